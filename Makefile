@@ -1,0 +1,44 @@
+# Everything sets itself up in .venv from requirements.lock (hashes pinned); only Python 3.11+ and make are needed.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: help setup demo test check acceptance lock schema clean
+
+help: ## what there is
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+setup: .venv/.done ## a virtual environment in .venv with the mrasfm command
+
+.venv/.done: requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else 0'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: setup ## render a drive, reconstruct it, say where the scene is and how good
+	$(BIN)/mrasfm synth --cameras 6 --units 20 --seed 1 --out demo/drive
+	$(BIN)/mrasfm reconstruct demo/drive --out demo/scene
+	$(BIN)/mrasfm evaluate demo/scene --truth demo/drive/truth.tum
+
+test: setup ## the fast suite and one real drive
+	$(BIN)/python -m pytest -m "not slow"
+
+check: setup ## lint, types, import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+acceptance: setup ## every figure that the README claims, printed as a table
+	$(BIN)/python -m tests.benchmarks.acceptance
+
+lock: setup ## renew requirements.lock from pyproject.toml (needs uv)
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet -o requirements.lock
+
+schema: setup ## export the JSON Schema of the drive manifest
+	$(BIN)/python -m schemas.export
+
+clean: ## remove what make made
+	rm -rf .venv demo build *.egg-info

@@ -1,0 +1,131 @@
+"""Rotations and rigid transforms as arrays.
+
+A transform `a_from_b` is a 4x4 float64 matrix (batches: (..., 4, 4)) that maps homogeneous coordinates of frame b into
+frame a. Rotation vectors are radians; quaternions are unit and in the order x, y, z, w.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+def skew(v: ArrayLike) -> Floats:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): `skew(v) @ x == cross(v, x)`."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def exp_so3(rotation_vector: ArrayLike) -> Floats:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues' formula)."""
+    w = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = skew(w)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle**2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    result: Floats = np.eye(3) + a * k + b * (k @ k)
+    return result
+
+
+def log_so3(rotation: ArrayLike) -> Floats:
+    """Rotation vectors (..., 3) in radians, norm at most pi, of rotation matrices (..., 3, 3)."""
+    q = quaternion_from_rotation(rotation)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    v, w = q[..., :3], q[..., 3]
+    n = np.linalg.norm(v, axis=-1)
+    angle = 2 * np.arctan2(n, w)
+    factor = np.where(n < 1e-9, 2.0, angle / np.where(n < 1e-9, 1.0, n))
+    result: Floats = v * factor[..., None]
+    return result
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
+    """Unit quaternions (..., 4), x y z w, w >= 0 up to rounding, of rotation matrices (..., 3, 3)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    d = np.stack([r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]], -1)
+    trace = d.sum(-1)
+    # Shepperd's method: of the four ways to divide, the one by the largest component.
+    squares = np.concatenate([1 + 2 * d - trace[..., None], (1 + trace)[..., None]], -1)
+    largest = squares.argmax(-1)
+    c = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
+    s = r + np.swapaxes(r, -1, -2)
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], s[..., 0, 1], s[..., 0, 2], c[..., 0]], -1),
+            np.stack([s[..., 0, 1], squares[..., 1], s[..., 1, 2], c[..., 1]], -1),
+            np.stack([s[..., 0, 2], s[..., 1, 2], squares[..., 2], c[..., 2]], -1),
+            np.stack([c[..., 0], c[..., 1], c[..., 2], squares[..., 3]], -1),
+        ],
+        -2,
+    )
+    q = np.take_along_axis(rows, largest[..., None, None], -2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    result: Floats = np.where(q[..., 3:] < 0, -q, q)
+    return result
+
+
+def rotation_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), x y z w, which are normalised first."""
+    q = np.asarray(quaternion_xyzw, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    k = skew(q[..., :3])
+    result: Floats = np.eye(3) + 2 * q[..., 3, None, None] * k + 2 * (k @ k)
+    return result
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> Floats:
+    """Transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    r, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+    out = np.zeros((*np.broadcast_shapes(r.shape[:-2], t.shape[:-1]), 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = r, t, 1.0
+    return out
+
+
+def inverse(a_from_b: ArrayLike) -> Floats:
+    """`b_from_a` (..., 4, 4)."""
+    m = np.asarray(a_from_b, dtype=np.float64)
+    r = np.swapaxes(m[..., :3, :3], -1, -2)
+    return transform(r, -(r @ m[..., :3, 3:])[..., 0])
+
+
+def apply(a_from_b: ArrayLike, points_b: ArrayLike) -> Floats:
+    """Points (..., n, 3) of frame b in frame a."""
+    m, x = np.asarray(a_from_b, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    result: Floats = x @ np.swapaxes(m[..., :3, :3], -1, -2) + m[..., None, :3, 3]
+    return result
+
+
+def rotation_angle_deg(rotation: ArrayLike) -> Floats:
+    """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
+    result: Floats = np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))
+    return result
+
+
+def mean_rotation(rotations: ArrayLike, weights: ArrayLike | None = None) -> Floats:
+    """Chordal L2 mean (3, 3) of rotations (n, 3, 3) with optional weights (n,).
+
+    Source: Hartley et al., "Rotation Averaging", IJCV 2013, section 5.2.
+    """
+    r = np.asarray(rotations, dtype=np.float64)
+    w: Any = np.ones(len(r)) if weights is None else np.asarray(weights, dtype=np.float64)
+    u, _, vt = np.linalg.svd(np.einsum("i,ijk->jk", w, r))
+    result: Floats = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return result
+
+
+def slerp(rotation_a: ArrayLike, rotation_b: ArrayLike, fraction: ArrayLike) -> Floats:
+    """Rotation(s) at `fraction` (0..1) of the way from a to b, along the shortest arc."""
+    a, b = np.asarray(rotation_a, dtype=np.float64), np.asarray(rotation_b, dtype=np.float64)
+    step = log_so3(np.swapaxes(a, -1, -2) @ b) * np.asarray(fraction, dtype=np.float64)[..., None]
+    result: Floats = a @ exp_so3(step)
+    return result

@@ -1,0 +1,81 @@
+"""A drive as the engine sees it: a checked manifest, the folder it lives in, and arrays instead of models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from schemas import Camera, DriveManifest, Pose
+
+Floats = NDArray[np.float64]
+
+
+def matrix_from_pose(pose: Pose) -> Floats:
+    """The 4x4 transform of a manifest's pose."""
+    return se3.transform(se3.rotation_from_quaternion(pose.rotation_xyzw), pose.translation_m)
+
+
+def pose_from_matrix(a_from_b: Floats) -> Pose:
+    """A manifest's pose of a 4x4 transform."""
+    return Pose(
+        rotation_xyzw=[float(v) for v in se3.quaternion_from_rotation(a_from_b[:3, :3])],
+        translation_m=[float(v) for v in a_from_b[:3, 3]],
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveImage:
+    """One image of the drive; its position in `Drive.images` is its index everywhere in the engine."""
+
+    unit: int  # index into manifest.frames
+    camera: int  # index into manifest.rig.cameras
+    file: str  # relative to the drive's folder
+    timestamp_us: int
+    mask: str | None
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recorded drive that can be reconstructed.
+
+    `manifest.rig.body_axes` is always `flu`: readers convert other axes once, when they load.
+    """
+
+    root: Path
+    manifest: DriveManifest
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The rig's cameras, in manifest order."""
+        return self.manifest.rig.cameras
+
+    @cached_property
+    def images(self) -> list[DriveImage]:
+        """All images, by unit and then by camera in manifest order."""
+        order = {camera.name: k for k, camera in enumerate(self.cameras)}
+        return [
+            DriveImage(
+                unit=u,
+                camera=order[name],
+                file=image.file,
+                timestamp_us=frame.timestamp_us if image.timestamp_us is None else image.timestamp_us,
+                mask=image.mask,
+            )
+            for u, frame in enumerate(self.manifest.frames)
+            for name, image in sorted(frame.images.items(), key=lambda item: order[item[0]])
+        ]
+
+    @cached_property
+    def timestamps_us(self) -> NDArray[np.int64]:
+        """The units' timestamps (units,)."""
+        return np.array([frame.timestamp_us for frame in self.manifest.frames], dtype=np.int64)
+
+    @cached_property
+    def rig_from_cam(self) -> Floats:
+        """The given calibration (cameras, 4, 4)."""
+        return np.stack([matrix_from_pose(camera.rig_from_cam) for camera in self.cameras])

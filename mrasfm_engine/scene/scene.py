@@ -1,0 +1,90 @@
+"""The result of a reconstruction in memory, before it is written out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.scene.drive import Drive
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageFeatures:
+    """Keypoints of one image, strongest first.
+
+    xy_px has COLMAP's convention: the centre of the top left pixel is at (0.5, 0.5).
+    """
+
+    xy_px: NDArray[np.float32]  # (n, 2)
+    descriptors: NDArray[np.uint8]  # (n, 128) RootSIFT scaled by 512 and clipped to 255, as COLMAP stores it
+    colors: NDArray[np.uint8]  # (n, 3) red, green, blue at the keypoint
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairMatches:
+    """Matches of one image pair, image_a < image_b (indices into `Drive.images`)."""
+
+    image_a: int
+    image_b: int
+    matches: NDArray[np.int32]  # (m, 2) keypoint indices, before verification
+    inliers: NDArray[np.bool_]  # (m,) which of them passed geometric verification
+
+
+@dataclass(frozen=True, kw_only=True)
+class Georeference:
+    """Where the scene's local frame lies on the earth.
+
+    The local frame is an east-north-up frame (x east, y north, z up) in metres at `origin_*`.
+    """
+
+    origin_latitude_deg: float
+    origin_longitude_deg: float
+    origin_ellipsoidal_height_m: float
+    height_datum: str  # as declared in the manifest; the origin's height is ellipsoidal all the same
+    ecef_from_local: Floats  # (4, 4), EPSG:4978
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCalibration:
+    """Refined calibration of one camera, in manifest units."""
+
+    rig_from_cam: Floats  # (4, 4)
+    params: Floats  # COLMAP's order
+    sigma_rotation_deg: Floats  # (3,) about the rig's axes, posterior
+    sigma_translation_m: Floats  # (3,) along the rig's axes, posterior
+    sigma_focal_px: float
+    # which of the six directions (rotation x y z, translation x y z) the drive observed, the rest is only the prior
+    observed: NDArray[np.bool_]  # (6,)
+
+
+@dataclass(kw_only=True)
+class Scene:
+    """A reconstructed scene in its local frame (`world`): east-north-up where georeferenced.
+
+    Images without an entry in `image_registered` are not part of the model.
+    """
+
+    drive: Drive
+    unit_registered: NDArray[np.bool_]  # (units,)
+    image_registered: NDArray[np.bool_]  # (images,)
+    world_from_rig: Floats  # (units, 4, 4); rows of units that are not registered are NaN
+    sigma_position_m: Floats  # (units, 3), NaN where not known
+    calibration: list[CameraCalibration]  # by camera
+    points_m: Floats  # (p, 3)
+    point_colors: NDArray[np.uint8]  # (p, 3)
+    point_error_px: Floats  # (p,) mean reprojection error
+    # one row an observation, sorted by point
+    observation_point: Ints
+    observation_image: Ints
+    observation_keypoint: Ints
+    features: list[ImageFeatures]  # by image
+    pairs: list[PairMatches]
+    georeference: Georeference | None = None
+    # without georeference but with rough poses: rough_world_from_local is a pure translation (4, 4)
+    rough_world_from_local: Floats | None = None
+    notes: list[str] = field(default_factory=list)

@@ -1,0 +1,35 @@
+"""The wire contract: pydantic models of what goes into and comes out of MRASfM."""
+
+from schemas.drive import (
+    CAMERA_MODELS,
+    BodyAxes,
+    Camera,
+    DriveManifest,
+    Frame,
+    FrameImage,
+    Gnss,
+    GnssSample,
+    LabelMap,
+    Pose,
+    Rig,
+    RoughPose,
+    RoughTrajectory,
+    SemanticClass,
+)
+
+__all__ = [
+    "CAMERA_MODELS",
+    "BodyAxes",
+    "Camera",
+    "DriveManifest",
+    "Frame",
+    "FrameImage",
+    "Gnss",
+    "GnssSample",
+    "LabelMap",
+    "Pose",
+    "Rig",
+    "RoughPose",
+    "RoughTrajectory",
+    "SemanticClass",
+]

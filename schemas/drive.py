@@ -1,0 +1,265 @@
+"""The drive manifest, `drive.json`, version 1: one recording of one vehicle, ready to be reconstructed.
+
+Conventions: a transform is named `a_from_b` and maps coordinates of frame b into frame a; rotations are unit
+quaternions in the order x, y, z, w; lengths are metres, angles degrees, times integer microseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from pathlib import PurePosixPath
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+# COLMAP's models that describe the cameras cars carry, with their parameters in COLMAP's order.
+CAMERA_MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+
+MAX_CAMERAS = 64
+MAX_FRAMES = 100_000
+MAX_GNSS_SAMPLES = 10_000_000
+MAX_IMAGE_SIDE_PX = 20_000
+MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
+MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=1e6)]
+TimestampUs = Annotated[int, Field(ge=0, le=2**62, strict=True)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+
+
+def _relative_path(value: str) -> str:
+    path = PurePosixPath(value)
+    if not value or len(value) > 512 or "\\" in value or "\0" in value or path.is_absolute() or ".." in path.parts:
+        raise ValueError("must be a relative path inside the drive with forward slashes and without '..'")
+    return value
+
+
+RelativePath = Annotated[str, AfterValidator(_relative_path)]
+Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class BodyAxes(StrEnum):
+    """Direction of the rig frame's x, y and z axes on the vehicle."""
+
+    FLU = "flu"  # forward, left, up: ours, ROS REP 103, nuScenes
+    RDF = "rdf"  # right, down, forward: KITTI's cameras
+    FRD = "frd"  # forward, right, down: aviation, many inertial units
+
+
+class SemanticClass(StrEnum):
+    """What the engine distinguishes; a label map sends a mask's ids to these."""
+
+    STATIC = "static"
+    ROAD = "road"
+    DYNAMIC = "dynamic"
+    SKY = "sky"
+    OWN_CAR = "own_car"
+
+
+class Pose(_Model):
+    """A rigid transform."""
+
+    rotation_xyzw: Annotated[list[Finite], Field(min_length=4, max_length=4, description="unit quaternion x, y, z, w")]
+    translation_m: Vector3
+
+    @field_validator("rotation_xyzw")
+    @classmethod
+    def _unit(cls, value: list[float]) -> list[float]:
+        norm = math.sqrt(sum(v * v for v in value))
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(f"quaternion must have norm 1, has {norm:.6g}: give x, y, z, w of a unit quaternion")
+        return [v / norm for v in value]
+
+    @field_validator("translation_m")
+    @classmethod
+    def _bounded(cls, value: list[float]) -> list[float]:
+        if max(abs(v) for v in value) > MAX_COORDINATE_M:
+            raise ValueError(f"coordinates beyond {MAX_COORDINATE_M:g} m are refused: give metres, not millimetres")
+        return value
+
+
+class Camera(_Model):
+    """One fixed camera of the rig."""
+
+    name: Name
+    model: str = Field(description=f"COLMAP's camera model: one of {', '.join(CAMERA_MODELS)}")
+    width: Annotated[int, Field(gt=0, le=MAX_IMAGE_SIDE_PX, strict=True, description="pixels")]
+    height: Annotated[int, Field(gt=0, le=MAX_IMAGE_SIDE_PX, strict=True, description="pixels")]
+    params: list[Finite] = Field(
+        description="COLMAP's parameters of the model, pixels; the centre of the top left pixel is at (0.5, 0.5)"
+    )
+    rig_from_cam: Pose = Field(
+        description="the camera's pose in the rig; camera axes are x right, y down, z forward. Its translation is "
+        "where the camera sits on the vehicle"
+    )
+    sigma_rotation_deg: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
+    sigma_translation_m: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
+    sigma_focal_px: Positive | None = Field(None, description="how well the focal length is known")
+
+    @model_validator(mode="after")
+    def _intrinsics(self) -> Camera:
+        if self.model not in CAMERA_MODELS:
+            raise ValueError(f"camera model {self.model!r} is not supported: use one of {', '.join(CAMERA_MODELS)}")
+        names = CAMERA_MODELS[self.model]
+        if len(self.params) != len(names):
+            raise ValueError(
+                f"{self.model} has {len(names)} parameters ({', '.join(names)}), {len(self.params)} are given"
+            )
+        values = dict(zip(names, self.params, strict=True))
+        side = max(self.width, self.height)
+        for name in ("f", "fx", "fy"):
+            if name in values and not 0.05 * side < values[name] < 100 * side:
+                raise ValueError(
+                    f"focal length {name} = {values[name]:g} px does not fit an image of {self.width}x{self.height} "
+                    "pixels: the calibration is singular or in other units than pixels"
+                )
+        if not (-0.5 * self.width < values["cx"] < 1.5 * self.width) or not (
+            -0.5 * self.height < values["cy"] < 1.5 * self.height
+        ):
+            raise ValueError(
+                f"principal point ({values['cx']:g}, {values['cy']:g}) is far outside the image of "
+                f"{self.width}x{self.height} pixels"
+            )
+        if max(abs(v) for v in self.rig_from_cam.translation_m) > MAX_RIG_EXTENT_M:
+            raise ValueError(f"rig_from_cam puts the camera over {MAX_RIG_EXTENT_M:g} m from the rig's origin: metres?")
+        return self
+
+
+class Rig(_Model):
+    """The vehicle's camera set."""
+
+    body_axes: BodyAxes = BodyAxes.FLU
+    cameras: Annotated[list[Camera], Field(min_length=1, max_length=MAX_CAMERAS)]
+
+    @model_validator(mode="after")
+    def _unique(self) -> Rig:
+        names = [camera.name for camera in self.cameras]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"camera name {name!r} is used twice")
+        return self
+
+
+class FrameImage(_Model):
+    """One camera's image at one instant."""
+
+    file: RelativePath = Field(description="path of the image in the drive")
+    timestamp_us: TimestampUs | None = Field(None, description="when this image was taken, if not with its frame")
+    mask: RelativePath | None = Field(None, description="path of its semantic mask: one channel, one id a pixel")
+
+
+class Frame(_Model):
+    """All images of one instant: a rigid unit."""
+
+    timestamp_us: TimestampUs
+    source_frame: Annotated[int, Field(ge=0)] = Field(description="the frame's number in the recording it comes from")
+    images: dict[Name, FrameImage] = Field(description="by camera name; a camera may be missing")
+
+
+class GnssSample(_Model):
+    """One position of the antenna's phase centre on WGS84."""
+
+    timestamp_us: TimestampUs
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
+    height_m: Annotated[float, Field(ge=-1000, le=20000)]
+    sigma_horizontal_m: Positive = Field(description="standard deviation of each horizontal axis")
+    sigma_vertical_m: Positive
+
+
+class Gnss(_Model):
+    """The receiver's positions."""
+
+    height_datum: str = Field(
+        pattern=r"^(ellipsoidal|EPSG:[0-9]{4,6})$",
+        description="what height_m counts from: 'ellipsoidal' (WGS84), or the EPSG code of a vertical datum",
+    )
+    antenna_in_rig_m: Vector3 = Field(description="position of the antenna in the rig frame (lever arm)")
+    samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES)]
+
+    @field_validator("antenna_in_rig_m")
+    @classmethod
+    def _on_the_vehicle(cls, value: list[float]) -> list[float]:
+        if max(abs(v) for v in value) > MAX_RIG_EXTENT_M:
+            raise ValueError(f"the antenna is over {MAX_RIG_EXTENT_M:g} m from the rig's origin: metres?")
+        return value
+
+
+class RoughPose(_Model):
+    """Roughly where the vehicle was."""
+
+    timestamp_us: TimestampUs
+    world_from_rig: Pose
+
+
+class RoughTrajectory(_Model):
+    """A rough trajectory in any metric, gravity aligned (z up) world frame."""
+
+    poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES)]
+    sigma_translation_m: Positive = 0.5
+    sigma_rotation_deg: Positive = 2.0
+
+
+class LabelMap(_Model):
+    """What the ids in the masks mean. Ids that are not listed are refused by name when a mask holds them."""
+
+    ids: dict[Annotated[int, Field(ge=0, le=255)], SemanticClass]
+
+    @staticmethod
+    def cityscapes() -> LabelMap:
+        """Cityscapes' train ids, with 19 for what is not labelled."""
+        dynamic, classes = range(11, 19), {0: SemanticClass.ROAD, 10: SemanticClass.SKY}
+        return LabelMap(
+            ids={
+                i: SemanticClass.DYNAMIC if i in dynamic else classes.get(i, SemanticClass.STATIC) for i in range(20)
+            }
+        )
+
+
+class DriveManifest(_Model):
+    """One recorded drive."""
+
+    version: Literal[1] = 1
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    rig: Rig
+    frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES)]
+    gnss: Gnss | None = None
+    rough_poses: RoughTrajectory | None = None
+    label_map: LabelMap | None = None
+    notes: list[str] = Field(default_factory=list, description="what a reader of results should know of the source")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> DriveManifest:
+        cameras = {camera.name for camera in self.rig.cameras}
+        last_us = -1
+        files: set[str] = set()
+        for i, frame in enumerate(self.frames):
+            if frame.timestamp_us <= last_us:
+                word = "repeats" if frame.timestamp_us == last_us else "goes back to"
+                raise ValueError(
+                    f"frames.{i}.timestamp_us {word} {frame.timestamp_us}: sort the frames by time and give every "
+                    "frame its own timestamp"
+                )
+            last_us = frame.timestamp_us
+            for name, image in frame.images.items():
+                if name not in cameras:
+                    raise ValueError(
+                        f"frames.{i}.images names camera {name!r}, which the rig does not have: {', '.join(sorted(cameras))}"
+                    )
+                if image.file in files:
+                    raise ValueError(f"frames.{i}.images.{name}.file {image.file!r} is used by two images")
+                files.add(image.file)
+        return self
