@@ -16,12 +16,15 @@ from schemas.drive import (
     RoughTrajectory,
     SemanticClass,
 )
+from schemas.parsing import DocumentError, FieldProblem, parse_manifest
 
 __all__ = [
     "CAMERA_MODELS",
     "BodyAxes",
     "Camera",
+    "DocumentError",
     "DriveManifest",
+    "FieldProblem",
     "Frame",
     "FrameImage",
     "Gnss",
@@ -32,4 +35,5 @@ __all__ = [
     "RoughPose",
     "RoughTrajectory",
     "SemanticClass",
+    "parse_manifest",
 ]

@@ -11,7 +11,7 @@ from enum import StrEnum
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 # COLMAP's models that describe the cameras cars carry, with their parameters in COLMAP's order.
 CAMERA_MODELS: dict[str, tuple[str, ...]] = {
@@ -25,7 +25,7 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
 
 MAX_CAMERAS = 64
 MAX_FRAMES = 100_000
-MAX_GNSS_SAMPLES = 10_000_000
+MAX_GNSS_SAMPLES = 1_000_000  # 100 Hz for 2.7 hours
 MAX_IMAGE_SIDE_PX = 20_000
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
@@ -38,8 +38,11 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 
 def _relative_path(value: str) -> str:
     path = PurePosixPath(value)
-    if not value or len(value) > 512 or "\\" in value or "\0" in value or path.is_absolute() or ".." in path.parts:
-        raise ValueError("must be a relative path inside the drive with forward slashes and without '..'")
+    plain = value.isprintable() and "\\" not in value and 0 < len(value) <= 512
+    plain = plain and all(len(part.encode()) <= 255 for part in path.parts)  # what file systems can hold
+    # str(path) differs where the same file could be written in two ways: './a', 'a//b', 'a/'.
+    if not plain or path.is_absolute() or ".." in path.parts or str(path) != value or value == ".":
+        raise ValueError("must be a relative path inside the drive with forward slashes and without '.', '..' or '//'")
     return value
 
 
@@ -109,33 +112,45 @@ class Camera(_Model):
     sigma_translation_m: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
     sigma_focal_px: Positive | None = Field(None, description="how well the focal length is known")
 
-    @model_validator(mode="after")
-    def _intrinsics(self) -> Camera:
-        if self.model not in CAMERA_MODELS:
-            raise ValueError(f"camera model {self.model!r} is not supported: use one of {', '.join(CAMERA_MODELS)}")
-        names = CAMERA_MODELS[self.model]
-        if len(self.params) != len(names):
+    @field_validator("model")
+    @classmethod
+    def _known_model(cls, value: str) -> str:
+        if value not in CAMERA_MODELS:
+            raise ValueError(f"camera model {value!r} is not supported: use one of {', '.join(CAMERA_MODELS)}")
+        return value
+
+    @field_validator("params")
+    @classmethod
+    def _plausible_params(cls, value: list[float], info: ValidationInfo) -> list[float]:
+        if not {"model", "width", "height"} <= info.data.keys():
+            return value  # those fields have errors of their own
+        _check_params(value, model=info.data["model"], width=info.data["width"], height=info.data["height"])
+        return value
+
+    @field_validator("rig_from_cam")
+    @classmethod
+    def _on_the_vehicle(cls, value: Pose) -> Pose:
+        if max(abs(v) for v in value.translation_m) > MAX_RIG_EXTENT_M:
+            raise ValueError(f"puts the camera over {MAX_RIG_EXTENT_M:g} m from the rig's origin: give metres")
+        return value
+
+
+def _check_params(params: list[float], *, model: str, width: int, height: int) -> None:
+    names = CAMERA_MODELS[model]
+    if len(params) != len(names):
+        raise ValueError(f"{model} has {len(names)} parameters ({', '.join(names)}), {len(params)} are given")
+    values = dict(zip(names, params, strict=True))
+    side = max(width, height)
+    for name in ("f", "fx", "fy"):
+        if name in values and not 0.05 * side < values[name] < 100 * side:
             raise ValueError(
-                f"{self.model} has {len(names)} parameters ({', '.join(names)}), {len(self.params)} are given"
+                f"focal length {name} = {values[name]:g} px does not fit an image of {width}x{height} pixels: "
+                "the calibration is singular or in other units than pixels"
             )
-        values = dict(zip(names, self.params, strict=True))
-        side = max(self.width, self.height)
-        for name in ("f", "fx", "fy"):
-            if name in values and not 0.05 * side < values[name] < 100 * side:
-                raise ValueError(
-                    f"focal length {name} = {values[name]:g} px does not fit an image of {self.width}x{self.height} "
-                    "pixels: the calibration is singular or in other units than pixels"
-                )
-        if not (-0.5 * self.width < values["cx"] < 1.5 * self.width) or not (
-            -0.5 * self.height < values["cy"] < 1.5 * self.height
-        ):
-            raise ValueError(
-                f"principal point ({values['cx']:g}, {values['cy']:g}) is far outside the image of "
-                f"{self.width}x{self.height} pixels"
-            )
-        if max(abs(v) for v in self.rig_from_cam.translation_m) > MAX_RIG_EXTENT_M:
-            raise ValueError(f"rig_from_cam puts the camera over {MAX_RIG_EXTENT_M:g} m from the rig's origin: metres?")
-        return self
+    if not (-0.5 * width < values["cx"] < 1.5 * width) or not (-0.5 * height < values["cy"] < 1.5 * height):
+        raise ValueError(
+            f"principal point ({values['cx']:g}, {values['cy']:g}) is far outside the image of {width}x{height} pixels"
+        )
 
 
 class Rig(_Model):
@@ -165,7 +180,9 @@ class Frame(_Model):
     """All images of one instant: a rigid unit."""
 
     timestamp_us: TimestampUs
-    source_frame: Annotated[int, Field(ge=0)] = Field(description="the frame's number in the recording it comes from")
+    source_frame: Annotated[int, Field(ge=0, le=2**31 - 1, strict=True)] = Field(
+        description="the frame's number in the recording it comes from; no two frames share one"
+    )
     images: dict[Name, FrameImage] = Field(description="by camera name; a camera may be missing")
 
 
@@ -223,30 +240,34 @@ class LabelMap(_Model):
         """Cityscapes' train ids, with 19 for what is not labelled."""
         dynamic, classes = range(11, 19), {0: SemanticClass.ROAD, 10: SemanticClass.SKY}
         return LabelMap(
-            ids={
-                i: SemanticClass.DYNAMIC if i in dynamic else classes.get(i, SemanticClass.STATIC) for i in range(20)
-            }
+            ids={i: SemanticClass.DYNAMIC if i in dynamic else classes.get(i, SemanticClass.STATIC) for i in range(20)}
         )
 
 
 class DriveManifest(_Model):
     """One recorded drive."""
 
-    version: Literal[1] = 1
+    version: Literal[1] = Field(1, description="of this contract")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     rig: Rig
     frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES)]
     gnss: Gnss | None = None
     rough_poses: RoughTrajectory | None = None
     label_map: LabelMap | None = None
-    notes: list[str] = Field(default_factory=list, description="what a reader of results should know of the source")
+    notes: Annotated[list[Annotated[str, Field(max_length=2000)]], Field(max_length=100)] = Field(
+        default_factory=list, description="what a reader of results should know of the source"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> DriveManifest:
         cameras = {camera.name for camera in self.rig.cameras}
         last_us = -1
         files: set[str] = set()
+        sources: set[int] = set()
         for i, frame in enumerate(self.frames):
+            if frame.source_frame in sources:
+                raise ValueError(f"frames.{i}.source_frame {frame.source_frame} is used twice")
+            sources.add(frame.source_frame)
             if frame.timestamp_us <= last_us:
                 word = "repeats" if frame.timestamp_us == last_us else "goes back to"
                 raise ValueError(
@@ -257,7 +278,8 @@ class DriveManifest(_Model):
             for name, image in frame.images.items():
                 if name not in cameras:
                     raise ValueError(
-                        f"frames.{i}.images names camera {name!r}, which the rig does not have: {', '.join(sorted(cameras))}"
+                        f"frames.{i}.images names camera {name!r}, which the rig does not have: "
+                        f"{', '.join(sorted(cameras))}"
                     )
                 if image.file in files:
                     raise ValueError(f"frames.{i}.images.{name}.file {image.file!r} is used by two images")

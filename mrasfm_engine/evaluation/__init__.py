@@ -1,0 +1,1 @@
+"""Measures of a scene's accuracy against the truth."""

@@ -1,0 +1,189 @@
+"""Terms of the adjustment that are not image observations: calibration, focal lengths, positions, gauges.
+
+Every term adds its cost, and the gradient and Gauss-Newton matrix of its residuals in the reduced vector. There are a
+few rows a unit or camera, so plain numpy does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.problem import Layout
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.state import State
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# How firmly a gauge is held, relative to the priors: firm enough to hold, soft enough not to hurt the conditioning.
+GAUGE_STIFFNESS = 1e6
+
+
+class Term(Protocol):
+    """Part of the cost over units and cameras."""
+
+    def cost(self, state: State) -> float:
+        """Half the (robust) sum of squared residuals."""
+        ...
+
+    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+        """Add J'J to h (n, n) (both triangles) and J'r to g (n,)."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationPrior:
+    """Keeps `rig_from_cam` near what was given, and holds the gauge between cameras and units.
+
+    Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes. Moving all
+    cameras by one transform and all units by its inverse changes no image: the weighted mean correction of all cameras
+    is held at zero, where the weights (Cauchy, from the current corrections) keep one bad camera from pulling the rest.
+    """
+
+    rotation: Floats  # (c, 3, 3) given
+    position_m: Floats  # (c, 3) given
+    sigma_rotation_rad: Floats  # (c,)
+    sigma_translation_m: Floats  # (c,)
+    loss_scale: float = 3.0  # in sigmas, of one camera's correction as a whole
+
+    def corrections(self, state: State) -> Floats:
+        """Rotation vectors (rad) and translations (m) of all cameras (c, 6) from given to current, in rig axes."""
+        turn = se3.log_so3(state.camera_rotation @ np.swapaxes(self.rotation, 1, 2))
+        return np.concatenate([turn, state.camera_position_m - self.position_m], axis=1)
+
+    def _whitened(self, state: State) -> tuple[Floats, Floats]:
+        sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
+        return self.corrections(state) / sigma, sigma
+
+    def weights(self, state: State) -> Floats:
+        """Cauchy weights (c,) of the cameras, from their distance to the median correction."""
+        r, _ = self._whitened(state)
+        d2 = ((r - np.median(r, axis=0)) ** 2).sum(1)
+        result: Floats = 1.0 / (1.0 + d2 / self.loss_scale**2)
+        return result
+
+    def _gauge(self, state: State) -> Floats:
+        w = self.weights(state)
+        result: Floats = (w / w.sum()) * np.sqrt(len(w))
+        return result
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        r, _ = self._whitened(state)
+        s2 = self.loss_scale**2
+        own = 0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum()
+        return float(own + 0.5 * (GAUGE_STIFFNESS * (self._gauge(state) @ r) ** 2).sum())
+
+    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+        """See `Term`."""
+        r, sigma = self._whitened(state)
+        cameras = np.flatnonzero(layout.camera_slot >= 0)
+        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
+        gauge = self._gauge(state)
+        mean = gauge @ r
+        offsets = layout.camera_offsets(cameras)
+        for axis in range(6):
+            rows = offsets + axis
+            scaled = 1.0 / sigma[cameras, axis]
+            h[rows, rows] += w[cameras] * scaled**2
+            g[rows] += w[cameras] * scaled * r[cameras, axis]
+            j = np.sqrt(GAUGE_STIFFNESS) * gauge[cameras] * scaled
+            h[np.ix_(rows, rows)] += np.outer(j, j)
+            g[rows] += j * np.sqrt(GAUGE_STIFFNESS) * mean[axis]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FocalPrior:
+    """Keeps focal lengths near what was given: residual log(f / f_given) / sigma, sigma relative to f."""
+
+    focal_px: Floats  # (c,) given
+    sigma: Floats  # (c,)
+
+    def _residuals(self, state: State) -> Floats:
+        result: Floats = np.log(state.camera_params[:, 0] / self.focal_px) / self.sigma
+        return result
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return float(0.5 * (self._residuals(state) ** 2).sum())
+
+    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+        """See `Term`."""
+        if not layout.free_focal:
+            return
+        cameras = np.flatnonzero(layout.camera_slot >= 0)
+        rows = layout.camera_offsets(cameras) + 6
+        h[rows, rows] += 1.0 / self.sigma[cameras] ** 2
+        g[rows] += self._residuals(state)[cameras] / self.sigma[cameras]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionPrior:
+    """Measured positions of a point of the vehicle (antenna, or the rig's origin), with a Cauchy loss.
+
+    Residual: (t + R lever - measured) / sigma by axis of the world frame.
+    """
+
+    unit: Ints  # (n,) units that have a measurement
+    position_m: Floats  # (n, 3) in the world frame
+    sigma_m: Floats  # (n, 3)
+    lever_arm_m: Floats  # (3,) in the rig frame
+    loss_scale: float = 3.0
+
+    def _residuals(self, state: State) -> tuple[Floats, Floats]:
+        arm = state.unit_rotation[self.unit] @ self.lever_arm_m
+        return arm, (state.unit_position_m[self.unit] + arm - self.position_m) / self.sigma_m
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        _, r = self._residuals(state)
+        s2 = self.loss_scale**2
+        return float(0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum())
+
+    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+        """See `Term`."""
+        arm, r = self._residuals(state)
+        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
+        # d (R arm) / d omega = -[R arm]x in world axes
+        j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+        j = j / self.sigma_m[:, :, None]
+        for i in np.flatnonzero(layout.unit_slot[self.unit] >= 0):
+            o = int(layout.unit_slot[self.unit[i]]) * 6
+            h[o : o + 6, o : o + 6] += w[i] * j[i].T @ j[i]
+            g[o : o + 6] += w[i] * j[i].T @ r[i]
+
+
+@dataclass(frozen=True, kw_only=True)
+class UprightPrior:
+    """Vehicles are upright on average: roll and pitch against the vertical are zero within a road's cross fall and grade.
+
+    A road's slope is common to the units of a drive, so together they count as one measurement. On a straight way this
+    alone says how the scene is turned about that line.
+    """
+
+    unit: Ints  # (n,)
+    sigma_roll_rad: float
+    sigma_pitch_rad: float
+
+    def _rows(self, state: State) -> tuple[Floats, Floats]:
+        # The rig's y axis (left) tells roll, its x axis (forward) pitch.
+        axes = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]], 1, 2)  # (n, 2, 3)
+        scale = np.array([self.sigma_roll_rad, self.sigma_pitch_rad]) * np.sqrt(len(self.unit))
+        jacobian = np.cross(axes, [0.0, 0.0, 1.0]) / scale[:, None]
+        return axes[:, :, 2] / scale, jacobian
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return float(0.5 * (self._rows(state)[0] ** 2).sum())
+
+    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+        """See `Term`."""
+        r, j = self._rows(state)
+        for i in np.flatnonzero(layout.unit_slot[self.unit] >= 0):
+            o = int(layout.unit_slot[self.unit[i]]) * 6
+            h[o : o + 3, o : o + 3] += j[i].T @ j[i]
+            g[o : o + 3] += j[i].T @ r[i]

@@ -1,0 +1,231 @@
+"""Levenberg-Marquardt over the reduced system of camera set bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.normal_equations import accumulate, squared_errors, substitute
+from mrasfm_engine.adjustment.priors import Term
+from mrasfm_engine.adjustment.problem import Layout, Observations, retract
+from mrasfm_engine.scene.state import State
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Termination(StrEnum):
+    """Why the solver stopped."""
+
+    CONVERGED = "converged"
+    ITERATIONS = "iteration limit"
+    NO_PROGRESS = "no step lowers the cost"
+    NOTHING_FREE = "nothing to adjust"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions:
+    """Options of one solve."""
+
+    max_iterations: int = 50
+    function_tolerance: float = 1e-6  # relative decrease of the cost below which it has converged
+    loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
+    sigma_px: float = 1.0  # standard deviation of an observation
+    threads: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """How a solve went."""
+
+    initial_cost: float
+    final_cost: float
+    iterations: int
+    termination: Termination
+    observations: int
+    parameters: int
+
+
+@dataclass(kw_only=True)
+class Problem:
+    """One adjustment: what is observed, what is free and what else is known."""
+
+    state: State
+    camera_kind: Ints
+    observations: Observations
+    layout: Layout
+    terms: Sequence[Term] = ()
+    options: SolverOptions = field(default_factory=SolverOptions)
+
+    def errors_px2(self, state: State) -> Floats:
+        """Squared reprojection errors (n,) of all observations."""
+        o = self.observations
+        out = np.empty(len(o.unit))
+        _in_ranges(
+            self.options.threads,
+            len(out),
+            lambda lo, hi, _: squared_errors(
+                *_arrays(state, self.camera_kind), o.unit, o.camera, o.point, o.xy_px, lo, hi, out
+            ),
+        )
+        return out
+
+    def cost(self, state: State) -> float:
+        """Half the robust sum of squares."""
+        s2 = self.options.loss_scale**2
+        images = 0.5 * s2 * np.log1p(self.errors_px2(state) / (s2 * self.options.sigma_px**2)).sum()
+        return float(images + sum(term.cost(state) for term in self.terms))
+
+    def normal_equations(self, state: State, damping: float) -> Reduced:
+        """The reduced system at a state."""
+        o, layout, options = self.observations, self.layout, self.options
+        n, p = layout.size, o.num_points
+        parts = min(options.threads, max(1, p // 256))
+        s, diagonal, g = np.zeros((parts, n, n)), np.zeros((parts, n)), np.zeros((parts, n))
+        v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
+        _in_ranges(
+            parts,
+            p,
+            lambda lo, hi, t: accumulate(
+                *_arrays(state, self.camera_kind), o.unit, o.camera, o.xy_px, o.first_of_point,
+                layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
+                damping, lo, hi, s[t], diagonal[t], g[t], v_inverse, v_gradient,
+            ),
+        )  # fmt: skip
+        matrix, extra, gradient = s.sum(0), np.zeros((n, n)), g.sum(0)
+        matrix = np.tril(matrix) + np.tril(matrix, -1).T
+        for term in self.terms:
+            term.add_to(state, layout, extra, gradient)
+        return Reduced(
+            matrix=matrix + extra,
+            diagonal=diagonal.sum(0) + np.diagonal(extra),
+            gradient=gradient,
+            v_inverse=v_inverse,
+            v_gradient=v_gradient,
+        )
+
+    def points_after(self, state: State, reduced: Reduced, step: Floats) -> Floats:
+        """Points (p, 3) that go with a step of the reduced vector."""
+        o, layout, options = self.observations, self.layout, self.options
+        out = np.empty_like(state.points_m)
+        _in_ranges(
+            options.threads,
+            o.num_points,
+            lambda lo, hi, _: substitute(
+                *_arrays(state, self.camera_kind), o.unit, o.camera, o.xy_px, o.first_of_point,
+                layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
+                step, reduced.v_inverse, reduced.v_gradient, lo, hi, out,
+            ),
+        )  # fmt: skip
+        return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduced:
+    """Normal equations with the points eliminated."""
+
+    matrix: Floats  # (n, n)
+    diagonal: Floats  # (n,) of the matrix before points were eliminated: what Marquardt's damping scales
+    gradient: Floats  # (n,)
+    v_inverse: Floats  # (p, 6)
+    v_gradient: Floats  # (p, 3)
+
+
+def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic], ...]:
+    return (
+        state.unit_rotation,
+        state.unit_position_m,
+        state.camera_rotation,
+        state.camera_position_m,
+        kind,
+        state.camera_params,
+        state.points_m,
+    )
+
+
+def _in_ranges(parts: int, count: int, work: Callable[[int, int, int], None]) -> None:
+    """Run `work(lo, hi, part)` over `count` items in so many threads; the kernels release the interpreter's lock."""
+    if parts <= 1 or count < 512:
+        work(0, count, 0)
+        return
+    bounds = np.linspace(0, count, parts + 1).astype(int)
+    with ThreadPoolExecutor(parts) as pool:
+        list(pool.map(work, bounds[:-1], bounds[1:], range(parts)))
+
+
+def solve(problem: Problem, *, cancel: Callable[[], bool] | None = None) -> tuple[State, Report]:
+    """Minimise the problem's cost.
+
+    Parameters
+    ----------
+    problem
+        What to adjust; its state is where the search starts.
+    cancel
+        Asked between iterations; where it answers True the best state so far is returned.
+
+    Returns
+    -------
+    state, report
+        The state of lowest cost that was found, and how it went.
+
+    Notes
+    -----
+    Damping follows Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems" (2004), section 3.2.
+    """
+    options, layout, state = problem.options, problem.layout, problem.state
+    cost = initial = problem.cost(state)
+    damping, raise_by, iterations = 1e-4, 2.0, 0
+    termination = Termination.ITERATIONS
+    free = np.setdiff1d(np.arange(layout.size), layout.held())
+    if not len(free) and not problem.observations.num_points:
+        termination = Termination.NOTHING_FREE
+    while iterations < options.max_iterations and termination is Termination.ITERATIONS:
+        if cancel is not None and cancel():
+            break
+        iterations += 1
+        reduced = problem.normal_equations(state, damping)
+        step = _damped_step(reduced, free, damping)
+        if step is not None:
+            trial = retract(state, layout, step, problem.points_after(state, reduced, step))
+            trial_cost = problem.cost(trial)
+        if step is None or not trial_cost < cost:
+            if damping > 1e8:
+                termination = Termination.NO_PROGRESS
+            elif step is not None and trial_cost - cost <= options.function_tolerance * cost * 1e-3:
+                termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
+            damping, raise_by = damping * raise_by, raise_by * 2.0
+            continue
+        decrease = cost - trial_cost
+        if decrease <= options.function_tolerance * cost:
+            termination = Termination.CONVERGED
+        state, cost = trial, trial_cost
+        damping, raise_by = max(damping / 5.0, 1e-10), 2.0
+    return state, Report(
+        initial_cost=initial,
+        final_cost=cost,
+        iterations=iterations,
+        termination=termination,
+        observations=len(problem.observations.unit),
+        parameters=len(free) + 3 * problem.observations.num_points,
+    )
+
+
+def _damped_step(reduced: Reduced, free: Ints, damping: float) -> Floats | None:
+    """The step of the reduced vector, zero where held; None where the damped matrix is not positive definite."""
+    step = np.zeros(len(reduced.gradient))
+    if not len(free):
+        return step
+    a = reduced.matrix[np.ix_(free, free)]
+    a[np.diag_indices(len(free))] += damping * np.maximum(reduced.diagonal[free], 1e-12)
+    try:
+        factor = scipy.linalg.cho_factor(a, lower=True, overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return None
+    step[free] = -scipy.linalg.cho_solve(factor, reduced.gradient[free], check_finite=False)
+    return step if np.isfinite(step).all() else None

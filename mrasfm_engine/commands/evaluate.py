@@ -1,0 +1,72 @@
+"""`mrasfm evaluate`: how far a scene's trajectory is from the truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_trajectories, match_timestamps
+from mrasfm_engine.io.read_scene import ScenePoses, read_poses
+from mrasfm_engine.io.trajectory_file import read_tum
+
+TOLERANCE_US = 1000
+
+
+def register(subparsers: Any) -> None:
+    """Add the `evaluate` parser."""
+    parser = subparsers.add_parser("evaluate", help="compare a scene's trajectory with the truth")
+    parser.add_argument("scene", type=Path, metavar="OUT", help="the folder that `mrasfm reconstruct` wrote")
+    parser.add_argument(
+        "--truth", type=Path, required=True, metavar="FILE", help="true poses of the rig in TUM's format"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare and print."""
+    scene, truth = read_poses(arguments.scene), read_tum(arguments.truth)
+    kept, matched = match_timestamps(scene.trajectory.timestamps_us, truth.timestamps_us, tolerance_us=TOLERANCE_US)
+    if len(kept) < MIN_POSES:
+        raise InputError(
+            f"{arguments.scene} and {arguments.truth} have {len(kept)} timestamps in common within "
+            f"{TOLERANCE_US / 1000:g} ms, {MIN_POSES} are needed",
+            remedy="Give the truth of this drive, with timestamps in seconds of the same clock.",
+        )
+    errors = compare_trajectories(scene.trajectory.world_from_rig[kept], truth.world_from_rig[matched])
+    if arguments.json:
+        print(json.dumps(_summary(scene, errors), allow_nan=False))
+    else:
+        _print_table(scene, errors)
+    return 0
+
+
+def _summary(scene: ScenePoses, errors: TrajectoryErrors) -> dict[str, Any]:
+    return {
+        "registered_units": len(scene.trajectory.timestamps_us),
+        "registered_images": scene.registered_images,
+        "total_images": scene.total_images,
+        "metric": {
+            "rmse_m": errors.metric_rmse_m,
+            "median_m": errors.metric_median_m,
+            "rotation_median_deg": errors.rotation_median_deg,
+        },
+        "similarity": {"rmse_m": errors.similarity_rmse_m, "scale": errors.similarity_scale},
+    }
+
+
+def _print_table(scene: ScenePoses, errors: TrajectoryErrors) -> None:
+    table = Table(show_header=False)
+    table.add_row("units", f"{len(scene.trajectory.timestamps_us)} of {scene.total_units} registered")
+    table.add_row("images", f"{scene.registered_images} of {scene.total_images} registered")
+    table.add_row("units with truth", f"{errors.poses}")
+    table.add_row("position, metric", f"rmse {errors.metric_rmse_m:.4f} m, median {errors.metric_median_m:.4f} m")
+    table.add_row("rotation", f"median {errors.rotation_median_deg:.4f} deg")
+    table.add_row("position, similarity", f"rmse {errors.similarity_rmse_m:.4f} m, scale {errors.similarity_scale:.6f}")
+    Console().print(table)

@@ -1,0 +1,96 @@
+"""`mrasfm reconstruct`: one drive to one scene."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from mrasfm_engine.config import read_config
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser("reconstruct", help="turn a drive into a scene")
+    parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.json")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the scene")
+    parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML)")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reconstruct, show progress, and say what there is and how good."""
+    config = read_config(arguments.config, **({"use_gnss": False} if arguments.no_gnss else {}))
+    # The engine takes a second to load; help and argument errors should not wait for it.
+    from mrasfm_engine.pipeline import reconstruct
+
+    console = Console(stderr=True)
+    with _cancel_on_interrupt(console) as cancelled, _bars(console) as progress:
+        report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled)
+    _say(report, arguments.out)
+    return 0
+
+
+@contextmanager
+def _cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
+    """Ctrl-C asks the run to stop where it leaves nothing half-written; a second one stops at once."""
+    asked = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+        console.print("stopping; finished stages are kept")
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    columns = (TextColumn("{task.description:<11}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    tasks: dict[str, TaskID] = {}
+    with Progress(*columns, console=console) as bars:
+
+        def update(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            if total > 1 or bars.tasks[tasks[stage]].total == 1:
+                bars.update(tasks[stage], completed=done, total=total)
+            elif done == total:
+                bars.update(tasks[stage], completed=bars.tasks[tasks[stage]].total)
+
+        yield update
+
+
+def _say(report: dict[str, Any], out: Path) -> None:
+    stages = {stage["stage"]: stage for stage in report["stages"]}
+    mapping, refinement = stages["mapping"], stages["refinement"]
+    units = mapping["registered_units"] + len(mapping["units_not_registered"])
+    print(f"Scene: {out}")
+    print(f"  units registered: {mapping['registered_units']} of {units}")
+    print(f"  points:           {refinement['points']} in {out / 'points.ply'}")
+    if refinement["georeferenced"]:
+        gnss = refinement["gnss"]
+        print(f"  georeferenced:    yes, {gnss['units_used']} positions, residual {gnss['residual_rms_m']:.2f} m RMS")
+    else:
+        print(f"  georeferenced:    no{' (' + refinement['gnss']['not_used'] + ')' if 'gnss' in refinement else ''}")
+    if "scale" in refinement:
+        print(f"  scale sigma:      {refinement['scale']['sigma_relative']:.2%}")
+    calibration = refinement["calibration"]
+    print(f"  calibration:      {'refined' if calibration['adjusted'] else 'held'} ({calibration['reason']})")
+    for finding in report["findings"]:
+        print(f"  {finding['severity']}: {finding['what']}")
+    for missing in mapping["units_not_registered"]:
+        print(f"  not registered: frame {missing['source_frame']}: {missing['reason']}")

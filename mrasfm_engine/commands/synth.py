@@ -1,0 +1,112 @@
+"""`mrasfm synth`: render drives with ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+
+from rich.progress import Progress
+
+from mrasfm_engine.synthetic.options import SpeedProfile, SynthOptions, World
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand's parser."""
+    parser = subparsers.add_parser(
+        "synth", help="render a drive with ground truth", description="Render drives of a synthetic world."
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the drive (of the drives, if several)")
+    parser.add_argument("--force", action="store_true", help="replace what is in --out")
+    default = SynthOptions()
+
+    def add(flag: str, kind: type, text: str, *, metavar: str | None = None, to: str | None = None) -> None:
+        name = to or flag.strip("-").replace("-", "_")
+        value = getattr(default, name)
+        parser.add_argument(
+            flag, dest=name, type=kind, default=value, metavar=metavar, help=f"{text} (default: {value})"
+        )
+
+    def choose(flag: str, choices: list[str], text: str) -> None:
+        name = flag.strip("-").replace("-", "_")
+        value = str(getattr(default, name))
+        parser.add_argument(flag, choices=choices, default=value, help=f"{text} (default: {value})")
+
+    add("--cameras", int, "cameras of the vehicle, 1 to 8")
+    add("--units", int, "instants at which all cameras take an image, 10 a second")
+    add("--drives", int, "drives of the same world, an hour apart")
+    add("--seed", int, "everything random follows from it")
+    choose("--world", [world.value for world in World], "kind of street")
+    parser.add_argument("--straight", action="store_true", help="a street without curves")
+    add("--ramp", float, "slope of a hill on the way, percent", to="ramp_percent", metavar="PERCENT")
+    add("--parked-cars", int, "parked cars along each drive")
+    add("--moving-cars", int, "other vehicles that drive")
+    add("--shadows", float, "how dark shadows are, 0 to 1", to="shadow_strength", metavar="STRENGTH")
+
+    add("--width", int, "of the images, pixels")
+    add("--height", int, "of the images, pixels")
+    choose("--camera-model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"], "COLMAP's model of all cameras")
+    add("--exposure-jitter", float, "sigma of the logarithm of each image's brightness")
+    add("--noise", float, "sensor noise; 1 is a good sensor in daylight")
+    add("--blur-px", float, "sigma of the point spread function")
+    add("--jpeg-quality", int, "of the images")
+    parser.add_argument("--no-masks", dest="masks", action="store_false", help="write no semantic masks")
+    add("--texture-px", int, "side of the largest textures: 64, 128, 256, 512 or 1024")
+
+    add("--spacing-m", float, "mean distance between units")
+    choose("--speed-profile", [profile.value for profile in SpeedProfile], "how the speed varies")
+    add("--standing", int, "units in the middle during which the vehicle stands", to="standing_units", metavar="UNITS")
+    add("--time-skew-ms", float, "images of a unit are taken up to that long apart")
+    add("--drop-images", float, "fraction of images that are missing", metavar="FRACTION")
+    parser.add_argument(
+        "--occlude",
+        dest="occluded_cameras",
+        type=lambda text: tuple(name for name in text.split(",") if name),
+        default=(),
+        metavar="NAME[,NAME]",
+        help="a lorry covers most of these cameras' images for half of the drive",
+    )
+
+    parser.add_argument("--no-gnss", dest="gnss", action="store_false", help="the drive has no GNSS")
+    add("--gnss-noise-m", float, "white noise, sigma of each horizontal axis; vertical errors are 1.5 times as large")
+    add("--gnss-drift-m", float, "slowly changing error, sigma of each horizontal axis")
+    add("--gnss-bias-m", float, "constant error of each drive, sigma of each horizontal axis")
+    add("--gnss-outliers", float, "fraction of samples that are 5 to 40 m off", metavar="FRACTION")
+    add("--gnss-offset-s", float, "added to the GNSS timestamps")
+    parser.add_argument("--rough-poses", action="store_true", help="the manifest has a rough trajectory")
+    add("--rough-noise-m", float, "sigma of each axis of the rough positions")
+    add("--rough-noise-deg", float, "sigma of each axis of the rough rotations")
+
+    add("--perturb-rotation-deg", float, "norm of the error of each given extrinsic rotation, in a random direction")
+    add("--perturb-translation-m", float, "norm of the error of each given camera position, in a random direction")
+    parser.add_argument("--declare-sigmas", action="store_true", help="the manifest says how good the calibration is")
+    parser.add_argument("--tight", action="store_true", help="the manifest declares 0.01 degrees and 1 mm")
+    parser.add_argument("--wrong-camera", metavar="NAME", help="this camera's given rotation is wrong")
+    add("--wrong-by-deg", float, "by how much")
+    parser.set_defaults(run=run)
+
+
+def options_from(arguments: argparse.Namespace) -> SynthOptions:
+    """The options that parsed arguments ask for."""
+    values = {field.name: getattr(arguments, field.name) for field in fields(SynthOptions)}
+    values["world"] = World(values["world"])
+    values["speed_profile"] = SpeedProfile(values["speed_profile"])
+    return SynthOptions(**values)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Render what the arguments ask for."""
+    options = options_from(arguments)
+    # The renderer's compiled kernels take a second to load; other subcommands do not pay for it.
+    from mrasfm_engine.synthetic.drive_writer import render_drives
+
+    with Progress(transient=True) as bar:
+        task = bar.add_task("rendering", total=None)
+
+        def report(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        folders = render_drives(options, arguments.out, force=arguments.force, progress=report)
+    for folder in folders:
+        print(folder)
+    return 0

@@ -1,0 +1,123 @@
+"""Settings of the engine, one comment a field. `--config FILE` takes a TOML file with the same sections and names."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mrasfm_engine.errors import InputError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class FeatureConfig(_Section):
+    """Extraction of keypoints."""
+
+    max_keypoints: Count = 2048  # a image, strongest first; 1024 costs accuracy
+    contrast_threshold: Positive = 0.02  # half of SIFT's usual value, so that asphalt and shade yield keypoints too
+    max_side_px: Count = 1600  # larger images are extracted at reduced size; coordinates stay those of the full image
+
+
+class PairConfig(_Section):
+    """Which image pairs are matched."""
+
+    window_units: Count = 4  # without a prior: how many following units a camera is matched with
+    cross_window_units: Annotated[int, Field(ge=0)] = 2  # the same across cameras that look in similar directions
+    pairs_per_image: Count = 16  # with a prior: best pairs by overlap an image
+    max_depth_m: Positive = 50.0  # viewing frustums end here
+    max_view_angle_deg: Positive = 75.0  # between optical axes
+    min_overlap: Positive = 0.08  # fraction of one image's frustum samples seen by the other
+    revisit_pairs_per_unit: Annotated[int, Field(ge=0)] = 3  # without a prior: similar units outside the window
+
+
+class MatchConfig(_Section):
+    """Nearest neighbours and their verification."""
+
+    ratio: Positive = 0.8  # of the distances to the best and second best descriptor
+    min_matches: Count = 15  # pairs with fewer matches or inliers are dropped
+    max_error_px: Positive = 2.0  # epipolar distance of an inlier
+    calibration_error_px: Positive = 8.0  # the same between cameras of one unit, where calibration gives the geometry
+
+
+class MappingConfig(_Section):
+    """The incremental loop."""
+
+    max_error_px: Positive = 4.0  # reprojection error of an observation while poses still settle
+    filter_error_px: Positive = 3.0  # and in the final scene
+    min_angle_deg: Positive = 1.0  # of a point's rays; below it depth is mostly noise
+    min_pnp_inliers: Count = 20  # of a unit over all its cameras
+    min_pnp_inlier_ratio: Positive = 0.2
+    local_units: Count = 6  # units that vary in local adjustment
+    local_every: Count = 2  # registered units between local adjustments
+    global_growth: Positive = 0.4  # global adjustment when this fraction of units was registered since the last
+
+
+class AdjustmentConfig(_Section):
+    """Camera set bundle adjustment."""
+
+    loss_scale: Positive = 2.0  # of the Cauchy loss, in standard deviations of an observation
+    sigma_rotation_deg: Positive = 2.0  # prior of rig_from_cam where the manifest gives none
+    sigma_translation_m: Positive = 0.05
+    sigma_focal: Positive = 0.002  # prior of a focal length relative to itself, where focal lengths vary
+    refine_calibration: bool = True  # rig_from_cam, where motion or GNSS make it observable
+    refine_focal: bool = False  # one factor for fx and fy a camera, with its prior
+    min_heading_change_deg: Positive = 15.0  # without GNSS, calibration is held on straighter drives
+
+
+class GnssConfig(_Section):
+    """Use of the receiver's positions."""
+
+    correlation_time_s: Positive = 1.0  # samples closer than this share most of their error
+    max_speed_mps: Positive = 70.0  # faster steps between samples are jumps
+    outlier_sigmas: Positive = 4.0  # residuals over this many sigmas after alignment are rejected
+    max_time_gap_s: Positive = 2.0  # no interpolation across larger gaps
+
+
+class EngineConfig(_Section):
+    """All settings of a reconstruction."""
+
+    features: FeatureConfig = FeatureConfig()
+    pairs: PairConfig = PairConfig()
+    matching: MatchConfig = MatchConfig()
+    mapping: MappingConfig = MappingConfig()
+    adjustment: AdjustmentConfig = AdjustmentConfig()
+    gnss: GnssConfig = GnssConfig()
+    use_gnss: bool = True
+    seed: int = 0
+    threads: Count = os.cpu_count() or 1
+
+
+def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
+    """The settings in a TOML file over the defaults, and `overrides` (top-level fields) over those.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be read or a setting is unknown or out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}", remedy="Give an existing file.") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path} is not TOML: {error}", remedy="See the README for an example.") from error
+    try:
+        return EngineConfig.model_validate(values | overrides)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{path or 'settings'}: {field}: {first['msg']}",
+            remedy="The settings and their meaning stand in mrasfm_engine/config.py.",
+        ) from error

@@ -1,0 +1,112 @@
+"""Is `rig_from_cam` given as its inverse? Found on the first units, before the long work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.correspondence.matching import Matcher
+from mrasfm_engine.correspondence.verification import MIN_FORWARD, essential_inliers, in_front_of_both
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures
+
+Floats = NDArray[np.float64]
+
+MIN_INLIERS = 50
+CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of the inverse, and of what was given, for a verdict
+MIN_EVIDENCE = 2  # unit pairs, or image pairs, that must say so
+
+
+def require_calibration_direction(
+    drive: Drive, images: Sequence[int], features: Sequence[ImageFeatures], matcher: Matcher, config: MatchConfig
+) -> None:
+    """Refuse a rig whose inverse explains the images clearly better.
+
+    Two signs are looked for. All cameras must find the car moving in one direction of the rig; under the inverse of
+    differently turned cameras they don't. And matches between cameras of one unit must lie in front of both; with the
+    baseline reversed they lie behind.
+
+    Parameters
+    ----------
+    images, features
+        Indices of some images of the drive's first units, and their features.
+
+    Raises
+    ------
+    InputError
+        Where the calibration is the wrong way round.
+    """
+    kinds, params = pack_cameras(drive.cameras)
+    prepared = [matcher.prepare(f) for f in features]
+    rays = [
+        unproject_pixels(int(kinds[drive.images[i].camera]), params[drive.images[i].camera], f.xy_px)
+        for i, f in zip(images, features, strict=True)
+    ]
+    where = {(drive.images[i].unit, drive.images[i].camera): k for k, i in enumerate(images)}
+
+    def verified(a: int, b: int) -> tuple[Floats, Floats] | None:
+        matches = matcher.match(prepared[a], prepared[b])
+        ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
+        good = essential_inliers(ra, rb, max_error=config.max_error_px / float(params[:, 0].min()))
+        return (ra[good], rb[good]) if good.sum() >= MIN_INLIERS else None
+
+    by_motion = [
+        agreement
+        for u in sorted({unit for unit, _ in where})
+        if (agreement := _motion_agreement(drive, u, where, verified)) is not None
+    ]
+    by_depth = []
+    for (u, ca), a in where.items():
+        for cb in range(ca + 1, len(drive.cameras)):
+            if (u, cb) in where and (found := verified(a, where[u, cb])) is not None:
+                given = se3.inverse(drive.rig_from_cam[cb]) @ drive.rig_from_cam[ca]
+                wrong = drive.rig_from_cam[cb] @ se3.inverse(drive.rig_from_cam[ca])
+                by_depth.append([float(in_front_of_both(pose, *found).mean()) for pose in (given, wrong)])
+    for evidence in (by_motion, by_depth):
+        if len(evidence) >= MIN_EVIDENCE:
+            given_ok, inverse_ok = np.median(np.array(evidence), axis=0)
+            if inverse_ok > CLEARLY_BETTER and given_ok < CLEARLY_WORSE:
+                raise InputError(
+                    "rig.cameras: rig_from_cam looks like its inverse, cam_from_rig: the first units agree "
+                    f"{inverse_ok:.0%} with the inverse and {given_ok:.0%} with what is given",
+                    remedy="Give the camera's pose in the rig: its translation is where the camera sits on the vehicle.",
+                    code="calibration-inverted",
+                )
+
+
+def _motion_agreement(drive: Drive, unit: int, where, verified) -> list[float] | None:  # type: ignore[no-untyped-def]
+    """Length (0..1) of the mean of the cameras' directions of motion in the rig, as given and inverted."""
+    directions = []
+    for camera in range(len(drive.cameras)):
+        if (unit, camera) not in where or (unit + 1, camera) not in where:
+            continue
+        found = verified(where[unit, camera], where[unit + 1, camera])
+        if found is None:
+            continue
+        direction = _direction(*found)
+        if direction is not None:
+            rotation = drive.rig_from_cam[camera, :3, :3]
+            directions.append([rotation @ direction, rotation.T @ direction])
+    if len(directions) < 2:
+        return None
+    mean = np.array(directions).mean(0)
+    return [float(np.linalg.norm(mean[0])), float(np.linalg.norm(mean[1]))]
+
+
+def _direction(rays_a: Floats, rays_b: Floats) -> Floats | None:
+    """Where camera b is, seen from camera a: a unit vector."""
+    ok = (rays_a[:, 2] > MIN_FORWARD) & (rays_b[:, 2] > MIN_FORWARD)
+    a, b = rays_a[ok, :2] / rays_a[ok, 2:], rays_b[ok, :2] / rays_b[ok, 2:]
+    essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, 0.999, 2e-3)
+    if essential is None or essential.shape != (3, 3):
+        return None
+    _, rotation, translation, _ = cv2.recoverPose(essential, a, b, np.eye(3), mask=mask)
+    result: Floats = -(rotation.T @ translation).ravel()
+    return result

@@ -1,0 +1,114 @@
+"""Keypoints and descriptors of all images of a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.io.images import read_image_rgb
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures
+
+DESCRIPTOR_SCALE = 512.0  # COLMAP stores unit-length descriptors times 512 in bytes
+SMALLEST_KEYPOINT_PX = 1e-3
+
+
+class Extractor(Protocol):
+    """Finds keypoints in one image."""
+
+    def extract(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> ImageFeatures:
+        """Keypoints of an image (h, w, 3); where `mask` (h, w) is False nothing is extracted."""
+        ...
+
+
+class SiftExtractor:
+    """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012)."""
+
+    def __init__(self, config: FeatureConfig) -> None:
+        self._config = config
+
+    def extract(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> ImageFeatures:
+        """See `Extractor`."""
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        scale = min(1.0, self._config.max_side_px / max(gray.shape))
+        if scale < 1.0:
+            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        # A detector an image: OpenCV's objects must not be shared between threads.
+        sift = cv2.SIFT_create(
+            nfeatures=self._config.max_keypoints, contrastThreshold=self._config.contrast_threshold
+        )
+        small_mask = None
+        if mask is not None:
+            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
+        if not keypoints:
+            return ImageFeatures(
+                xy_px=np.zeros((0, 2), np.float32),
+                descriptors=np.zeros((0, 128), np.uint8),
+                colors=np.zeros((0, 3), np.uint8),
+            )
+        order = np.argsort([-k.response for k in keypoints], kind="stable")[: self._config.max_keypoints]
+        # OpenCV puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
+        xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (gray.shape[1] / rgb.shape[1], gray.shape[0] / rgb.shape[0])
+        root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_KEYPOINT_PX))
+        column = np.clip(xy[:, 0].astype(int), 0, rgb.shape[1] - 1)
+        row = np.clip(xy[:, 1].astype(int), 0, rgb.shape[0] - 1)
+        return ImageFeatures(
+            xy_px=xy.astype(np.float32),
+            descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
+            colors=np.ascontiguousarray(rgb[row, column]),
+        )
+
+
+def extract_features(
+    drive: Drive,
+    extractor: Extractor,
+    *,
+    threads: int,
+    progress: Callable[[int, int], None] | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> list[ImageFeatures]:
+    """Features of every image of the drive, in the order of `drive.images`.
+
+    Raises
+    ------
+    InputError
+        Where an image cannot be read or has another size than its camera.
+    CancelledError
+        Where `cancel` answers True.
+    """
+
+    def one(index: int) -> ImageFeatures:
+        if cancel is not None and cancel():
+            raise CancelledError
+        image = drive.images[index]
+        camera = drive.cameras[image.camera]
+        rgb = read_image_rgb(drive.root / image.file)
+        if rgb.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"{image.file} has {rgb.shape[1]}x{rgb.shape[0]} pixels, its camera {camera.name} "
+                f"{camera.width}x{camera.height}",
+                remedy="Give the calibration of images of this size, or images of the calibration's size.",
+            )
+        return extractor.extract(rgb, None)
+
+    cv2.setNumThreads(1)
+    result: list[ImageFeatures] = []
+    with ThreadPoolExecutor(threads) as pool:
+        futures = [pool.submit(one, index) for index in range(len(drive.images))]
+        try:
+            for future in futures:
+                result.append(future.result())
+                if progress is not None:
+                    progress(len(result), len(futures))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return result

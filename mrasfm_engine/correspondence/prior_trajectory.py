@@ -1,0 +1,105 @@
+"""Where the units roughly are before any image is looked at: from rough poses, from GNSS, or unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.config import GnssConfig
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import geodesy, se3
+from mrasfm_engine.geometry.gnss_track import GnssTrack, find_gross_errors, rough_trajectory
+from mrasfm_engine.io.heights import ellipsoidal_heights
+from mrasfm_engine.scene.drive import Drive, matrix_from_pose
+from mrasfm_engine.scene.scene import Georeference
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorTrajectory:
+    """What is known of the way before reconstruction. All poses are in one local frame.
+
+    With GNSS the local frame is east-north-up at the track's middle; with rough poses alone it is their world, moved to
+    begin near zero.
+    """
+
+    source: str  # "rough poses", "GNSS" or "none"
+    world_from_rig: Floats | None  # (units, 4, 4)
+    gnss: GnssTrack | None = None
+    antenna_in_rig_m: Floats | None = None
+    georeference: Georeference | None = None
+    rough_world_from_rig: Floats | None = None  # (units, 4, 4)
+    rough_world_from_local: Floats | None = None  # (4, 4)
+
+
+def prior_trajectory(drive: Drive, config: GnssConfig, *, use_gnss: bool) -> PriorTrajectory:
+    """Interpolate what the manifest knows to the units' timestamps.
+
+    Rough poses are preferred where there are both, as they know headings; GNSS then still georeferences.
+    """
+    gnss = drive.manifest.gnss if use_gnss else None
+    track, georeference = (None, None) if gnss is None else _track(drive, config)
+    rough = rough_world_from_local = None
+    if drive.manifest.rough_poses is not None:
+        rough, rough_world_from_local = _rough(drive)
+    antenna = None if gnss is None else np.array(gnss.antenna_in_rig_m)
+    poses, source = rough, "rough poses"
+    if rough is None and track is not None and antenna is not None:
+        poses, source = rough_trajectory(track, drive.timestamps_us, antenna), "GNSS"
+    return PriorTrajectory(
+        source="none" if poses is None else source,
+        world_from_rig=poses,
+        gnss=track,
+        antenna_in_rig_m=antenna,
+        georeference=georeference,
+        rough_world_from_rig=rough,
+        rough_world_from_local=rough_world_from_local,
+    )
+
+
+def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
+    gnss = drive.manifest.gnss
+    if gnss is None or not gnss.samples:
+        raise InputError("gnss.samples is empty", remedy="Give samples, leave gnss out, or use --no-gnss.")
+    geodetic = np.array([(s.latitude_deg, s.longitude_deg, 0.0) for s in gnss.samples])
+    geodetic[:, 2] = ellipsoidal_heights(gnss)
+    origin = np.median(geodetic, axis=0)
+    ecef_from_local = geodesy.ecef_from_local(origin)
+    position = geodesy.local_from_geodetic(geodetic, ecef_from_local)
+    sigma = np.array([(s.sigma_horizontal_m, s.sigma_horizontal_m, s.sigma_vertical_m) for s in gnss.samples])
+    times = np.array([s.timestamp_us for s in gnss.samples], dtype=np.int64)
+    bad = find_gross_errors(times, position, sigma, outlier_sigmas=config.outlier_sigmas)
+    return (
+        GnssTrack(timestamps_us=times, position_m=position, sigma_m=sigma, good=~bad),
+        Georeference(
+            origin_latitude_deg=float(origin[0]),
+            origin_longitude_deg=float(origin[1]),
+            origin_ellipsoidal_height_m=float(origin[2]),
+            height_datum=gnss.height_datum,
+            ecef_from_local=ecef_from_local,
+        ),
+    )
+
+
+def _rough(drive: Drive) -> tuple[Floats, Floats]:
+    """Rough poses at the units' times in a local frame near zero, and the shift back."""
+    rough = drive.manifest.rough_poses
+    assert rough is not None
+    times = np.array([p.timestamp_us for p in rough.poses], dtype=np.int64)
+    if (np.diff(times) <= 0).any():
+        raise InputError("rough_poses.poses are not ascending in time", remedy="Sort them and drop repeated timestamps.")
+    poses = np.stack([matrix_from_pose(p.world_from_rig) for p in rough.poses])
+    shift = np.round(poses[0, :3, 3])
+    poses[:, :3, 3] -= shift
+    at = drive.timestamps_us
+    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1)) if len(times) > 1 else None
+    if after is None:
+        return np.repeat(poses, len(at), axis=0), se3.transform(np.eye(3), shift)
+    fraction = np.clip((at - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
+    a, b = poses[after - 1], poses[after]
+    rotation = se3.slerp(a[:, :3, :3], b[:, :3, :3], fraction)
+    position = a[:, :3, 3] + fraction[:, None] * (b[:, :3, 3] - a[:, :3, 3])
+    return se3.transform(rotation, position), se3.transform(np.eye(3), shift)

@@ -1,0 +1,120 @@
+"""A receiver's track in a local frame: gross errors found, positions and headings at other times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+NEIGHBOURS = 5  # samples on each side that a sample is compared with
+NEIGHBOUR_SPAN_S = 3.0
+MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
+HEADING_WINDOWS_S = (0.5, 1.0, 2.0, 4.0, 8.0)  # half widths tried, the narrowest that shows a direction is used
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssTrack:
+    """Positions of the antenna in a local east-north-up frame, ascending in time."""
+
+    timestamps_us: Ints  # (n,)
+    position_m: Floats  # (n, 3)
+    sigma_m: Floats  # (n, 3)
+    good: Bools  # (n,) False for gross errors
+
+    def at(self, timestamps_us: Ints, *, max_gap_us: int) -> tuple[Floats, Floats]:
+        """Positions and sigmas (m, 3) at other times, linear between good samples; NaN outside and in larger gaps."""
+        t, p, s = self.timestamps_us[self.good], self.position_m[self.good], self.sigma_m[self.good]
+        position, sigma = np.full((len(timestamps_us), 3), np.nan), np.full((len(timestamps_us), 3), np.nan)
+        if not len(t):
+            return position, sigma
+        after = np.clip(np.searchsorted(t, timestamps_us), 1, max(len(t) - 1, 1)) if len(t) > 1 else None
+        if after is None:
+            same = timestamps_us == t[0]
+            position[same], sigma[same] = p[0], s[0]
+            return position, sigma
+        gap = t[after] - t[after - 1]
+        fraction = (timestamps_us - t[after - 1]) / gap
+        inside = (fraction >= 0) & (fraction <= 1) & ((gap <= max_gap_us) | (fraction == 0) | (fraction == 1))
+        blend = p[after - 1] + fraction[:, None] * (p[after] - p[after - 1])
+        position[inside] = blend[inside]
+        sigma[inside] = np.maximum(s[after - 1], s[after])[inside]
+        return position, sigma
+
+
+def find_gross_errors(timestamps_us: Ints, position_m: Floats, sigma_m: Floats, *, outlier_sigmas: float) -> Bools:
+    """Which samples (n,) are far from the line through their neighbours in time.
+
+    The line is fitted with L1 weights, so that single neighbours that are wrong themselves do little.
+    """
+    n = len(timestamps_us)
+    bad = np.zeros(n, dtype=np.bool_)
+    t = timestamps_us / 1e6
+    for i in range(n):
+        lo, hi = max(0, i - NEIGHBOURS), min(n, i + NEIGHBOURS + 1)
+        near = np.array([k for k in range(lo, hi) if k != i and abs(t[k] - t[i]) <= NEIGHBOUR_SPAN_S], dtype=np.int64)
+        if len(near) < 4:
+            continue
+        predicted = _line_at(t[near] - t[i], position_m[near])
+        off = np.linalg.norm((position_m[i] - predicted) / sigma_m[i])
+        bad[i] = off > outlier_sigmas and np.linalg.norm(position_m[i] - predicted) > MIN_JUMP_M
+    return bad
+
+
+def _line_at(dt: Floats, position: Floats) -> Floats:
+    """Value (3,) at dt = 0 of the line through positions (n, 3), fitted with L1 weights."""
+    a = np.stack([np.ones_like(dt), dt], 1)
+    weights = np.ones(len(dt))
+    line = np.zeros((2, position.shape[1]))
+    for _ in range(8):
+        line = np.linalg.lstsq(a * weights[:, None], position * weights[:, None], rcond=None)[0]
+        weights = 1.0 / np.sqrt(np.maximum(np.linalg.norm(position - a @ line, axis=1), 0.1))
+    result: Floats = line[0]
+    return result
+
+
+def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Floats) -> Floats | None:
+    """Poses `world_from_rig` (m, 4, 4) from positions alone: heading along the track, level, lever arm applied.
+
+    Where the car stands, it keeps the heading it came with (or leaves with). None where the track shows no direction at
+    all, or does not cover most of the times.
+    """
+    t, p = track.timestamps_us[track.good] / 1e6, track.position_m[track.good]
+    if len(t) < 3:
+        return None
+    noise = float(np.median(track.sigma_m[track.good, :2]))
+    times = np.clip(timestamps_us / 1e6, t[0], t[-1])
+    position, heading = np.empty((len(times), 3)), np.full(len(times), np.nan)
+    for i, now in enumerate(times):
+        for half in HEADING_WINDOWS_S:
+            near = np.flatnonzero(np.abs(t - now) <= half)
+            if len(near) < 3:
+                continue
+            centre, velocity = _fit_motion(t[near] - now, p[near])
+            position[i] = centre
+            spread = float(np.sqrt(((t[near] - t[near].mean()) ** 2).sum()))
+            if np.linalg.norm(velocity[:2]) * spread > 3.0 * noise:
+                heading[i] = np.arctan2(velocity[1], velocity[0])
+                break
+        else:
+            position[i] = np.array([np.interp(now, t, p[:, k]) for k in range(3)])
+    known = np.flatnonzero(np.isfinite(heading))
+    if not len(known):
+        return None
+    nearest = known[np.abs(times[:, None] - times[None, known]).argmin(1)]
+    heading = heading[nearest]
+    rotation = se3.exp_so3(np.stack([np.zeros_like(heading), np.zeros_like(heading), heading], -1))
+    return se3.transform(rotation, position - rotation @ antenna_in_rig_m)
+
+
+def _fit_motion(dt: Floats, position: Floats) -> tuple[Floats, Floats]:
+    """Position at dt = 0 and mean velocity by least squares."""
+    a = np.stack([np.ones_like(dt), dt], 1)
+    line = np.linalg.lstsq(a, position, rcond=None)[0]
+    return line[0], line[1]

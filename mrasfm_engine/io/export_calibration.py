@@ -1,0 +1,57 @@
+"""`calibration.json`: the calibration as given, as refined, and how well the drive observed it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from mrasfm_engine.scene.scene import CameraCalibration, Scene
+from schemas import CAMERA_MODELS, Camera
+
+
+def calibration_document(scene: Scene) -> dict[str, Any]:
+    """By camera: `given`, `refined`, `difference` (about and along the rig's axes), `sigma` and `observed`.
+
+    `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
+    A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
+    """
+    cameras = zip(scene.drive.cameras, scene.calibration, strict=True)
+    return {
+        "version": 1,
+        "axes": "rotation_vector_deg, translation_m, sigmas and observed are about and along the rig's x, y, z",
+        "cameras": {camera.name: _camera(camera, refined) for camera, refined in cameras},
+    }
+
+
+def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
+    given = matrix_from_pose(camera.rig_from_cam)
+    names = CAMERA_MODELS[camera.model]
+    rotation = np.degrees(se3.log_so3(refined.rig_from_cam[:3, :3] @ given[:3, :3].T))
+    focal = [k for k, name in enumerate(names) if name in ("f", "fx", "fy")]
+    sigma = {
+        "rotation_deg": refined.sigma_rotation_deg,
+        "translation_m": refined.sigma_translation_m,
+        "focal_px": np.array(refined.sigma_focal_px),
+    }
+    return {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "param_names": list(names),
+        "given": {"rig_from_cam": camera.rig_from_cam.model_dump(), "params": list(camera.params)},
+        "refined": {
+            "rig_from_cam": pose_from_matrix(refined.rig_from_cam).model_dump(),
+            "params": refined.params.tolist(),
+        },
+        "difference": {
+            "rotation_vector_deg": rotation.tolist(),
+            "rotation_deg": float(np.linalg.norm(rotation)),
+            "translation_m": (refined.rig_from_cam[:3, 3] - given[:3, 3]).tolist(),
+            "focal_px": float(np.mean([refined.params[k] - camera.params[k] for k in focal])),
+        },
+        "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},
+        "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()},
+    }

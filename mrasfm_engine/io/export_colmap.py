@@ -1,0 +1,131 @@
+"""The scene as a COLMAP model with rigs and frames, binary and text.
+
+The binary files are packed here: point by point through pycolmap's Python objects takes many times as long. Ids:
+image = index + 1, frame = unit + 1, camera = index + 1, point = index + 1; keypoints keep their indices. The rig frame
+is the vehicle's, so the rig's reference sensor is a virtual inertial unit and every camera has a `sensor_from_rig`.
+
+Source of the layout: COLMAP 4.2, src/colmap/scene/reconstruction_io_binary.cc.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.export_poses import rig_from_world, world_from_cam
+from mrasfm_engine.scene.scene import Scene
+
+Floats = NDArray[np.float64]
+
+RIG_ID = 1
+REFERENCE_SENSOR_ID = 1
+SENSOR_CAMERA, SENSOR_IMU = 0, 1
+BINARY_FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin")
+TEXT_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt")
+
+
+def write_model(scene: Scene, folder: Path) -> None:
+    """Write the binary model of all registered images into an existing folder."""
+    (folder / "cameras.bin").write_bytes(_cameras(scene))
+    (folder / "rigs.bin").write_bytes(_rigs(scene))
+    (folder / "frames.bin").write_bytes(_frames(scene))
+    (folder / "images.bin").write_bytes(_images(scene))
+    (folder / "points3D.bin").write_bytes(_points(scene))
+
+
+def write_text_model(binary_folder: Path, folder: Path) -> None:
+    """Write the text model of a binary one into an existing folder."""
+    pycolmap.Reconstruction(str(binary_folder)).write_text(str(folder))
+
+
+def text_model_fits(scene: Scene) -> bool:
+    """Whether COLMAP's text format can hold the image names: it ends a name at the first space."""
+    return not any(any(c.isspace() for c in image.file) for image in scene.drive.images)
+
+
+def images_of_units(scene: Scene) -> dict[int, list[int]]:
+    """Registered images by unit, for units that have any; both rising."""
+    units: dict[int, list[int]] = {}
+    for i, image in enumerate(scene.drive.images):
+        if scene.image_registered[i]:
+            units.setdefault(image.unit, []).append(i)
+    return dict(sorted(units.items()))
+
+
+def _wxyz_and_translation(transforms: Floats) -> Floats:
+    """COLMAP's seven numbers (..., 7) of a pose: w x y z of the quaternion, translation."""
+    q = se3.quaternion_from_rotation(transforms[..., :3, :3])
+    return np.concatenate([q[..., 3:], q[..., :3], transforms[..., :3, 3]], -1)
+
+
+def _cameras(scene: Scene) -> bytes:
+    parts = [struct.pack("<Q", len(scene.drive.cameras))]
+    for k, (camera, refined) in enumerate(zip(scene.drive.cameras, scene.calibration, strict=True)):
+        model = int(getattr(pycolmap.CameraModelId, camera.model).value)
+        parts.append(struct.pack("<IiQQ", k + 1, model, camera.width, camera.height))
+        parts.append(np.asarray(refined.params, dtype="<f8").tobytes())
+    return b"".join(parts)
+
+
+def _rigs(scene: Scene) -> bytes:
+    poses = _wxyz_and_translation(se3.inverse(np.stack([c.rig_from_cam for c in scene.calibration])))
+    parts = [struct.pack("<QII", 1, RIG_ID, len(poses) + 1), struct.pack("<iI", SENSOR_IMU, REFERENCE_SENSOR_ID)]
+    parts += [struct.pack("<iIB7d", SENSOR_CAMERA, k + 1, 1, *pose) for k, pose in enumerate(poses)]
+    return b"".join(parts)
+
+
+def _frames(scene: Scene) -> bytes:
+    units = images_of_units(scene)
+    poses = _wxyz_and_translation(rig_from_world(scene))
+    parts = [struct.pack("<Q", len(units))]
+    for unit, images in units.items():
+        parts.append(struct.pack("<II7dI", unit + 1, RIG_ID, *poses[unit], len(images)))
+        parts += [struct.pack("<iIQ", SENSOR_CAMERA, scene.drive.images[i].camera + 1, i + 1) for i in images]
+    return b"".join(parts)
+
+
+def _images(scene: Scene) -> bytes:
+    poses = _wxyz_and_translation(se3.inverse(world_from_cam(scene)))
+    observations = _observations_by_image(scene)
+    registered = np.flatnonzero(scene.image_registered)
+    parts = [struct.pack("<Q", len(registered))]
+    for i in registered.tolist():
+        image, xy = scene.drive.images[i], scene.features[i].xy_px
+        rows = np.zeros(len(xy), dtype=[("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+        rows["x"], rows["y"], rows["point"] = xy[:, 0], xy[:, 1], -1
+        mine = observations[i]
+        rows["point"][scene.observation_keypoint[mine]] = scene.observation_point[mine] + 1
+        parts.append(struct.pack("<I7dI", i + 1, *poses[i], image.camera + 1))
+        parts.append(image.file.encode("utf-8") + b"\0" + struct.pack("<Q", len(xy)) + rows.tobytes())
+    return b"".join(parts)
+
+
+def _observations_by_image(scene: Scene) -> list[NDArray[np.int64]]:
+    order = np.argsort(scene.observation_image, kind="stable")
+    ends = np.cumsum(np.bincount(scene.observation_image, minlength=len(scene.drive.images)))
+    return np.split(order, ends[:-1])
+
+
+def _points(scene: Scene) -> bytes:
+    n = len(scene.points_m)
+    lengths = np.bincount(scene.observation_point, minlength=n)
+    heads = np.zeros(
+        n, dtype=[("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+    )
+    heads["id"], heads["xyz"], heads["color"] = np.arange(1, n + 1), scene.points_m, scene.point_colors
+    heads["error"], heads["length"] = scene.point_error_px, lengths
+    tracks = np.zeros(len(scene.observation_point), dtype=[("image", "<u4"), ("keypoint", "<u4")])
+    tracks["image"], tracks["keypoint"] = scene.observation_image + 1, scene.observation_keypoint
+    # Heads and tracks of different lengths alternate: scatter both to their places in one buffer.
+    head_size, track_size = heads.dtype.itemsize, tracks.dtype.itemsize
+    out = np.zeros(n * head_size + len(tracks) * track_size, dtype=np.uint8)
+    starts = np.arange(n) * head_size + (np.cumsum(lengths) - lengths) * track_size
+    out[starts[:, None] + np.arange(head_size)] = heads.view(np.uint8).reshape(n, head_size)
+    places = (scene.observation_point + 1) * head_size + np.arange(len(tracks)) * track_size
+    out[places[:, None] + np.arange(track_size)] = tracks.view(np.uint8).reshape(len(tracks), track_size)
+    return struct.pack("<Q", n) + out.tobytes()

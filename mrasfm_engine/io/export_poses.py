@@ -1,0 +1,99 @@
+"""`poses.json` and `poses.tum`: where the vehicle and its cameras were."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import geodesy, se3
+from mrasfm_engine.io.trajectory_file import format_tum
+from mrasfm_engine.scene.drive import pose_from_matrix
+from mrasfm_engine.scene.scene import Scene
+
+Floats = NDArray[np.float64]
+
+
+def world_from_cam(scene: Scene) -> Floats:
+    """Poses (images, 4, 4) of all images at their unit's time; NaN for images that are not registered."""
+    images = scene.drive.images
+    units = np.array([image.unit for image in images], dtype=np.int64)
+    cameras = np.array([image.camera for image in images], dtype=np.int64)
+    rig_from_cam = np.stack([camera.rig_from_cam for camera in scene.calibration])
+    poses: Floats = scene.world_from_rig[units] @ rig_from_cam[cameras]
+    poses[~scene.image_registered] = np.nan
+    return poses
+
+
+def poses_text(scene: Scene) -> str:
+    """`poses.tum`: `world_from_rig` of the registered units."""
+    kept = scene.unit_registered
+    return format_tum(scene.drive.timestamps_us[kept].tolist(), scene.world_from_rig[kept])
+
+
+def poses_document(scene: Scene) -> dict[str, Any]:
+    """`poses.json`: every unit and every image of the drive, with a pose where it is registered.
+
+    A value that does not exist (the pose of what is not registered, the geodetic position of a scene that is not
+    georeferenced, an unknown sigma) is absent, never zero or null.
+    """
+    cameras = world_from_cam(scene)
+    unit_places, camera_places = _geodetic(scene, scene.world_from_rig), _geodetic(scene, cameras)
+    units = []
+    for u, frame in enumerate(scene.drive.manifest.frames):
+        registered = bool(scene.unit_registered[u])
+        unit: dict[str, Any] = {
+            "timestamp_us": frame.timestamp_us,
+            "source_frame": frame.source_frame,
+            "registered": registered,
+        }
+        if registered:
+            unit["world_from_rig"] = pose_from_matrix(scene.world_from_rig[u]).model_dump()
+            if np.isfinite(scene.sigma_position_m[u]).all():
+                unit["sigma_position_m"] = scene.sigma_position_m[u].tolist()
+            unit |= _place(unit_places, u)
+        units.append(unit)
+    images = []
+    for i, source in enumerate(scene.drive.images):
+        image: dict[str, Any] = {
+            "file": source.file,
+            "camera": scene.drive.cameras[source.camera].name,
+            "unit": source.unit,
+            "timestamp_us": source.timestamp_us,
+            "registered": bool(scene.image_registered[i]),
+        }
+        if image["registered"]:
+            image["world_from_cam"] = pose_from_matrix(cameras[i]).model_dump()
+            image |= _place(camera_places, i)
+        images.append(image)
+    return {
+        "version": 1,
+        "world": "the local frame of frame.json",
+        "pose_time": "an image's pose is at its unit's timestamp_us",
+        "units": units,
+        "images": images,
+    }
+
+
+def _geodetic(scene: Scene, world_from_any: Floats) -> Floats | None:
+    """Geodetic coordinates (n, 3) of the poses' origins; NaN where a pose is."""
+    if scene.georeference is None:
+        return None
+    positions = world_from_any[:, :3, 3]
+    known = np.isfinite(positions).all(axis=1)
+    places = np.full(positions.shape, np.nan)
+    places[known] = geodesy.geodetic_from_local(positions[known], scene.georeference.ecef_from_local)
+    return places
+
+
+def _place(places: Floats | None, index: int) -> dict[str, Any]:
+    if places is None:
+        return {}
+    latitude, longitude, height = places[index].tolist()
+    return {"geodetic": {"latitude_deg": latitude, "longitude_deg": longitude, "ellipsoidal_height_m": height}}
+
+
+def rig_from_world(scene: Scene) -> Floats:
+    """Poses (units, 4, 4) as COLMAP's frames have them; NaN for units that are not registered."""
+    return se3.inverse(scene.world_from_rig)

@@ -1,0 +1,218 @@
+"""Writes a scene's files, checks them, and puts them in place.
+
+A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
+`poses.json`, `calibration.json`, `frame.json`, `features.db` and `report.json`. One with a `report.json` is complete.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import MrasfmError, StorageError
+from mrasfm_engine.io import (
+    export_calibration,
+    export_check,
+    export_check_model,
+    export_colmap,
+    export_frame,
+    export_ply,
+    export_poses,
+    feature_database,
+)
+from mrasfm_engine.scene.scene import Scene
+
+COMPLETE_MARK = "report.json"
+LEFTOVER_AGE_S = 3600.0
+
+
+def write_scene(scene: Scene, out: Path, report: Mapping[str, Any]) -> None:
+    """Write all files of a scene into the folder `out`.
+
+    They are written into a temporary folder, read back and compared with the scene, and only then moved: an interrupted
+    or failed run leaves nothing half-written. A new folder appears at once; into an existing one the files move one by
+    one, its old `report.json` goes first and the new one comes last. Other files in it are kept.
+
+    Parameters
+    ----------
+    report
+        What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths.
+
+    Raises
+    ------
+    StorageError
+        Where the disk is full or cannot be written.
+    MrasfmError
+        Where the scene contradicts itself, or a file that was written does not read back.
+    """
+    _check_scene(scene)
+    out = out.resolve()
+    try:
+        # Inside an existing folder, because that may be another file system than its parent.
+        home = out if out.is_dir() else out.parent
+        _prepare(scene, out, home)
+        work = home / f".{out.name}.partial-{os.getpid()}-{secrets.token_hex(4)}"
+        work.mkdir()
+        try:
+            _write(scene, work, report)
+            _put_in_place(work, out)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        remedy = "Free space on this disk, or choose a folder that can be written."
+        raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
+
+
+def summary(scene: Scene) -> dict[str, Any]:
+    """The figures of `report.json`'s `summary`."""
+    figures: dict[str, Any] = {
+        "georeferenced": scene.georeference is not None,
+        "registered_units": int(scene.unit_registered.sum()),
+        "total_units": len(scene.unit_registered),
+        "registered_images": int(scene.image_registered.sum()),
+        "total_images": len(scene.image_registered),
+        "points": len(scene.points_m),
+        "observations": len(scene.observation_point),
+        "notes": list(scene.notes),
+    }
+    if len(scene.points_m):
+        figures["mean_track_length"] = len(scene.observation_point) / len(scene.points_m)
+        figures["mean_reprojection_error_px"] = float(scene.point_error_px.mean())
+    return figures
+
+
+def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
+    model, text = work / "model", work / "model" / "text"
+    text.mkdir(parents=True)
+    export_colmap.write_model(scene, model)
+    export_check_model.check_binary_model(scene, model)
+    export_colmap.write_text_model(model, text)
+    readable = export_colmap.text_model_fits(scene)
+    export_check_model.check_text_model(scene, text, through_colmap=readable)
+    figures = summary(scene)
+    if not readable:
+        shutil.rmtree(text)
+        figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
+    export_ply.write_ply(scene, work / "points.ply")
+    export_check.check_ply(scene, work / "points.ply")
+    feature_database.write_features(scene, work / "features.db")
+    export_check.check_features(scene, work / "features.db")
+    (work / "poses.tum").write_text(export_poses.poses_text(scene), encoding="utf-8")
+    _write_json(work / "poses.json", export_poses.poses_document(scene))
+    _write_json(work / "calibration.json", export_calibration.calibration_document(scene))
+    _write_json(work / "frame.json", export_frame.frame_document(scene))
+    _write_json(work / COMPLETE_MARK, {**report, "summary": figures})
+    export_check.check_documents(scene, work)
+
+
+def _write_json(path: Path, document: Mapping[str, Any]) -> None:
+    try:
+        text = json.dumps(document, allow_nan=False, indent=1, ensure_ascii=False, default=_plain)
+    except (TypeError, ValueError) as error:
+        raise MrasfmError(
+            f"{path.name} cannot be written: {error}",
+            remedy="This is a defect of mrasfm, please report it.",
+            code="export-check-failed",
+        ) from error
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def _prepare(scene: Scene, out: Path, home: Path) -> None:
+    """Make the folder to work in, clear what killed runs left there, and see that the files will fit."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
+    home.mkdir(parents=True, exist_ok=True)
+    for leftover in home.glob(f".{out.name}.partial-*"):
+        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
+            shutil.rmtree(leftover, ignore_errors=True)
+    needed, free = _size_bytes(scene), shutil.disk_usage(home).free
+    if free < needed:
+        raise StorageError(
+            f"{out} needs about {needed / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
+            remedy="Free space on this disk, or choose another folder.",
+        )
+
+
+def _size_bytes(scene: Scene) -> int:
+    """About what the files take, with the database's write-ahead log."""
+    keypoints = sum(len(f.xy_px) for f in scene.features)
+    matches = sum(len(p.matches) for p in scene.pairs)
+    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 300 * len(scene.points_m) + 2_000_000
+
+
+def _put_in_place(work: Path, out: Path) -> None:
+    if not out.exists():
+        work.rename(out)
+        return
+    (out / COMPLETE_MARK).unlink(missing_ok=True)
+    for item in sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK):
+        target = out / item.name
+        if item.is_dir() and target.is_dir():
+            target.rename(work / f"old-{item.name}")
+        item.rename(target)
+
+
+def _check_scene(scene: Scene) -> None:
+    """Refuse a scene whose arrays contradict each other before anything is written."""
+    for what, right in _consistency(scene):
+        if not right:
+            raise MrasfmError(
+                f"the scene contradicts itself: {what}",
+                remedy="This is a defect of mrasfm, please report it.",
+                code="inconsistent-scene",
+            )
+
+
+def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
+    """What must not be, and whether it is not; a later check relies on the earlier ones."""
+    images, units, points = len(scene.drive.images), len(scene.drive.manifest.frames), len(scene.points_m)
+    shapes = [
+        (scene.world_from_rig.shape, (units, 4, 4)),
+        (scene.sigma_position_m.shape, (units, 3)),
+        (scene.unit_registered.shape, (units,)),
+        (scene.image_registered.shape, (images,)),
+        (scene.point_colors.shape, (points, 3)),
+        (scene.point_error_px.shape, (points,)),
+        (len(scene.calibration), len(scene.drive.cameras)),
+    ]
+    unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)
+    sizes = np.array([len(features.xy_px) for features in scene.features], dtype=np.int64)
+    point, image, keypoint = scene.observation_point, scene.observation_image, scene.observation_keypoint
+    yield "array sizes do not fit the drive", all(actual == expected for actual, expected in shapes)
+    yield "it does not have features for every image", len(sizes) == images
+    yield "a registered unit's pose is not finite", _finite(scene.world_from_rig[scene.unit_registered])
+    yield "an image is registered without its unit", not (scene.image_registered & ~scene.unit_registered[unit]).any()
+    yield "a point is not finite", _finite(scene.points_m) and _finite(scene.point_error_px)
+    yield "an observation names no point", _inside(point, points)
+    yield "observations are not sorted by point", not (np.diff(point) < 0).any()
+    yield "an observation names no image", _inside(image, images)
+    yield "an observation's image is not registered", bool(scene.image_registered[image].all())
+    yield "an observation names no keypoint", _inside(keypoint, sizes[image])
+    keys = image * (1 + sizes.max(initial=0)) + keypoint
+    yield "a keypoint observes two points", len(np.unique(keys)) == len(keys)
+
+
+def _finite(values: NDArray[np.float64]) -> bool:
+    return bool(np.isfinite(values).all())
+
+
+def _inside(values: NDArray[np.int64], stop: int | NDArray[np.int64]) -> bool:
+    return bool(((values >= 0) & (values < stop)).all())

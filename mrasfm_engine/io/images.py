@@ -1,0 +1,162 @@
+"""Decodes images and masks; what cannot be trusted is refused by name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular
+from schemas import LabelMap
+from schemas.drive import MAX_IMAGE_SIDE_PX
+
+# OpenCV reads this when it is first imported; headers are checked before decoding in any case.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
+
+import cv2
+
+Bytes = NDArray[np.uint8]
+
+
+def read_image_gray(path: Path) -> Bytes:
+    """An image as (height, width) uint8, as it is stored: EXIF's orientation is not applied.
+
+    16 bits are scaled to 8, an alpha channel is dropped.
+
+    Raises
+    ------
+    InputError
+        That names the file, if it is missing, truncated, damaged or no JPEG or PNG.
+    """
+    data, header = _load(path)
+    if not _needs_conversion(header):
+        return _decode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, path, header)
+    image = _to_8_bits(_decode(data, cv2.IMREAD_UNCHANGED, path, header))
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def read_image_rgb(path: Path) -> Bytes:
+    """An image as (height, width, 3) uint8, red, green, blue; else as `read_image_gray`."""
+    data, header = _load(path)
+    if not _needs_conversion(header):
+        image = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, path, header)
+    else:
+        image = _to_8_bits(_decode(data, cv2.IMREAD_UNCHANGED, path, header))
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=2)
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:
+    """A semantic mask as (height, width) uint8 ids.
+
+    Parameters
+    ----------
+    label_map
+        What ids may occur; Cityscapes' train ids if None.
+
+    Raises
+    ------
+    InputError
+        That names the file, if it is not a complete PNG with one channel of 8 bits, or holds an id that the label map
+        does not have.
+    """
+    data, header = _load(path)
+    check_mask_header(header, path)
+    mask = _decode(data, cv2.IMREAD_UNCHANGED, path, header)
+    ids = (LabelMap.cityscapes() if label_map is None else label_map).ids
+    unknown = [i for i in np.flatnonzero(np.bincount(mask.ravel(), minlength=256)) if int(i) not in ids]
+    if unknown:
+        raise InputError(
+            f"mask {path} holds ids that the label map does not have: {', '.join(str(i) for i in unknown[:10])}",
+            remedy="Add them to label_map.ids in drive.json (without a label_map, ids are Cityscapes' train ids 0 to "
+            "18, and 19 for unlabelled).",
+            code="unknown-label",
+        )
+    return mask
+
+
+def check_mask_header(header: ImageHeader, path: Path) -> None:
+    """Refuse masks whose pixels are not ids.
+
+    Raises
+    ------
+    InputError
+        If the mask is not a PNG with one channel of 8 bits.
+    """
+    if header.format == "PNG" and header.kind is ImageKind.GRAY and header.bits == 8:
+        return
+    if header.format == "JPEG":
+        found = "JPEG, which alters ids"
+    else:
+        found = f"PNG with {header.kind} pixels of {header.bits} bits a channel"
+    raise InputError(
+        f"mask {path} is a {found}",
+        remedy="Save masks as PNG with one gray channel of 8 bits that holds one id a pixel.",
+        code="bad-mask",
+    )
+
+
+def check_image_header(header: ImageHeader, path: Path) -> None:
+    """Refuse images that would be decoded wrongly or in part.
+
+    Raises
+    ------
+    InputError
+        If the file is truncated, or holds CMYK or over 8 bits in JPEG.
+    """
+    if not header.complete:
+        raise InputError(
+            f"image {path} is truncated: its end marker is missing",
+            remedy="Copy it again from its source.",
+            code="truncated-image",
+        )
+    if header.kind is ImageKind.CMYK or (header.format == "JPEG" and header.bits != 8):
+        raise InputError(
+            f"image {path} is a JPEG with {header.kind} pixels of {header.bits} bits, which is not supported",
+            remedy="Convert it to an RGB or gray JPEG of 8 bits, or to PNG.",
+            code="unsupported-image",
+        )
+
+
+def _needs_conversion(header: ImageHeader) -> bool:
+    return header.bits == 16 or header.kind in (ImageKind.RGBA, ImageKind.GRAY_ALPHA)
+
+
+def _load(path: Path) -> tuple[Bytes, ImageHeader]:
+    path = Path(path)
+    try:
+        with open_regular(path) as stream:
+            data = stream.read()
+    except OSError as error:
+        raise InputError(
+            f"image {path} cannot be read: {error.strerror}", remedy="Check its permissions.", code="unreadable-file"
+        ) from error
+    header = header_of(data, path)
+    check_image_header(header, path)
+    return np.frombuffer(data, dtype=np.uint8), header
+
+
+def _decode(data: Bytes, flags: int, path: Path, header: ImageHeader) -> Bytes:
+    try:
+        image = cv2.imdecode(data, flags)
+    except cv2.error:
+        image = None
+    if image is None or image.shape[:2] != (header.height, header.width):
+        raise InputError(
+            f"image {path} is damaged and cannot be decoded",
+            remedy="Copy it again from its source.",
+            code="damaged-image",
+        )
+    return image  # type: ignore[no-any-return]
+
+
+def _to_8_bits(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Bytes:
+    if image.dtype == np.uint16:
+        return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    return image.astype(np.uint8, copy=False)

@@ -1,0 +1,1 @@
+"""Importers: folders as they are distributed become drive bundles."""

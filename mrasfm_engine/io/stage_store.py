@@ -1,0 +1,80 @@
+"""Finished stages on disk, so that a second run does not do them again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.io.drive_bundle import storage_error
+from mrasfm_engine.scene.drive import Drive
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def fingerprint(*parts: object) -> str:
+    """SHA-256 over anything that JSON can write: what a stage's result depends on."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def drive_fingerprint(drive: Drive) -> str:
+    """Of the manifest and of size and modification time of every image."""
+    files = []
+    for image in drive.images:
+        status = (drive.root / image.file).stat()
+        files.append((image.file, status.st_size, status.st_mtime_ns))
+    return fingerprint(drive.manifest.model_dump(mode="json"), files)
+
+
+class StageStore:
+    """Arrays and a small report of every finished stage, in one folder.
+
+    A result is found again only under the same name and fingerprint; writing replaces it in one step.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def load(self, name: str, key: str) -> tuple[Arrays, dict[str, Any]] | None:
+        """Arrays and report of a stage, or None where it has not been finished with this fingerprint."""
+        path = self._folder / f"{name}.npz"
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                header = json.loads(str(archive["header"]))
+                if header["key"] != key:
+                    return None
+                return {k: archive[k] for k in archive.files if k != "header"}, header["report"]
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def save(self, name: str, key: str, arrays: Mapping[str, NDArray[Any]], report: Mapping[str, Any]) -> None:
+        """Keep a finished stage.
+
+        Raises
+        ------
+        StorageError
+            Where the disk is full or cannot be written.
+        """
+        path = self._folder / f"{name}.npz"
+        partial = self._folder / f".{name}.{secrets.token_hex(4)}.partial"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            try:
+                with partial.open("wb") as file:
+                    np.savez(file, header=np.array(json.dumps({"key": key, "report": report})), **dict(arrays))
+                    file.flush()
+                    os.fsync(file.fileno())
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
+        except OSError as error:
+            raise storage_error(path, error) from error

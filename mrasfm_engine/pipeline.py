@@ -1,0 +1,58 @@
+"""From a recorded drive to a scene on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mrasfm_engine import stages
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.io.export_scene import write_scene
+
+
+def reconstruct(
+    drive_folder: Path,
+    out: Path,
+    config: EngineConfig,
+    *,
+    progress: stages.Progress = lambda stage, done, total: None,
+    cancel: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Reconstruct a drive and write the scene into the folder `out`.
+
+    Finished stages are kept in `out/.stages` and not repeated for the same input and settings.
+
+    Parameters
+    ----------
+    drive_folder
+        Holds `drive.json` and the images.
+    progress
+        Called as progress(stage, done, total).
+    cancel
+        Asked now and then; where it answers True the run ends with CancelledError.
+
+    Returns
+    -------
+    dict
+        What `report.json` says.
+
+    Raises
+    ------
+    InputError, ReconstructionError, StorageError, CancelledError
+        See `errors`.
+    """
+    drive = read_drive(drive_folder)
+    run = stages.Run(drive, config, stages.store_of(out), progress, cancel)
+    run.report["drive"] = drive.manifest.name
+    run.report["settings"] = config.model_dump(mode="json")
+    stages.preflight(run)
+    prior = stages.prior(run)
+    stages.probe(run)
+    features = stages.features(run)
+    matches = stages.matches(run, features, prior)
+    model = stages.mapping(run, features, matches, prior)
+    scene = stages.scene(run, model, features, matches, prior)
+    write_scene(scene, out, run.report)
+    return run.report

@@ -1,0 +1,209 @@
+"""Camera set registration: the pose of a rigid unit from points its cameras see, as one.
+
+First one generalised PnP over all cameras. Where that fails, or a camera disagrees with it, every camera is registered
+alone, its pose turned into one of the unit through `rig_from_cam`, and the unit's pose is their robust average (MRASfM,
+section 3(a)); cameras far from it are voted out by name. Either way all images of the unit get their pose from the unit,
+also those that see too little to be registered alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
+from mrasfm_engine.geometry.camera_model import unpack_camera
+from mrasfm_engine.registration.model import Model
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAX_ERROR_PX = 8.0  # of an inlier; wider than elsewhere, as calibration may be off until it is refined
+MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
+MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
+MIN_CAMERA_INLIER_RATIO = 0.25
+VOTE_ROTATION_DEG = 1.0  # votes farther than this from the average are out
+VOTE_TRANSLATION_M = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registration:
+    """How a unit was registered, or why not."""
+
+    unit: int
+    world_from_rig: Floats | None
+    correspondences: int
+    inliers: int
+    method: str  # "joint", "vote" or "none"
+    voted_out: tuple[str, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """Image points of a unit whose tracks have points."""
+
+    xy_px: Floats  # (n, 2)
+    points_m: Floats  # (n, 3)
+    camera: Ints  # (n,)
+
+    def of(self, rows: Ints) -> _Seen:
+        return _Seen(xy_px=self.xy_px[rows], points_m=self.points_m[rows], camera=self.camera[rows])
+
+
+def register_unit(model: Model, unit: int) -> Registration:
+    """Find the pose of a unit from the model's points."""
+    seen = _points_seen(model, unit)
+    needed = model.config.mapping.min_pnp_inliers
+    if len(seen.camera) < needed:
+        return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {needed} are needed")
+    sample = seen.of(_spread(len(seen.camera), MAX_CORRESPONDENCES))
+    pose = _joint_pose(model, sample)
+    inlier = np.zeros(len(seen.camera), dtype=np.bool_)
+    if pose is not None:
+        inlier = _errors_px(model, pose, seen) < MAX_ERROR_PX
+    disagreeing = _disagreeing(model, seen, inlier)
+    method, voted_out = "joint", ()
+    if pose is None or disagreeing or inlier.mean() < model.config.mapping.min_pnp_inlier_ratio:
+        vote, out = _vote(model, sample)
+        if vote is not None:
+            by_vote = _errors_px(model, vote, seen) < MAX_ERROR_PX
+            if by_vote.sum() >= inlier.sum() * 0.9:
+                pose, inlier, method, voted_out = vote, by_vote, "vote", out
+        if method == "joint" and disagreeing:
+            voted_out = disagreeing
+    count = int(inlier.sum())
+    if pose is None or count < needed or count < model.config.mapping.min_pnp_inlier_ratio * len(inlier):
+        return _failed(unit, seen, count, f"only {count} of {len(inlier)} points agree with one pose")
+    return Registration(
+        unit=unit,
+        world_from_rig=pose,
+        correspondences=len(inlier),
+        inliers=count,
+        method=method,
+        voted_out=voted_out,
+    )
+
+
+def _failed(unit: int, seen: _Seen, inliers: int, reason: str) -> Registration:
+    return Registration(
+        unit=unit,
+        world_from_rig=None,
+        correspondences=len(seen.camera),
+        inliers=inliers,
+        method="none",
+        reason=reason,
+    )
+
+
+def _points_seen(model: Model, unit: int) -> _Seen:
+    rows = model.rows_of_unit[unit]
+    tracks = model.tracks.of_keypoint[rows]
+    known = model.solved[tracks]
+    rows, tracks = rows[known], tracks[known]
+    return _Seen(
+        xy_px=model.keypoints.xy_px[rows],
+        points_m=model.state.points_m[tracks],
+        camera=model.keypoints.camera[rows],
+    )
+
+
+def _spread(count: int, limit: int) -> Ints:
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.int64))
+
+
+def cameras_of(model: Model) -> list[pycolmap.Camera]:
+    """The cameras with their current intrinsics, as pycolmap takes them."""
+    return [
+        pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=unpack_camera(c.model, params))
+        for c, params in zip(model.drive.cameras, model.state.camera_params, strict=True)
+    ]
+
+
+def rigid3d(a_from_b: Floats) -> pycolmap.Rigid3d:
+    """A transform as pycolmap takes it."""
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(a_from_b[:3, :3]), a_from_b[:3, 3])
+
+
+def matrix_of(pose: pycolmap.Rigid3d) -> Floats:
+    """A transform of pycolmap's as a matrix."""
+    return se3.transform(pose.rotation.matrix(), pose.translation)
+
+
+def _ransac(model: Model) -> pycolmap.RANSACOptions:
+    options = pycolmap.RANSACOptions()
+    options.max_error = MAX_ERROR_PX
+    options.min_num_trials, options.max_num_trials = 50, 10000
+    options.random_seed = model.config.seed
+    return options
+
+
+def _joint_pose(model: Model, seen: _Seen) -> Floats | None:
+    """world_from_rig by one generalised PnP over all cameras."""
+    result = pycolmap.estimate_and_refine_generalized_absolute_pose(
+        seen.xy_px,
+        seen.points_m,
+        [int(c) for c in seen.camera],
+        [rigid3d(m) for m in se3.inverse(model.state.rig_from_cam)],
+        cameras_of(model),
+        estimation_options=_ransac(model),
+    )
+    return None if result is None else se3.inverse(matrix_of(result["rig_from_world"]))
+
+
+def _errors_px(model: Model, world_from_rig: Floats, seen: _Seen) -> Floats:
+    """Reprojection errors (n,) under a pose of the unit; infinite behind a camera."""
+    cam_from_world = se3.inverse(world_from_rig @ model.state.rig_from_cam)
+    errors = np.full(len(seen.camera), np.inf)
+    for c, camera in enumerate(cameras_of(model)):
+        rows = np.flatnonzero(seen.camera == c)
+        points = se3.apply(cam_from_world[c], seen.points_m[rows])
+        front = points[:, 2] > 1e-3
+        pixels = camera.img_from_cam(points[front])
+        errors[rows[front]] = np.linalg.norm(pixels - seen.xy_px[rows[front]], axis=1)
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _disagreeing(model: Model, seen: _Seen, inlier: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Cameras that see enough points but whose points don't fit the joint pose."""
+    return tuple(
+        camera.name
+        for c, camera in enumerate(model.drive.cameras)
+        if (seen.camera == c).sum() >= MIN_CAMERA_MATCHES
+        and inlier[seen.camera == c].mean() < MIN_CAMERA_INLIER_RATIO
+    )
+
+
+def _vote(model: Model, seen: _Seen) -> tuple[Floats | None, tuple[str, ...]]:
+    """Average of the cameras' own poses, and the names of those that are far from it."""
+    cameras, votes, names = cameras_of(model), [], []
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac = _ransac(model)
+    for c, camera in enumerate(cameras):
+        rows = seen.camera == c
+        if rows.sum() < MIN_CAMERA_MATCHES:
+            continue
+        result = pycolmap.estimate_and_refine_absolute_pose(
+            seen.xy_px[rows], seen.points_m[rows], camera, estimation_options=options
+        )
+        if result is None or result["num_inliers"] < MIN_CAMERA_INLIER_RATIO * rows.sum():
+            continue
+        world_from_cam = se3.inverse(matrix_of(result["cam_from_world"]))
+        votes.append(world_from_cam @ se3.inverse(model.state.rig_from_cam[c]))
+        names.append(model.drive.cameras[c].name)
+    if not votes:
+        return None, ()
+    poses = np.stack(votes)
+    rotation = robust_mean_rotation(poses[:, :3, :3])
+    position = geometric_median(poses[:, :3, 3])
+    turned = se3.rotation_angle_deg(poses[:, :3, :3] @ rotation.T)
+    moved = np.linalg.norm(poses[:, :3, 3] - position, axis=1)
+    good = (turned < VOTE_ROTATION_DEG) & (moved < VOTE_TRANSLATION_M)
+    if good.any():
+        rotation = se3.mean_rotation(poses[good, :3, :3])
+        position = poses[good, :3, 3].mean(0)
+    return se3.transform(rotation, position), tuple(n for n, g in zip(names, good, strict=True) if not g)

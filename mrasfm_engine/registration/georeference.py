@@ -1,0 +1,161 @@
+"""Putting the scene where it belongs: rigid alignment with the receiver's positions, gross errors rejected.
+
+Scale is not touched: it comes from the rig, and the receiver takes part in it only through the adjustment that follows.
+Positions along a straight line leave the rotation about that line free; the vehicle's own up direction decides it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import rotation_between
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
+SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
+HYPOTHESES = 300
+LOSS_SCALE = 2.0
+MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssAlignment:
+    """The receiver's frame and the scene's."""
+
+    world_from_model: Floats  # (4, 4), rigid
+    inlier: Bools  # (n,)
+    residual_m: Floats  # (n,) distance after alignment
+    scale: float  # by which the model would have to be multiplied to fit the receiver best: a check, not applied
+    noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
+
+
+def align_with_gnss(
+    antenna_m: Floats,
+    up: Floats,
+    forward: Floats,
+    measured_m: Floats,
+    sigma_m: Floats,
+    *,
+    outlier_sigmas: float,
+    rng: np.random.Generator,
+) -> GnssAlignment | str:
+    """Rigid transform from the model's frame to the receiver's.
+
+    Parameters
+    ----------
+    antenna_m
+        Positions (n, 3) of the antenna in the model, lever arm applied.
+    up, forward
+        The vehicle's up and forward directions (n, 3) in the model.
+    measured_m, sigma_m
+        Positions and sigmas (n, 3) of the receiver, x east, y north, z up.
+    outlier_sigmas
+        Residuals beyond so many sigmas are outliers.
+    rng
+        Draws the hypotheses.
+
+    Returns
+    -------
+    GnssAlignment or str
+        The reason, where it is not possible.
+    """
+    if len(antenna_m) < 3:
+        return f"only {len(antenna_m)} registered units have a position at their time, 3 are needed"
+    level = se3.transform(rotation_between(_unit(up.sum(0)), np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    a = se3.apply(level, antenna_m)
+    spread = np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1)
+    if np.sqrt((spread**2).sum()) < MIN_EXTENT_SIGMAS * float(np.median(sigma_m[:, :2])):
+        return f"the car moved by {2 * spread.max():.1f} m, too little against the receiver's noise to tell directions"
+    start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng)
+    if inlier.sum() < 3 or inlier.mean() < 0.3:
+        return (
+            f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and longitude "
+            "swapped, or the receiver's clock off?)"
+        )
+    turned = start @ level
+    pose, factor = turned, 1.0
+    for _ in range(4):
+        pose = _refine(pose, antenna_m, up, forward, measured_m, sigma_m * factor, inlier)
+        whitened = np.linalg.norm((se3.apply(pose, antenna_m) - measured_m) / sigma_m, axis=1)
+        # 1.54 is the median length of a standard normal 3-vector.
+        factor = max(1.0, float(np.median(whitened[inlier])) / 1.54)
+        inlier = whitened < outlier_sigmas * factor
+        if inlier.sum() < 3:
+            return "no consistent set of positions was found"
+    residual = np.linalg.norm(se3.apply(pose, antenna_m) - measured_m, axis=1)
+    return GnssAlignment(
+        world_from_model=pose,
+        inlier=inlier,
+        residual_m=residual,
+        scale=_scale(se3.apply(pose, antenna_m)[inlier], measured_m[inlier], sigma_m[inlier]),
+        noise_factor=factor,
+    )
+
+
+def _unit(v: Floats) -> Floats:
+    result: Floats = v / max(float(np.linalg.norm(v)), 1e-12)
+    return result
+
+
+def _best_yaw(
+    a: Floats, measured: Floats, sigma: Floats, outlier_sigmas: float, rng: np.random.Generator
+) -> tuple[Floats, Bools]:
+    """RANSAC over pairs of positions for the turn about the vertical and the shift."""
+    best_score, best, best_inlier = -1.0, np.eye(4), np.zeros(len(a), dtype=np.bool_)
+    for _ in range(HYPOTHESES):
+        i, j = rng.choice(len(a), 2, replace=False)
+        da, dm = a[j] - a[i], measured[j] - measured[i]
+        length = float(np.hypot(da[0], da[1]))
+        if length < 1e-3 or abs(np.hypot(dm[0], dm[1]) - length) > 0.3 * length + 4 * float(sigma[i, 0]):
+            continue
+        yaw = np.arctan2(dm[1], dm[0]) - np.arctan2(da[1], da[0])
+        rotation = se3.exp_so3([0.0, 0.0, yaw])
+        shift = np.median(measured - a @ rotation.T, axis=0)
+        for t in (shift, 0.5 * (measured[i] + measured[j] - (a[i] + a[j]) @ rotation.T)):
+            off = np.linalg.norm((a @ rotation.T + t - measured) / sigma, axis=1)
+            inlier = off < outlier_sigmas
+            score = float(np.maximum(0.0, outlier_sigmas**2 - off**2).sum())
+            if score > best_score:
+                best_score, best, best_inlier = score, se3.transform(rotation, t), inlier
+    return best, best_inlier
+
+
+def _refine(
+    pose: Floats, antenna: Floats, up: Floats, forward: Floats, measured: Floats, sigma: Floats, inlier: Bools
+) -> Floats:
+    """Gauss-Newton on rotation and translation: positions with a Cauchy loss, and the vehicle near upright."""
+    left = np.cross(up, forward)
+    for _ in range(15):
+        p = se3.apply(pose, antenna)[inlier]
+        s = sigma[inlier]
+        r = (p - measured[inlier]) / s
+        w = 1.0 / (1.0 + (r**2).sum(1) / LOSS_SCALE**2)
+        j = np.concatenate([-se3.skew(p - pose[:3, 3]), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2) / s[..., None]
+        h = np.einsum("n,nij,nik->jk", w, j, j)
+        g = np.einsum("n,nij,ni->j", w, j, r)
+        for direction, prior in ((left, SIGMA_ROLL_RAD), (forward, SIGMA_PITCH_RAD)):
+            d = direction @ pose[:3, :3].T
+            # d (R v)_z / d omega = (v x e_z)' in turned axes; averaged over units, as one error is common to all.
+            row = np.zeros((len(d), 6))
+            row[:, :3] = np.cross(d, [0.0, 0.0, 1.0])
+            weight = 1.0 / (prior**2 * len(d))
+            h += weight * row.T @ row
+            g += weight * row.T @ d[:, 2]
+        step = -np.linalg.solve(h + 1e-12 * np.eye(6), g)
+        rotation = se3.exp_so3(step[:3])
+        pose = se3.transform(rotation @ pose[:3, :3], pose[:3, 3] + step[3:])
+        if np.abs(step).max() < 1e-9:
+            break
+    return pose
+
+
+def _scale(a: Floats, b: Floats, sigma: Floats) -> float:
+    w = (1.0 / sigma**2).mean(1)
+    ca, cb = (w[:, None] * a).sum(0) / w.sum(), (w[:, None] * b).sum(0) / w.sum()
+    return float((w[:, None] * (a - ca) * (b - cb)).sum() / max((w[:, None] * (a - ca) ** 2).sum(), 1e-12))

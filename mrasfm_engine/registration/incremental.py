@@ -1,0 +1,174 @@
+"""The incremental loop: register the next unit, triangulate, adjust locally, now and then globally."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.priors import CalibrationPrior
+from mrasfm_engine.adjustment.solver import Report, SolverOptions
+from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.registration.camera_set import Registration, register_unit
+from mrasfm_engine.registration.initialise import Initialisation, initialise
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.scene.scene import PairMatches
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+LOCAL_TOLERANCE = 1e-3
+GLOBAL_TOLERANCE = 1e-4
+
+
+@dataclass(kw_only=True)
+class MappingLog:
+    """What happened while the scene grew."""
+
+    initialisation: Initialisation | None = None
+    registrations: list[Registration] = field(default_factory=list)
+    failures: dict[int, Registration] = field(default_factory=dict)  # by unit, the last attempt
+    local_adjustments: int = 0
+    global_adjustments: list[Report] = field(default_factory=list)
+
+
+def grow(
+    model: Model,
+    pairs: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> MappingLog:
+    """Register as many units as possible, beginning with the best-connected two.
+
+    Raises
+    ------
+    ReconstructionError
+        Where the scene cannot even begin.
+    CancelledError
+        Where `cancel` answers True.
+    """
+    log, config = MappingLog(), model.config
+    log.initialisation = initialise(model, pairs, prior_world_from_rig)
+    since_local, at_global = 0, 2
+    recent: list[int] = list(log.initialisation.units)
+    adjust_globally(model, log, cancel)
+    while not model.registered.all():
+        if cancel is not None and cancel():
+            raise CancelledError
+        registration = _register_next(model, log)
+        if registration is None:
+            break
+        log.registrations.append(registration)
+        recent.append(registration.unit)
+        model.extend(registration.unit)
+        since_local += 1
+        if since_local >= config.mapping.local_every:
+            _adjust_locally(model, recent[-1])
+            log.local_adjustments += 1
+            since_local = 0
+        if model.registered.sum() >= at_global * (1 + config.mapping.global_growth):
+            adjust_globally(model, log, cancel)
+            at_global = int(model.registered.sum())
+        if progress is not None:
+            progress(int(model.registered.sum()), len(model.registered))
+    return log
+
+
+def _register_next(model: Model, log: MappingLog) -> Registration | None:
+    """Register the unit that sees most points; units that failed wait until they see more."""
+    counts = model.visible_counts()
+    for unit in np.argsort(-counts, kind="stable"):
+        unit = int(unit)
+        if model.registered[unit] or counts[unit] < model.config.mapping.min_pnp_inliers:
+            continue
+        failed = log.failures.get(unit)
+        if failed is not None and counts[unit] < 1.2 * failed.correspondences:
+            continue
+        registration = register_unit(model, unit)
+        if registration.world_from_rig is not None:
+            log.failures.pop(unit, None)
+            model.set_pose(unit, registration.world_from_rig)
+            return registration
+        log.failures[unit] = registration
+    return None
+
+
+def _adjust_locally(model: Model, unit: int) -> None:
+    """Adjust a new unit and those it shares most points with; all other units and the calibration stay."""
+    tracks = model.tracks_of_units(np.array([unit]))
+    rows = model.observation_rows(tracks[model.solved[tracks]])
+    shared = np.bincount(model.keypoints.unit[rows], minlength=len(model.registered))
+    shared[unit] = np.iinfo(np.int64).max
+    best = np.argsort(-shared, kind="stable")[: model.config.mapping.local_units]
+    free = np.zeros(len(model.registered), dtype=np.bool_)
+    free[best[shared[best] > 0]] = True
+    free &= model.registered
+    # Without a fixed unit the gauge is loose: hold the one that shares least.
+    if (free == model.registered).all():
+        free[best[free[best]][-1]] = False
+    model.adjust(
+        free,
+        options=SolverOptions(
+            max_iterations=10,
+            function_tolerance=LOCAL_TOLERANCE,
+            loss_scale=model.config.adjustment.loss_scale,
+            threads=model.config.threads,
+        ),
+    )
+
+
+def calibration_prior(model: Model) -> CalibrationPrior:
+    """The prior of `rig_from_cam` from the manifest's sigmas, or the default ones."""
+    settings, cameras = model.config.adjustment, model.drive.cameras
+    given = model.drive.rig_from_cam
+    return CalibrationPrior(
+        rotation=given[:, :3, :3],
+        position_m=given[:, :3, 3],
+        sigma_rotation_rad=np.radians([c.sigma_rotation_deg or settings.sigma_rotation_deg for c in cameras]),
+        sigma_translation_m=np.array([c.sigma_translation_m or settings.sigma_translation_m for c in cameras]),
+    )
+
+
+def heading_change_deg(model: Model) -> float:
+    """By how much the registered units' forward directions spread, degrees."""
+    forward = model.state.unit_rotation[model.registered][:, :, 0]
+    mean = forward.mean(0) / max(float(np.linalg.norm(forward.mean(0))), 1e-9)
+    angles = np.degrees(np.arccos(np.clip(forward @ mean, -1, 1)))
+    return float(2 * angles.max())
+
+
+def calibration_is_free(model: Model, *, georeferenced: bool) -> bool:
+    """Whether `rig_from_cam` may vary: on a straight way without GNSS it is not observed, and freeing it does harm."""
+    settings = model.config.adjustment
+    if not settings.refine_calibration or len(model.drive.cameras) < 2:
+        return False
+    return georeferenced or heading_change_deg(model) >= settings.min_heading_change_deg
+
+
+def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | None) -> None:
+    """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter."""
+    free_units = model.registered.copy()
+    free_units[np.flatnonzero(model.registered)[0]] = False
+    settings = model.config.adjustment
+    free = calibration_is_free(model, georeferenced=False)
+    for error_px in (model.config.mapping.max_error_px, model.config.mapping.filter_error_px):
+        report = model.adjust(
+            free_units,
+            free_cameras=np.full(len(model.camera_kind), free),
+            terms=[calibration_prior(model)] if free else (),
+            options=SolverOptions(
+                max_iterations=20,
+                function_tolerance=GLOBAL_TOLERANCE,
+                loss_scale=settings.loss_scale,
+                threads=model.config.threads,
+            ),
+            cancel=cancel,
+        )
+        log.global_adjustments.append(report)
+        model.triangulate()
+        model.filter(error_px)

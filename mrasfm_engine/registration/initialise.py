@@ -1,0 +1,174 @@
+"""The first two units: which ones, and their poses to one another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.solver import SolverOptions
+from mrasfm_engine.errors import ReconstructionError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.registration.camera_set import cameras_of, matrix_of, register_unit, rigid3d
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.scene.scene import PairMatches
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CANDIDATES = 4  # pairs of units that are tried
+MAX_RELATIVE_MATCHES = 1200
+RELATIVE_ERROR_PX = 4.0
+ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
+MIN_POINTS = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Initialisation:
+    """Where the scene begins."""
+
+    units: tuple[int, int]
+    points: int
+    method: str
+
+
+def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.float64], dict[tuple[int, int], int]]:
+    """Verified matches inside every unit (units,) and between units (by pair, smaller unit first)."""
+    inside = np.zeros(len(model.registered))
+    between: dict[tuple[int, int], int] = {}
+    for pair in pairs:
+        u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
+        count = int(pair.inliers.sum())
+        if u == v:
+            inside[u] += count
+        else:
+            between[u, v] = between.get((u, v), 0) + count
+    return inside, between
+
+
+def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig: Floats | None) -> Initialisation:
+    """Register the two best-connected units.
+
+    For each of the best pairs of units by verified matches inside and between them, every source of a relative pose is
+    tried: the prior poses, points triangulated inside the first unit, and the generalised relative pose. Each is
+    adjusted; the pair with the most points of good angle is kept.
+
+    Raises
+    ------
+    ReconstructionError
+        Where no pair of units gives points.
+    """
+    inside, between = unit_scores(model, pairs)
+    ranked = sorted(between, key=lambda uv: -(between[uv] + inside[uv[0]] + inside[uv[1]]))
+    best: tuple[int, Initialisation, Floats, Floats] | None = None
+    for u, v in _varied(ranked):
+        anchor = np.eye(4) if prior_world_from_rig is None else prior_world_from_rig[u]
+        for method, pose in _proposals(model, pairs, u, v, anchor, prior_world_from_rig):
+            points = _evaluate(model, u, v, anchor, pose)
+            if best is None or points > best[0]:
+                best = (
+                    points,
+                    Initialisation(units=(u, v), points=points, method=method),
+                    model.state.world_from_rig[u],
+                    model.state.world_from_rig[v],
+                )
+    model.clear()
+    if best is None or best[0] < MIN_POINTS:
+        raise ReconstructionError(
+            f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the best "
+            f"two units share {0 if best is None else best[0]} points",
+            remedy="Check that the images show a textured scene while the car moves, that cameras and files are not mixed "
+            "up, and that intrinsics fit the images.",
+            code="nothing-matches",
+        )
+    points, result, pose_u, pose_v = best
+    del points
+    model.set_pose(result.units[0], pose_u)
+    model.set_pose(result.units[1], pose_v)
+    model.triangulate()
+    return result
+
+
+def _varied(ranked: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The best pairs, but not the same gap over and over: with a longer step points get better angles."""
+    chosen: list[tuple[int, int]] = []
+    for gap in sorted({v - u for u, v in ranked})[:CANDIDATES]:
+        chosen.append(next((u, v) for u, v in ranked if v - u == gap))
+    return chosen
+
+
+def _proposals(
+    model: Model,
+    pairs: Sequence[PairMatches],
+    u: int,
+    v: int,
+    anchor: Floats,
+    prior_world_from_rig: Floats | None,
+) -> Iterator[tuple[str, Floats]]:
+    """Poses of unit v, given that of u, and where they come from."""
+    if prior_world_from_rig is not None:
+        yield "prior poses", anchor @ se3.inverse(prior_world_from_rig[u]) @ prior_world_from_rig[v]
+    model.clear()
+    model.set_pose(u, anchor)
+    if model.triangulate(model.tracks_of_units(np.array([u]))) >= MIN_POINTS:
+        registration = register_unit(model, v)
+        if registration.world_from_rig is not None:
+            yield "points inside the first unit", registration.world_from_rig
+    relative = _generalised_relative_pose(model, pairs, u, v)
+    if relative is not None:
+        yield "generalised relative pose", anchor @ relative
+
+
+def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> Floats | None:
+    """rig_u_from_rig_v from matches between all cameras of the two units."""
+    rows_u, rows_v = [], []
+    for pair in pairs:
+        if {int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])} != {u, v}:
+            continue
+        a = model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]
+        b = model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]
+        if model.image_unit[pair.image_a] != u:
+            a, b = b, a
+        rows_u.append(a)
+        rows_v.append(b)
+    a, b = np.concatenate(rows_u), np.concatenate(rows_v)
+    keep = np.unique(np.linspace(0, len(a) - 1, min(len(a), MAX_RELATIVE_MATCHES)).astype(np.int64))
+    a, b = a[keep], b[keep]
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
+    options.min_num_trials, options.max_num_trials = 100, 2000
+    result = pycolmap.estimate_generalized_relative_pose(
+        model.keypoints.xy_px[a],
+        model.keypoints.xy_px[b],
+        [int(c) for c in model.keypoints.camera[a]],
+        [int(c) for c in model.keypoints.camera[b]],
+        [rigid3d(m) for m in se3.inverse(model.state.rig_from_cam)],
+        cameras_of(model),
+        estimation_options=options,
+    )
+    if result is None or "rig2_from_rig1" not in result:
+        return None
+    return se3.inverse(matrix_of(result["rig2_from_rig1"]))
+
+
+def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int:
+    """Points of the two units after adjusting the second; the model is left in that state."""
+    model.clear()
+    model.set_pose(u, anchor)
+    model.set_pose(v, pose)
+    tracks = model.tracks_of_units(np.array([u, v]))
+    free = np.zeros(len(model.registered), dtype=np.bool_)
+    free[v] = True
+    threshold = model.triangulator.max_error_px
+    try:
+        for error_px in (ROUGH_ERROR_PX, ROUGH_ERROR_PX / 2, threshold):
+            model.triangulator.max_error_px = max(error_px, threshold)
+            if model.triangulate(tracks) < MIN_POINTS:
+                return 0
+            model.adjust(free, options=SolverOptions(max_iterations=30, function_tolerance=1e-4))
+    finally:
+        model.triangulator.max_error_px = threshold
+    return model.triangulate(tracks)

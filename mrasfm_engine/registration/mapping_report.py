@@ -1,0 +1,98 @@
+"""What the report says of mapping and refinement, in plain values."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.adjustment.solver import Report
+from mrasfm_engine.registration.incremental import MappingLog, heading_change_deg
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.refine import Refinement
+
+
+def describe(model: Model, log: MappingLog) -> dict[str, Any]:
+    """Counts of the incremental loop, and what was rejected and why."""
+    frames = model.drive.manifest.frames
+    voted_out = Counter(name for r in log.registrations for name in r.voted_out)
+    start = log.initialisation
+    missing = [
+        {
+            "unit": int(u),
+            "source_frame": frames[u].source_frame,
+            "reason": log.failures[u].reason if u in log.failures else "it sees no point of the scene",
+        }
+        for u in np.flatnonzero(~model.registered)
+    ]
+    return {
+        "initial_units": None if start is None else list(start.units),
+        "initial_pose_from": None if start is None else start.method,
+        "registered_units": int(model.registered.sum()),
+        "units_not_registered": missing,
+        "registered_by": dict(Counter(r.method for r in log.registrations)),
+        "cameras_voted_out": dict(voted_out),
+        "tracks": len(model.tracks),
+        "points": int(model.solved.sum()),
+        "observations": int(model.kept.sum()),
+        "local_adjustments": log.local_adjustments,
+        "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
+    }
+
+
+def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
+    """Alignment, adjustments and certainty of the last stage."""
+    alignment, certainty = refinement.alignment, refinement.certainty
+    free = refinement.calibration_free
+    result: dict[str, Any] = {
+        "points": int(model.solved.sum()),
+        "observations": int(model.kept.sum()),
+        "rejected": {"observations": refinement.observations_dropped, "points": refinement.points_dropped},
+        "sigma_observation_px": refinement.sigma_px,
+        "adjustments": [_adjustment(r) for r in refinement.adjustments],
+        "calibration": {
+            "adjusted": free,
+            "reason": _why_calibration(model, refinement),
+            "heading_change_deg": heading_change_deg(model),
+        },
+        "georeferenced": alignment is not None,
+    }
+    if certainty is not None and np.isfinite(certainty.sigma_scale):
+        result["scale"] = {
+            "sigma_relative": certainty.sigma_scale,
+            "from": "baselines of the rig and GNSS" if alignment is not None else "baselines of the rig",
+        }
+    if alignment is not None:
+        times = model.drive.timestamps_us[refinement.gnss_units[~alignment.inlier]]
+        result["gnss"] = {
+            "units_used": int(alignment.inlier.sum()),
+            "outliers_at_us": [int(t) for t in times],
+            "residual_rms_m": float(np.sqrt((alignment.residual_m[alignment.inlier] ** 2).mean())),
+            "noise_factor": alignment.noise_factor,
+            "scale_of_rig_against_gnss": alignment.scale,
+        }
+    elif refinement.not_georeferenced:
+        result["gnss"] = {"not_used": refinement.not_georeferenced}
+    return result
+
+
+def _why_calibration(model: Model, refinement: Refinement) -> str:
+    if refinement.calibration_free:
+        return "GNSS makes it observable" if refinement.alignment is not None else "the drive turns enough to observe it"
+    if not model.config.adjustment.refine_calibration:
+        return "held by the settings"
+    if len(model.drive.cameras) < 2:
+        return "a single camera has no calibration to others"
+    return "held as given: without GNSS a drive this straight does not observe it"
+
+
+def _adjustment(report: Report) -> dict[str, Any]:
+    return {
+        "initial_cost": report.initial_cost,
+        "final_cost": report.final_cost,
+        "iterations": report.iterations,
+        "termination": str(report.termination),
+        "observations": report.observations,
+        "parameters": report.parameters,
+    }

@@ -1,0 +1,200 @@
+"""The scene while it grows: registered units, points of tracks, and the adjustments that act on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.priors import Term
+from mrasfm_engine.adjustment.problem import Layout, Observations
+from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solve
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
+from mrasfm_engine.triangulation.triangulate import Triangulator
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+class Model:
+    """Registered units, tracks and their points. A track has at most one point.
+
+    Attributes
+    ----------
+    state
+        Poses and calibration; `state.points_m` has a row for every track, valid where `solved`.
+    registered
+        (units,) which units have a pose.
+    solved
+        (tracks,) which tracks have a point.
+    kept
+        (keypoints,) which keypoints are observations of their track's point.
+    """
+
+    def __init__(self, drive: Drive, keypoints: Keypoints, tracks: Tracks, config: EngineConfig) -> None:
+        self.drive, self.keypoints, self.tracks, self.config = drive, keypoints, tracks, config
+        self.camera_kind, params = pack_cameras(drive.cameras)
+        units = len(drive.manifest.frames)
+        self.state = State(
+            unit_rotation=np.tile(np.eye(3), (units, 1, 1)),
+            unit_position_m=np.zeros((units, 3)),
+            camera_rotation=np.ascontiguousarray(drive.rig_from_cam[:, :3, :3]),
+            camera_position_m=np.ascontiguousarray(drive.rig_from_cam[:, :3, 3]),
+            camera_params=params,
+            points_m=np.zeros((len(tracks), 3)),
+        )
+        self.registered = np.zeros(units, dtype=np.bool_)
+        self.solved = np.zeros(len(tracks), dtype=np.bool_)
+        self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
+        self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+        self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
+        self.triangulator = Triangulator(
+            keypoints,
+            self.image_unit,
+            self.image_camera,
+            self.camera_kind,
+            max_error_px=config.mapping.max_error_px,
+            min_angle_deg=config.mapping.min_angle_deg,
+        )
+        # Keypoints by unit, and the tracks they are in: what registration asks for again and again.
+        order = np.argsort(keypoints.unit, kind="stable")
+        bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
+        tracked = tracks.of_keypoint >= 0
+        self.rows_of_unit = [
+            rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in zip(bounds[:-1], bounds[1:], strict=True))
+        ]
+
+    def set_pose(self, unit: int, world_from_rig: Floats) -> None:
+        """Give a unit a pose and count it as registered."""
+        self.state.unit_rotation[unit] = world_from_rig[:3, :3]
+        self.state.unit_position_m[unit] = world_from_rig[:3, 3]
+        self.registered[unit] = True
+
+    def clear(self) -> None:
+        """Forget all poses and points."""
+        self.registered[:] = False
+        self.solved[:] = False
+        self.kept[:] = False
+
+    def tracks_of_units(self, units: Ints) -> Ints:
+        """Tracks seen by any of the units, ascending."""
+        rows = [self.rows_of_unit[int(u)] for u in units]
+        return np.unique(self.tracks.of_keypoint[np.concatenate(rows)]) if rows else np.zeros(0, dtype=np.int64)
+
+    def visible_counts(self) -> Ints:
+        """How many keypoints with a point every unit has (units,)."""
+        rows = self.tracks.of_keypoint >= 0
+        seen = rows.copy()
+        seen[rows] = self.solved[self.tracks.of_keypoint[rows]]
+        return np.bincount(self.keypoints.unit[seen], minlength=len(self.registered)).astype(np.int64)
+
+    def triangulate(self, which: Ints | None = None) -> int:
+        """Triangulate tracks (all by default) from registered units; how many of them have a point."""
+        if which is None:
+            which = np.arange(len(self.tracks), dtype=np.int64)
+        self.triangulator.triangulate(
+            self.state,
+            self.tracks,
+            self.registered,
+            which=which,
+            points_m=self.state.points_m,
+            solved=self.solved,
+            kept=self.kept,
+        )
+        return int(self.solved[which].sum())
+
+    def extend(self, unit: int) -> None:
+        """Let a newly registered unit observe the points of its tracks, and give its other tracks points."""
+        rows = self.rows_of_unit[unit]
+        tracks = self.tracks.of_keypoint[rows]
+        has_point = self.solved[tracks]
+        errors = self.triangulator.errors_px(self.state, rows[has_point], self.state.points_m, tracks[has_point])
+        fits = errors < self.triangulator.max_error_px
+        self.kept[rows[has_point]] = fits
+        # Also points that the new view contradicts: with it, another hypothesis may win.
+        self.triangulate(np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]])))
+
+    def filter(self, max_error_px: float) -> tuple[int, int]:
+        """Drop observations with larger errors, and points left with fewer than two; how many of both."""
+        rows = np.flatnonzero(self.kept)
+        tracks = self.tracks.of_keypoint[rows]
+        errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, tracks)
+        bad = errors > max_error_px
+        self.kept[rows[bad]] = False
+        left = np.bincount(tracks[~bad], minlength=len(self.tracks))
+        lost = self.solved & (left < 2)
+        self.solved[lost] = False
+        alone = np.flatnonzero(self.kept)
+        self.kept[alone[lost[self.tracks.of_keypoint[alone]]]] = False
+        return int(bad.sum()), int(lost.sum())
+
+    def observation_rows(self, tracks: Ints | None = None) -> Ints:
+        """Keypoints that are observations (of the given solved tracks), sorted by track."""
+        rows = np.flatnonzero(self.kept)
+        if tracks is not None:
+            wanted = np.zeros(len(self.tracks), dtype=np.bool_)
+            wanted[tracks] = True
+            rows = rows[wanted[self.tracks.of_keypoint[rows]]]
+        result: Ints = rows[np.argsort(self.tracks.of_keypoint[rows], kind="stable")]
+        return result
+
+    def problem(
+        self,
+        free_units: Bools,
+        *,
+        free_cameras: Bools | None = None,
+        free_focal: bool = False,
+        terms: Sequence[Term] = (),
+        options: SolverOptions,
+    ) -> tuple[Problem, Ints]:
+        """The adjustment of some units (and cameras) with all points they see; also those points' tracks."""
+        everything = bool((free_units | ~self.registered).all()) or free_cameras is not None
+        seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
+        rows = self.observation_rows(None if seen is None else seen[self.solved[seen]])
+        tracks, point = np.unique(self.tracks.of_keypoint[rows], return_inverse=True)
+        problem = Problem(
+            state=replace(self.state, points_m=self.state.points_m[tracks]),
+            camera_kind=self.camera_kind,
+            observations=Observations(
+                unit=self.keypoints.unit[rows],
+                camera=self.keypoints.camera[rows],
+                point=point.astype(np.int64),
+                xy_px=self.keypoints.xy_px[rows],
+                num_points=len(tracks),
+            ),
+            layout=Layout.of(
+                free_units & self.registered,
+                np.zeros(len(self.camera_kind), dtype=np.bool_) if free_cameras is None else free_cameras,
+                free_focal=free_focal,
+            ),
+            terms=terms,
+            options=options,
+        )
+        return problem, tracks
+
+    def adjust(
+        self,
+        free_units: Bools,
+        *,
+        free_cameras: Bools | None = None,
+        free_focal: bool = False,
+        terms: Sequence[Term] = (),
+        options: SolverOptions,
+        cancel: Callable[[], bool] | None = None,
+    ) -> Report:
+        """Solve the adjustment and take over its result."""
+        problem, tracks = self.problem(
+            free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
+        )
+        solution, report = solve(problem, cancel=cancel)
+        points = self.state.points_m
+        points[tracks] = solution.points_m
+        self.state = replace(solution, points_m=points)
+        return report

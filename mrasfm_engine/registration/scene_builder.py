@@ -1,0 +1,88 @@
+"""The finished scene from the refined model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.observability import observed_directions
+from mrasfm_engine.adjustment.priors import CalibrationPrior
+from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
+from mrasfm_engine.geometry.camera_model import unpack_camera
+from mrasfm_engine.registration.incremental import calibration_prior
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.refine import Refinement
+from mrasfm_engine.scene.scene import CameraCalibration, ImageFeatures, PairMatches, Scene
+
+Floats = NDArray[np.float64]
+
+
+def build_scene(
+    model: Model,
+    refinement: Refinement,
+    features: Sequence[ImageFeatures],
+    pairs: Sequence[PairMatches],
+    prior: PriorTrajectory,
+    *,
+    notes: Sequence[str] = (),
+) -> Scene:
+    """Everything that is exported, as arrays. All images of a registered unit are part of the scene."""
+    rows = model.observation_rows()
+    tracks, point = np.unique(model.tracks.of_keypoint[rows], return_inverse=True)
+    errors = model.triangulator.errors_px(
+        model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows]
+    )
+    counts = np.bincount(point, minlength=len(tracks)).clip(1)
+    colors = np.concatenate([f.colors for f in features]).astype(np.float64)
+    mean_color = np.stack([np.bincount(point, colors[rows, k], minlength=len(tracks)) for k in range(3)], 1)
+    units = len(model.registered)
+    poses = model.state.world_from_rig.copy()
+    poses[~model.registered] = np.nan
+    sigma = np.full((units, 3), np.nan)
+    if refinement.certainty is not None:
+        sigma = refinement.certainty.sigma_unit_position_m
+    georeferenced = refinement.alignment is not None
+    return Scene(
+        drive=model.drive,
+        unit_registered=model.registered.copy(),
+        image_registered=model.registered[model.image_unit],
+        world_from_rig=poses,
+        sigma_position_m=sigma,
+        calibration=_calibrations(model, refinement),
+        points_m=model.state.points_m[tracks],
+        point_colors=np.round(mean_color / counts[:, None]).astype(np.uint8),
+        point_error_px=np.bincount(point, errors, minlength=len(tracks)) / counts,
+        observation_point=point.astype(np.int64),
+        observation_image=model.keypoints.image[rows],
+        observation_keypoint=rows - model.keypoints.first[model.keypoints.image[rows]],
+        features=list(features),
+        pairs=list(pairs),
+        georeference=prior.georeference if georeferenced else None,
+        rough_world_from_local=None if georeferenced else prior.rough_world_from_local,
+        notes=list(notes),
+    )
+
+
+def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibration]:
+    prior: CalibrationPrior = calibration_prior(model)
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    focal = np.array([c.sigma_focal_px or 0.0 for c in model.drive.cameras])
+    observed = np.zeros((len(sigma), 6), dtype=np.bool_)
+    if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
+        sigma = refinement.certainty.sigma_camera[:, :6]
+        observed = observed_directions(sigma, prior.sigma_rotation_rad, prior.sigma_translation_m)
+        if refinement.focal_free:
+            focal = refinement.certainty.sigma_camera[:, 6] * model.state.camera_params[:, 0]
+    return [
+        CameraCalibration(
+            rig_from_cam=model.state.rig_from_cam[c],
+            params=unpack_camera(camera.model, model.state.camera_params[c]),
+            sigma_rotation_deg=np.degrees(sigma[c, :3]),
+            sigma_translation_m=sigma[c, 3:],
+            sigma_focal_px=float(focal[c]),
+            observed=observed[c],
+        )
+        for c, camera in enumerate(model.drive.cameras)
+    ]

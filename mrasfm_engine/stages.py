@@ -1,0 +1,266 @@
+"""The stages of a reconstruction: each takes its input, leaves its result and a report in the store, and is skipped where
+both are there already.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine import __version__
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.correspondence.calibration_check import require_calibration_direction
+from mrasfm_engine.correspondence.features import SiftExtractor, extract_features
+from mrasfm_engine.correspondence.matching import NearestNeighbourMatcher
+from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window
+from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory, prior_trajectory
+from mrasfm_engine.correspondence.revisits import revisit_pairs
+from mrasfm_engine.correspondence.search import match_pairs
+from mrasfm_engine.errors import CancelledError, ReconstructionError
+from mrasfm_engine.io.preflight import check_drive, require_sound
+from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
+from mrasfm_engine.registration import incremental, mapping_report
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.refine import refine
+from mrasfm_engine.registration.scene_builder import build_scene
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, build_tracks
+
+Progress = Callable[[str, int, int], None]  # stage, done, total
+PROBE_UNITS = 5
+
+
+@dataclass
+class Run:
+    """One reconstruction under way: settings, store, report, and who watches."""
+
+    drive: Drive
+    config: EngineConfig
+    store: StageStore
+    progress: Progress
+    cancel: Callable[[], bool]
+    report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
+    _key: str = ""
+
+    def step(self, stage: str) -> Callable[[int, int], None]:
+        """The progress callback of a stage."""
+        return lambda done, total: self.progress(stage, done, total)
+
+    def stage(
+        self, name: str, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]
+    ) -> tuple[Arrays, dict[str, Any]]:
+        """Do a stage, or take its result from the store.
+
+        A stage's fingerprint covers the one before it, its own settings and the engine's version.
+        """
+        if self.cancel():
+            raise CancelledError
+        self._key = fingerprint(self._key or drive_fingerprint(self.drive), name, settings, __version__)
+        started = time.perf_counter()
+        found = self.store.load(name, self._key)
+        reused = found is not None
+        if found is None:
+            found = work()
+            self.store.save(name, self._key, *found)
+        arrays, report = found
+        self.report["stages"].append(
+            {"stage": name, "seconds": round(time.perf_counter() - started, 3), "reused": reused, **report}
+        )
+        self.progress(name, 1, 1)
+        return arrays, report
+
+
+def preflight(run: Run) -> None:
+    """Check the manifest and the files' headers; refuse what cannot work before any long work."""
+    findings = check_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"))
+    run.report["findings"] = [
+        {"severity": str(f.severity), "code": f.code, "what": f.what, "remedy": f.remedy} for f in findings
+    ]
+    require_sound(findings)
+
+
+def prior(run: Run) -> PriorTrajectory:
+    """Where the units roughly are."""
+    result = prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
+    run.report["prior"] = {
+        "source": result.source,
+        "gnss_samples": 0 if result.gnss is None else len(result.gnss.good),
+        "gnss_gross_errors": 0 if result.gnss is None else int((~result.gnss.good).sum()),
+    }
+    return result
+
+
+def probe(run: Run) -> None:
+    """On the first units: is the calibration the right way round?"""
+    images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
+    if len(run.drive.cameras) < 2 or run.store.load("features", _features_key(run)) is not None:
+        return
+    first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
+    features = extract_features(
+        Drive(run.drive.root, first), SiftExtractor(run.config.features), threads=run.config.threads, cancel=run.cancel
+    )
+    require_calibration_direction(
+        run.drive, images, features, NearestNeighbourMatcher(run.config.matching), run.config.matching
+    )
+
+
+def _features_key(run: Run) -> str:
+    settings = run.config.features.model_dump()
+    return fingerprint(drive_fingerprint(run.drive), "features", settings, __version__)
+
+
+def features(run: Run) -> list[ImageFeatures]:
+    """Keypoints and descriptors of all images."""
+
+    def work() -> tuple[Arrays, dict[str, Any]]:
+        found = extract_features(
+            run.drive,
+            SiftExtractor(run.config.features),
+            threads=run.config.threads,
+            progress=run.step("features"),
+            cancel=run.cancel,
+        )
+        counts = np.array([len(f.xy_px) for f in found], dtype=np.int64)
+        poor = [run.drive.images[i].file for i in np.flatnonzero(counts < 100)]
+        return (
+            {
+                "counts": counts,
+                "xy_px": np.concatenate([f.xy_px for f in found]),
+                "descriptors": np.concatenate([f.descriptors for f in found]),
+                "colors": np.concatenate([f.colors for f in found]),
+            },
+            {"images": len(found), "keypoints": int(counts.sum()), "images_with_under_100_keypoints": poor},
+        )
+
+    arrays, _ = run.stage("features", run.config.features.model_dump(), work)
+    ends = np.cumsum(arrays["counts"])
+    return [
+        ImageFeatures(
+            xy_px=arrays["xy_px"][hi - n : hi],
+            descriptors=arrays["descriptors"][hi - n : hi],
+            colors=arrays["colors"][hi - n : hi],
+        )
+        for n, hi in zip(arrays["counts"], ends, strict=True)
+    ]
+
+
+def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> list[PairMatches]:
+    """Candidate pairs by the prior (or by window and likeness), matched and verified."""
+
+    def work() -> tuple[Arrays, dict[str, Any]]:
+        if known.world_from_rig is not None:
+            pairs = pairs_from_poses(run.drive, known.world_from_rig, run.config.pairs)
+        else:
+            window = pairs_from_window(run.drive, run.config.pairs)
+            pairs = np.unique(np.concatenate([window, revisit_pairs(run.drive, found, run.config.pairs)]), axis=0)
+        result = match_pairs(
+            run.drive,
+            found,
+            pairs,
+            NearestNeighbourMatcher(run.config.matching),
+            run.config.matching,
+            threads=run.config.threads,
+            progress=run.step("matches"),
+            cancel=run.cancel,
+        )
+        return _pack_pairs(result.pairs), {
+            "candidate_pairs": len(pairs),
+            "verified_pairs": len(result.pairs),
+            "rejected_pairs": {"few matches": result.few_matches, "few inliers": result.few_inliers},
+            "matches": sum(len(p.matches) for p in result.pairs),
+            "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),
+        }
+
+    settings = (run.config.pairs.model_dump(), run.config.matching.model_dump(), run.config.use_gnss)
+    arrays, report = run.stage("matches", settings, work)
+    if not report["verified_pairs"]:
+        raise ReconstructionError(
+            f"nothing matches: none of {report['candidate_pairs']} image pairs has a verified match",
+            remedy="Check that consecutive frames show the same scene, and that images are sharp and not mixed up.",
+            code="nothing-matches",
+        )
+    return _unpack_pairs(arrays)
+
+
+def _pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
+    return {
+        "ends": np.array([(p.image_a, p.image_b, len(p.matches)) for p in pairs], dtype=np.int64).reshape(-1, 3),
+        "matches": np.concatenate([p.matches for p in pairs] or [np.zeros((0, 2), np.int32)]),
+        "inliers": np.concatenate([p.inliers for p in pairs] or [np.zeros(0, np.bool_)]),
+    }
+
+
+def _unpack_pairs(arrays: Arrays) -> list[PairMatches]:
+    stops = np.cumsum(arrays["ends"][:, 2])
+    return [
+        PairMatches(
+            image_a=int(a), image_b=int(b), matches=arrays["matches"][hi - n : hi], inliers=arrays["inliers"][hi - n : hi]
+        )
+        for (a, b, n), hi in zip(arrays["ends"], stops, strict=True)
+    ]
+
+
+def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory) -> Model:
+    """Units registered one by one, points triangulated, everything adjusted."""
+    keypoints = Keypoints.of(run.drive, found)
+
+    def work() -> tuple[Arrays, dict[str, Any]]:
+        model = Model(run.drive, keypoints, build_tracks(keypoints, pairs), run.config)
+        log = incremental.grow(
+            model, pairs, known.world_from_rig, progress=run.step("mapping"), cancel=run.cancel
+        )
+        arrays = {
+            "of_keypoint": model.tracks.of_keypoint,
+            "registered": model.registered,
+            "solved": model.solved,
+            "kept": model.kept,
+            **{name: getattr(model.state, name) for name in STATE_ARRAYS},
+        }
+        return arrays, mapping_report.describe(model, log)
+
+    settings = (run.config.mapping.model_dump(), run.config.adjustment.model_dump(), run.config.seed)
+    arrays, _ = run.stage("mapping", settings, work)
+    model = Model(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
+    model.registered, model.solved, model.kept = arrays["registered"], arrays["solved"], arrays["kept"]
+    model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
+    return model
+
+
+STATE_ARRAYS = (
+    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m"
+)  # fmt: skip
+
+
+def scene(
+    run: Run, model: Model, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
+) -> Scene:
+    """Georeferencing, the final adjustment with all priors, and how certain the result is."""
+    started = time.perf_counter()
+    refinement = refine(
+        model,
+        gnss=known.gnss,
+        antenna_in_rig_m=known.antenna_in_rig_m,
+        rough_world_from_rig=known.rough_world_from_rig,
+        progress=run.step("refinement"),
+        cancel=run.cancel,
+    )
+    run.report["stages"].append(
+        {
+            "stage": "refinement",
+            "seconds": round(time.perf_counter() - started, 3),
+            "reused": False,
+            **mapping_report.describe_refinement(model, refinement),
+        }
+    )
+    return build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)
+
+
+def store_of(out: Path) -> StageStore:
+    """Where a scene's folder keeps its finished stages."""
+    return StageStore(out / ".stages")

@@ -1,0 +1,295 @@
+"""Renders drives into folders: images, masks, manifest and the truth."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import InputError, StorageError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.drive import pose_from_matrix
+from mrasfm_engine.synthetic import gnss
+from mrasfm_engine.synthetic.calibration import given_cameras
+from mrasfm_engine.synthetic.light import daylight
+from mrasfm_engine.synthetic.motion import Motion, drive_motion
+from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.render import Lens, develop, render
+from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
+from mrasfm_engine.synthetic.scene_in_time import SceneInTime, build_scene
+from mrasfm_engine.synthetic.world import StaticWorld, build_world
+from schemas import DriveManifest, Frame, FrameImage, LabelMap, Rig, RoughPose, RoughTrajectory
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+FIRST_EPOCH_US = 1_750_000_000_000_000
+_BETWEEN_DRIVES_US = 3_600_000_000
+_WORKERS = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One image to be taken."""
+
+    unit: int
+    camera: int
+    file: str
+    mask: str | None
+    timestamp_us: int
+    world_from_cam: Floats  # true, at the true instant
+
+
+def render_drives(
+    options: SynthOptions, out: Path, *, force: bool = False, progress: Progress | None = None
+) -> list[Path]:
+    """Render one world's drives.
+
+    Parameters
+    ----------
+    options
+        What to render.
+    out
+        The drive's folder, or with several drives the folder of `drive_0`, `drive_1` and so on. It appears when
+        everything is written, and not at all when something goes wrong.
+    force
+        Replace what is there.
+    progress
+        Called with the number of images done and of all.
+
+    Returns
+    -------
+    The drives' folders.
+
+    Raises
+    ------
+    InputError
+        When `out` holds files already.
+    StorageError
+        When it cannot be written.
+    """
+    if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is not an empty folder", remedy="Choose another --out, or replace it with --force.")
+    partial: Path | None = None
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        partial.chmod(0o755)
+        names = ["."] if options.drives == 1 else [f"drive_{k}" for k in range(options.drives)]
+        _render_into([partial / name for name in names], options, progress)
+        _replace(partial, out)
+    except OSError as error:
+        raise StorageError(
+            f"{out} could not be written: {error}", remedy="Free space or choose another folder."
+        ) from error
+    finally:
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)
+    return [out / name for name in names]
+
+
+def _replace(partial: Path, out: Path) -> None:
+    old = None
+    if out.exists():
+        old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
+        os.replace(out, old / "old")
+    os.replace(partial, out)
+    if old is not None:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _render_into(folders: list[Path], options: SynthOptions, progress: Progress | None) -> None:
+    # Each topic has its own stream of random numbers, so that an option changes nothing but its own topic.
+    world = build_world(options, np.random.default_rng([options.seed, 0]))
+    rig = true_cameras(
+        options.cameras,
+        width=options.width,
+        height=options.height,
+        model=options.camera_model,
+        rng=np.random.default_rng([options.seed, 1]),
+    )
+    lenses = [Lens(camera) for camera in rig]
+    total = options.drives * options.units * len(rig)
+    for drive, folder in enumerate(folders):
+        folder.mkdir(exist_ok=True)
+        done_before = drive * options.units * len(rig)
+
+        def report(done: int, offset: int = done_before) -> None:
+            if progress is not None:
+                progress(offset + done, total)
+
+        _render_drive(options, world, rig, lenses, drive, folder, report)
+    if progress is not None:
+        progress(total, total)
+
+
+def _render_drive(
+    options: SynthOptions,
+    world: StaticWorld,
+    rig: list[TrueCamera],
+    lenses: list[Lens],
+    drive: int,
+    folder: Path,
+    report: Callable[[int], None],
+) -> None:
+    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(6)]
+    motion = drive_motion(options, world.layout, drive, rng[0])
+    start_us = FIRST_EPOCH_US + drive * _BETWEEN_DRIVES_US
+    unit_s = np.arange(options.units) / RATE_HZ
+    unit_us = start_us + np.round(unit_s * 1e6).astype(np.int64)
+    shots = _plan(options, motion, rig, unit_us, start_us, rng[1])
+    scene = build_scene(options, world, drive=drive, own=motion, rig=rig, light=daylight(rng[2]), rng=rng[3])
+    world_from_rig = motion.world_from_rig(unit_s)
+    manifest = DriveManifest(
+        name=f"synthetic {options.world} {drive}, seed {options.seed}",
+        rig=Rig(cameras=given_cameras(options, rig, np.random.default_rng([options.seed, 3]))),
+        frames=_frames(options, shots, rig, unit_us),
+        gnss=gnss.receive(options, world_from_rig, unit_us, rng[4]) if options.gnss else None,
+        rough_poses=_rough(options, world_from_rig, unit_us, rng[5]) if options.rough_poses else None,
+        label_map=LabelMap.cityscapes() if options.masks else None,
+        notes=["rendered by mrasfm synth"],
+    )
+    for camera in rig:
+        (folder / "images" / camera.name).mkdir(parents=True)
+        if options.masks:
+            (folder / "masks" / camera.name).mkdir(parents=True)
+    (folder / "drive.json").write_text(manifest.model_dump_json(exclude_none=True, indent=1) + "\n")
+    _write_truth(folder, options, rig, shots, world_from_rig, unit_us)
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        tasks = [
+            pool.submit(_take, options, scene, lenses[shot.camera], shot, folder, start_us, drive) for shot in shots
+        ]
+        try:
+            for done, task in enumerate(tasks, 1):
+                task.result()
+                report(done)
+        finally:
+            for task in tasks:
+                task.cancel()
+
+
+def _plan(
+    options: SynthOptions,
+    motion: Motion,
+    rig: list[TrueCamera],
+    unit_us: NDArray[np.int64],
+    start_us: int,
+    rng: np.random.Generator,
+) -> list[Shot]:
+    """When and where every image is taken; the images that are dropped are left out."""
+    spread = np.linspace(-0.5, 0.5, len(rig)) if len(rig) > 1 else np.zeros(1)
+    skew_us = np.round(rng.permutation(spread) * options.time_skew_ms * 1000).astype(np.int64)
+    dropped = rng.random((len(unit_us), len(rig))) < options.drop_images
+    shots = []
+    for unit, at_us in enumerate(unit_us):
+        for k, camera in enumerate(rig):
+            if dropped[unit, k]:
+                continue
+            t = int(at_us + skew_us[k])
+            world_from_cam = motion.world_from_rig((t - start_us) / 1e6) @ camera.rig_from_cam
+            shots.append(
+                Shot(
+                    unit=unit,
+                    camera=k,
+                    file=f"images/{camera.name}/{unit:06d}.jpg",
+                    mask=f"masks/{camera.name}/{unit:06d}.png" if options.masks else None,
+                    timestamp_us=t,
+                    world_from_cam=world_from_cam,
+                )
+            )
+    return shots
+
+
+def _frames(options: SynthOptions, shots: list[Shot], rig: list[TrueCamera], unit_us: NDArray[np.int64]) -> list[Frame]:
+    images: list[dict[str, FrameImage]] = [{} for _ in unit_us]
+    for shot in shots:
+        images[shot.unit][rig[shot.camera].name] = FrameImage(
+            file=shot.file, mask=shot.mask, timestamp_us=shot.timestamp_us if options.time_skew_ms > 0 else None
+        )
+    return [Frame(timestamp_us=int(t), source_frame=unit, images=images[unit]) for unit, t in enumerate(unit_us)]
+
+
+def _rough(
+    options: SynthOptions, world_from_rig: Floats, unit_us: NDArray[np.int64], rng: np.random.Generator
+) -> RoughTrajectory:
+    n = len(world_from_rig)
+    rough = world_from_rig.copy()
+    rough[:, :3, 3] += options.rough_noise_m * rng.normal(size=(n, 3))
+    rough[:, :3, :3] = rough[:, :3, :3] @ se3.exp_so3(np.radians(options.rough_noise_deg) * rng.normal(size=(n, 3)))
+    return RoughTrajectory(
+        poses=[
+            RoughPose(timestamp_us=int(t), world_from_rig=pose_from_matrix(pose))
+            for t, pose in zip(unit_us, rough, strict=True)
+        ],
+        sigma_translation_m=max(0.01, options.rough_noise_m),
+        sigma_rotation_deg=max(0.01, options.rough_noise_deg),
+    )
+
+
+def _write_truth(
+    folder: Path,
+    options: SynthOptions,
+    rig: list[TrueCamera],
+    shots: list[Shot],
+    world_from_rig: Floats,
+    unit_us: NDArray[np.int64],
+) -> None:
+    """Write what the engine never reads."""
+    lines = []
+    for t, pose in zip(unit_us.tolist(), world_from_rig, strict=True):
+        numbers = [*pose[:3, 3], *se3.quaternion_from_rotation(pose[:3, :3])]
+        lines.append(" ".join([f"{t // 10**6}.{t % 10**6:06d}", *(f"{v:.9f}" for v in numbers)]))
+    (folder / "truth.tum").write_text("\n".join(lines) + "\n")
+    calibration = {camera.name: pose_from_matrix(camera.rig_from_cam).model_dump() for camera in rig}
+    (folder / "truth_calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
+    images = {
+        shot.file: {
+            "camera": rig[shot.camera].name,
+            "unit": shot.unit,
+            "timestamp_us": shot.timestamp_us,
+            "world_from_cam": pose_from_matrix(shot.world_from_cam).model_dump(),
+        }
+        for shot in shots
+    }
+    (folder / "truth_cameras.json").write_text(json.dumps(images, indent=1) + "\n")
+    origin = {"enu_origin": asdict(gnss.Origin()), "options": asdict(options)}
+    (folder / "truth_world.json").write_text(json.dumps(origin, indent=1) + "\n")
+
+
+def _take(
+    options: SynthOptions, scene: SceneInTime, lens: Lens, shot: Shot, folder: Path, start_us: int, drive: int
+) -> None:
+    """Render, expose and write one image and its mask."""
+    mesh, boxes = scene.at((shot.timestamp_us - start_us) / 1e6)
+    view = render(
+        mesh,
+        scene.materials.atlas,
+        lens,
+        shot.world_from_cam,
+        light=scene.light,
+        shadows=scene.shadows,
+        shadow_strength=options.shadow_strength,
+        moving_boxes=boxes,
+        sky_texture=scene.materials.clouds,
+    )
+    # An image's noise must not depend on which thread comes first.
+    rng = np.random.default_rng([options.seed, 4, drive, shot.unit, shot.camera])
+    gain = scene.light.gain * float(np.exp(0.5 * options.exposure_jitter * rng.normal()))
+    image = develop(view, lens, gain=gain, noise=options.noise, blur_px=options.blur_px, rng=rng)
+    _write(folder / shot.file, image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, options.jpeg_quality])
+    if shot.mask is not None:
+        _write(folder / shot.mask, view.labels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+
+
+def _write(path: Path, image: NDArray[np.uint8], parameters: list[int]) -> None:
+    if not cv2.imwrite(str(path), image, parameters):
+        raise OSError(f"{path} could not be encoded or written")

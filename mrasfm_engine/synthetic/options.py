@@ -1,0 +1,137 @@
+"""What can be asked of the renderer, and what makes no sense to ask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.synthetic.rigs import MAX_SYNTHETIC_CAMERAS, mounts
+
+RATE_HZ = 10.0
+MIN_LOOP_M = 110.0
+LOOP_OVERLAP_M = 10.0
+
+
+class World(StrEnum):
+    """Kinds of streets."""
+
+    STREET = "street"  # one winding street
+    CROSSING = "crossing"  # two streets that cross
+    LOOP = "loop"  # once around a block
+    REPEATED = "repeated"  # two parallel streets whose facades are all the same
+
+
+class SpeedProfile(StrEnum):
+    """How the vehicle's speed varies about its mean."""
+
+    CONSTANT = "constant"
+    GENTLE = "gentle"  # by 8 %
+    VARYING = "varying"  # 3 to 12 m/s
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthOptions:
+    """One world and its drives. Lengths are metres, angles degrees; noise is the standard deviation of each axis."""
+
+    cameras: int = 6
+    units: int = 40
+    drives: int = 1
+    seed: int = 1
+    world: World = World.STREET
+    straight: bool = False  # the first street has no curvature
+    ramp_percent: float = 0.0  # slope of a hill that begins 10 m into the first drive
+    parked_cars: int = 8
+    moving_cars: int = 3
+    shadow_strength: float = 1.0  # 0: no shadows, 1: as dark as they are
+
+    width: int = 960
+    height: int = 540
+    camera_model: str = "PINHOLE"
+    exposure_jitter: float = 0.0  # standard deviation of the logarithm of every image's brightness
+    noise: float = 1.0  # 1 is a good sensor in daylight, 0 none
+    blur_px: float = 0.45  # standard deviation of the point spread function
+    jpeg_quality: int = 95
+    masks: bool = True
+    texture_px: int = 1024  # side of the largest textures; less for small images and fast tests
+
+    spacing_m: float = 1.1  # mean distance between units, at 10 Hz
+    speed_profile: SpeedProfile = SpeedProfile.GENTLE
+    standing_units: int = 0  # the vehicle stands still for that many units in the middle of each drive
+    time_skew_ms: float = 0.0  # the images of a unit are taken up to that long apart
+    drop_images: float = 0.0  # fraction of images that are missing
+    occluded_cameras: tuple[str, ...] = ()  # a lorry covers most of their images for half of the drive
+
+    gnss: bool = True
+    gnss_noise_m: float = 0.3  # white; vertical 1.5 times that
+    gnss_drift_m: float = 0.2  # slowly changing (correlation time 20 s)
+    gnss_bias_m: float = 0.3  # constant in each drive
+    gnss_outliers: float = 0.0  # fraction of samples that are 5 to 40 m off
+    gnss_offset_s: float = 0.0  # added to the GNSS timestamps
+    rough_poses: bool = False
+    rough_noise_m: float = 0.3
+    rough_noise_deg: float = 1.0
+
+    perturb_rotation_deg: float = 0.0  # norm of each given extrinsic rotation's error, in a random direction
+    perturb_translation_m: float = 0.0  # norm of each given extrinsic translation's error, in a random direction
+    declare_sigmas: bool = False  # the manifest says how well the extrinsics are known
+    tight: bool = False  # the manifest declares 0.01 degrees and 1 mm
+    wrong_camera: str | None = None
+    wrong_by_deg: float = 3.0  # additional rotation of the wrong camera about a random axis
+
+    def __post_init__(self) -> None:
+        def refuse(what: str, remedy: str) -> None:
+            raise InputError(what, remedy=remedy)
+
+        if not 1 <= self.cameras <= MAX_SYNTHETIC_CAMERAS:
+            refuse(f"--cameras {self.cameras} is not possible", f"Ask for 1 to {MAX_SYNTHETIC_CAMERAS}.")
+        for name in ("units", "drives"):
+            if getattr(self, name) < 1:
+                refuse(f"--{name} {getattr(self, name)} is not positive", "Ask for at least 1.")
+        if self.width < 32 or self.height < 32 or self.width > 8192 or self.height > 8192:
+            refuse(f"images of {self.width}x{self.height} pixels cannot be rendered", "Use sides of 32 to 8192 pixels.")
+        if self.texture_px not in (64, 128, 256, 512, 1024):
+            refuse(f"textures of {self.texture_px} pixels are not possible", "Use 64, 128, 256, 512 or 1024.")
+        for name in (
+            "parked_cars moving_cars exposure_jitter noise blur_px standing_units time_skew_ms gnss_noise_m "
+            "gnss_drift_m gnss_bias_m rough_noise_m rough_noise_deg perturb_rotation_deg perturb_translation_m seed"
+        ).split():
+            if getattr(self, name) < 0:
+                flag = name.replace("_", "-")
+                refuse(f"--{flag} {getattr(self, name)} is negative", "Give zero or a positive number.")
+        for name in ("drop_images", "gnss_outliers", "shadow_strength"):
+            if not 0 <= getattr(self, name) <= 1:
+                flag = name.replace("_", "-")
+                refuse(f"--{flag} {getattr(self, name)} is not a fraction", "Give a number from 0 to 1.")
+        if not 0.05 <= self.spacing_m <= 5:
+            refuse(f"--spacing-m {self.spacing_m} is not a car's", "Use 0.05 to 5 m, which is 0.5 to 50 m/s.")
+        if self.time_skew_ms >= 1000 / RATE_HZ:
+            refuse(f"--time-skew-ms {self.time_skew_ms} reaches the next unit", "Use less than 100 ms.")
+        if abs(self.ramp_percent) > 20:
+            refuse(f"--ramp {self.ramp_percent} is steeper than streets are", "Use -20 to 20 percent.")
+        if self.standing_units > self.units // 2:
+            refuse(
+                f"--standing {self.standing_units} is more than half of {self.units} units", "Stand still for fewer."
+            )
+        names = [mount.name for mount in mounts(self.cameras)]
+        for name in (*self.occluded_cameras, *([self.wrong_camera] if self.wrong_camera else [])):
+            if name not in names:
+                refuse(f"camera {name!r} is not on this vehicle", f"Its cameras are {', '.join(names)}.")
+        if self.tight and (self.perturb_rotation_deg or self.perturb_translation_m):
+            refuse("--tight declares a calibration that is perturbed", "Leave out --tight, or the perturbation.")
+        if self.world is World.LOOP and self.loop_length_m < MIN_LOOP_M:
+            needed = int((MIN_LOOP_M / self.drives + LOOP_OVERLAP_M) / self.spacing_m) + 1
+            refuse(
+                f"{self.units} units of {self.spacing_m} m do not go around a block",
+                f"Ask for at least {needed} units.",
+            )
+
+    @property
+    def drive_length_m(self) -> float:
+        """How far each drive goes, without the units in which it stands still."""
+        return (self.units - 1 - self.standing_units) * self.spacing_m
+
+    @property
+    def loop_length_m(self) -> float:
+        """Way around the block: every drive ends 10 m into the next one's way."""
+        return self.drives * (self.drive_length_m - LOOP_OVERLAP_M)

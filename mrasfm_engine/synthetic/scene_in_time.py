@@ -1,0 +1,145 @@
+"""One drive's scene at any instant: what stands, what moves, and the shadows of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.synthetic import objects
+from mrasfm_engine.synthetic.light import Light, ShadowMap, cast_shadows
+from mrasfm_engine.synthetic.materials import Materials
+from mrasfm_engine.synthetic.mesh import Mesh, concatenate
+from mrasfm_engine.synthetic.motion import Motion, traffic
+from mrasfm_engine.synthetic.occluder import place_truck
+from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.rigs import TrueCamera
+from mrasfm_engine.synthetic.streets import ROAD_HALF_M, Layout
+from mrasfm_engine.synthetic.world import StaticWorld
+
+Floats = NDArray[np.float64]
+
+_UNDERGROUND_M = -500.0  # where things wait that are not there
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mover:
+    """A vehicle that moves: by its own motion, or fixed to the recording vehicle."""
+
+    mesh: Mesh  # in its own frame
+    motion: Motion
+    motion_from_mover: Floats  # (4, 4)
+    size_m: tuple[float, float, float]
+    is_truck: bool
+    begin_s: float = -np.inf  # there only in between
+    end_s: float = np.inf
+
+    def pose(self, time_s: float) -> Floats | None:
+        """`world_from_mover` (4, 4), or nothing while it is not there."""
+        if not self.begin_s <= time_s < self.end_s:
+            return None
+        result: Floats = self.motion.world_from_rig(time_s) @ self.motion_from_mover
+        return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneInTime:
+    """Everything that a drive's cameras can see."""
+
+    materials: Materials
+    light: Light
+    shadows: ShadowMap
+    static: Mesh
+    movers: list[Mover]
+    everything: Mesh  # static, then the movers in their own frames
+
+    def at(self, time_s: float) -> tuple[Mesh, Floats]:
+        """The mesh at an instant, and the moving casters (k, 8) of shadows."""
+        if not self.movers:
+            return self.static, np.zeros((0, 8))
+        parts, boxes = [], []
+        for mover in self.movers:
+            pose = mover.pose(time_s)
+            if pose is None:
+                pose = np.eye(4)
+                pose[2, 3] = _UNDERGROUND_M
+            else:
+                boxes.append(objects.shadow_boxes(pose, mover.size_m, is_truck=mover.is_truck))
+            parts.append(mover.mesh.moved(pose))
+        geometry = {
+            name: np.concatenate([getattr(self.static, name), *(getattr(part, name) for part in parts)])
+            for name in ("origin", "u", "v", "normal")
+        }
+        return replace(self.everything, **geometry), np.concatenate([np.zeros((0, 8)), *boxes])
+
+
+def parked_cars(options: SynthOptions, world: StaticWorld, drive: int, rng: np.random.Generator) -> list[Mesh]:
+    """Cars in the parking lanes along a drive's way, none in another street."""
+    layout: Layout = world.layout
+    route = layout.routes[drive]
+    street = layout.streets[route.street]
+    result: list[Mesh] = []
+    places: list[tuple[int, float]] = []
+    for _ in range(60 * options.parked_cars):
+        if len(result) == options.parked_cars:
+            break
+        side = int(rng.choice([-1, 1]))
+        along = float(rng.uniform(-12.0, options.drive_length_m + 30.0))
+        if any(s == side and abs(a - along) < 5.6 for s, a in places):
+            continue
+        s = route.start_m + route.direction * along
+        xy, heading = street.at(s, side * (ROAD_HALF_M - 1.05))
+        others = [other for k, other in enumerate(layout.streets) if k != route.street]
+        if any(other.distance(xy[None])[0] < ROAD_HALF_M + 4.0 for other in others):
+            continue
+        places.append((side, along))
+        turn = float(heading) + (np.pi if side > 0 else 0.0) + float(rng.normal(0, 0.03))
+        frame = objects.pose_on_ground(layout.ground.lift(xy), turn)
+        result.append(objects.car(world.materials, is_moving=False, rng=rng).moved(frame))
+    return result
+
+
+def build_scene(
+    options: SynthOptions,
+    world: StaticWorld,
+    *,
+    drive: int,
+    own: Motion,
+    rig: list[TrueCamera],
+    light: Light,
+    rng: np.random.Generator,
+) -> SceneInTime:
+    """The world with one drive's parked cars, traffic and light."""
+    static = concatenate([world.mesh, *parked_cars(options, world, drive, rng)])
+    movers = [
+        Mover(
+            mesh=objects.car(world.materials, is_moving=True, rng=rng),
+            motion=motion,
+            motion_from_mover=np.eye(4),
+            size_m=objects.CAR_SIZE_M,
+            is_truck=False,
+        )
+        for motion in traffic(options, world.layout, drive, rng)
+    ]
+    for camera in rig:
+        if camera.name in options.occluded_cameras:
+            movers.append(
+                Mover(
+                    mesh=objects.truck(world.materials, rng=rng),
+                    motion=own,
+                    motion_from_mover=place_truck(camera, rig),
+                    size_m=objects.TRUCK_SIZE_M,
+                    is_truck=True,
+                    begin_s=0.25 * options.units / RATE_HZ - 0.05,
+                    end_s=0.75 * options.units / RATE_HZ - 0.05,
+                )
+            )
+    return SceneInTime(
+        materials=world.materials,
+        light=light,
+        shadows=cast_shadows(static, world.materials.atlas, light.to_sun),
+        static=static,
+        movers=movers,
+        everything=concatenate([static, *(mover.mesh for mover in movers)]) if movers else static,
+    )

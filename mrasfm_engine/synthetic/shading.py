@@ -1,0 +1,407 @@
+"""Colour: mip-mapped, anisotropically filtered textures under sun, sky light, shadows and haze.
+
+Everything is computed in square-root ("gamma 2") intensities, as textures are stored, because they are multiplied only.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+MAX_TAPS = 8
+
+_SKY = 10
+
+# Reordering of sums is harmless; that infinities and nans do not occur must not be assumed: the sky is at inf.
+_FAST = {"reassoc", "contract", "arcp", "nsz"}
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
+    """Red, green and blue (0..255) of a texture's level at texture coordinates, which repeat with period 1."""
+    w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
+    x, y = u * w - 0.5, v * h - 0.5
+    fx, fy = math.floor(x), math.floor(y)
+    ax, ay = x - fx, y - fy
+    c0, r0 = int(fx) & (w - 1), int(fy) & (h - 1)
+    c1, r1 = (c0 + 1) & (w - 1), (r0 + 1) & (h - 1)
+    base = offset[t, level]
+    t00, t01 = texels[base + r0 * w + c0], texels[base + r0 * w + c1]
+    t10, t11 = texels[base + r1 * w + c0], texels[base + r1 * w + c1]
+    w00, w01, w10, w11 = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
+    red = w00 * (t00 & 255) + w01 * (t01 & 255) + w10 * (t10 & 255) + w11 * (t11 & 255)
+    green = w00 * ((t00 >> 8) & 255) + w01 * ((t01 >> 8) & 255) + w10 * ((t10 >> 8) & 255) + w11 * ((t11 >> 8) & 255)
+    blue = w00 * ((t00 >> 16) & 255) + w01 * ((t01 >> 16) & 255) + w10 * ((t10 >> 16) & 255) + w11 * ((t11 >> 16) & 255)
+    return red, green, blue
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
+    """The first channel of `_bilinear`."""
+    w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
+    x, y = u * w - 0.5, v * h - 0.5
+    fx, fy = math.floor(x), math.floor(y)
+    ax, ay = x - fx, y - fy
+    c0, r0 = int(fx) & (w - 1), int(fy) & (h - 1)
+    c1, r1 = (c0 + 1) & (w - 1), (r0 + 1) & (h - 1)
+    base = offset[t, level]
+    upper = (1 - ax) * (texels[base + r0 * w + c0] & 255) + ax * (texels[base + r0 * w + c1] & 255)
+    lower = (1 - ax) * (texels[base + r1 * w + c0] & 255) + ax * (texels[base + r1 * w + c1] & 255)
+    return (1 - ay) * upper + ay * lower
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, log2_h: Any, levels: Any) -> Any:
+    """Number of taps, their spacing's direction (whole length) and the mip level for a pixel's footprint.
+
+    The footprint has the edges (ux, vx) and (uy, vy) in texture coordinates; taps lie along the longer one.
+    """
+    w, h = float(1 << log2_w[t]), float(1 << log2_h[t])
+    length_x = math.sqrt((ux * w) ** 2 + (vx * h) ** 2)
+    length_y = math.sqrt((uy * w) ** 2 + (vy * h) ** 2)
+    if length_x >= length_y:
+        major, minor, du, dv = length_x, length_y, ux, vx
+    else:
+        major, minor, du, dv = length_y, length_x, uy, vy
+    taps = max(1, min(MAX_TAPS, int(math.ceil(major / max(minor, 1.0) - 0.25))))
+    level = math.log2(max(major / taps, 1.0))
+    return taps, du, dv, min(level, float(levels[t] - 1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _filtered(
+    t: int,
+    u: float,
+    v: float,
+    ux: float,
+    vx: float,
+    uy: float,
+    vy: float,
+    texels: Any,
+    offset: Any,
+    log2_w: Any,
+    log2_h: Any,
+    levels: Any,
+) -> Any:
+    """The texture's mean colour over a pixel, by trilinear taps."""
+    taps, du, dv, exact_level = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
+    level = int(exact_level)
+    fraction = exact_level - level
+    red, green, blue = 0.0, 0.0, 0.0
+    for k in range(taps):
+        f = (k + 0.5) / taps - 0.5
+        r, g, b = _bilinear(t, level, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
+        if fraction > 0.02:
+            r2, g2, b2 = _bilinear(t, level + 1, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
+            r, g, b = r + fraction * (r2 - r), g + fraction * (g2 - g), b + fraction * (b2 - b)
+        red, green, blue = red + r, green + g, blue + b
+    return red / taps, green / taps, blue / taps
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _filtered_grey(
+    t: int,
+    u: float,
+    v: float,
+    ux: float,
+    vx: float,
+    uy: float,
+    vy: float,
+    texels: Any,
+    offset: Any,
+    log2_w: Any,
+    log2_h: Any,
+    levels: Any,
+) -> float:
+    """The first channel of `_filtered`."""
+    taps, du, dv, exact_level = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
+    level = int(exact_level)
+    fraction = exact_level - level
+    total = 0.0
+    for k in range(taps):
+        f = (k + 0.5) / taps - 0.5
+        value = _bilinear_grey(t, level, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
+        if fraction > 0.02:
+            coarse = _bilinear_grey(t, level + 1, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
+            value += fraction * (coarse - value)
+        total += value
+    return total / taps
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _sun_reaches(
+    x: float,
+    y: float,
+    z: float,
+    to_sun: Any,
+    sun_from_world: Any,
+    shadow_map: Any,
+    shadow_frame: Any,
+    boxes: Any,
+    casters: int,
+) -> float:
+    """Share of the sun that a world point sees: 0 in full shadow, 1 in none.
+
+    `shadow_frame` is the map's x0, y0 and cell size in the sun's frame; the first `casters` rows of `boxes` (k, 8) move: centre x, y,
+    lower and upper z, cosine and sine of the heading, half length, half width.
+    """
+    for k in range(casters):
+        px, py = x - boxes[k, 0], y - boxes[k, 1]
+        if (px * px + py * py) > 900.0:
+            continue
+        c, s = boxes[k, 4], boxes[k, 5]
+        ox, oy = c * px + s * py, -s * px + c * py
+        dx, dy, dz = c * to_sun[0] + s * to_sun[1], -s * to_sun[0] + c * to_sun[1], to_sun[2]
+        t0, t1 = (boxes[k, 2] - z) / dz, (boxes[k, 3] - z) / dz
+        t0 = max(t0, 0.0)
+        if abs(dx) > 1e-6:
+            ta, tb = (-boxes[k, 6] - ox) / dx, (boxes[k, 6] - ox) / dx
+            t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
+        elif abs(ox) > boxes[k, 6]:
+            continue
+        if abs(dy) > 1e-6:
+            ta, tb = (-boxes[k, 7] - oy) / dy, (boxes[k, 7] - oy) / dy
+            t0, t1 = max(t0, min(ta, tb)), min(t1, max(ta, tb))
+        elif abs(oy) > boxes[k, 7]:
+            continue
+        if t0 < t1:
+            return 0.0
+    sx = sun_from_world[0, 0] * x + sun_from_world[0, 1] * y + sun_from_world[0, 2] * z + sun_from_world[0, 3]
+    sy = sun_from_world[1, 0] * x + sun_from_world[1, 1] * y + sun_from_world[1, 2] * z + sun_from_world[1, 3]
+    sz = sun_from_world[2, 0] * x + sun_from_world[2, 1] * y + sun_from_world[2, 2] * z + sun_from_world[2, 3]
+    cx, cy = (sx - shadow_frame[0]) / shadow_frame[2] - 0.5, (sy - shadow_frame[1]) / shadow_frame[2] - 0.5
+    col, row = int(math.floor(cx)), int(math.floor(cy))
+    if col < 0 or row < 0 or col + 1 >= shadow_map.shape[1] or row + 1 >= shadow_map.shape[0]:
+        return 1.0
+    ax, ay = cx - col, cy - row
+    lit = 0.0
+    if shadow_map[row, col] <= sz:
+        lit += (1 - ax) * (1 - ay)
+    if shadow_map[row, col + 1] <= sz:
+        lit += ax * (1 - ay)
+    if shadow_map[row + 1, col] <= sz:
+        lit += (1 - ax) * ay
+    if shadow_map[row + 1, col + 1] <= sz:
+        lit += ax * ay
+    return lit
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def shade(
+    index: Any,
+    ideal: Any,
+    plane: Any,
+    world_from_cam: Any,
+    texture: Any,
+    texture_uv: Any,
+    detail: Any,
+    detail_uv: Any,
+    tint: Any,
+    normal: Any,
+    label: Any,
+    is_moving: Any,
+    texels: Any,
+    offset: Any,
+    log2_w: Any,
+    log2_h: Any,
+    levels: Any,
+    light: Any,
+    sun_from_world: Any,
+    shadow_map: Any,
+    shadow_frame: Any,
+    boxes: Any,
+    sky_texture: int,
+    image: Any,
+    labels: Any,
+    depth: Any,
+) -> None:
+    """Fill `image` (h, w, 3) in 0..1, `labels` (h, w) and `depth` (h, w; metres along z, inf for sky).
+
+    `index` (2h, 2w) are the primitives that a pixel's four samples see, -1 for sky; `ideal` (h, w, 2) the ideal
+    coordinates of pixel centres. `light` (7, 3): direction to the sun, sun, sky light, haze colour, zenith colour,
+    (haze distance, shadow strength, cloudiness), sun's glow.
+    """
+    height, width = image.shape[0], image.shape[1]
+    to_sun = light[0]
+    ids = np.zeros(4, np.int64)
+    for row in range(height):
+        for col in range(width):
+            x, y = ideal[row, col, 0], ideal[row, col, 1]
+            cn = col + 1 if col + 1 < width else col - 1
+            rn = row + 1 if row + 1 < height else row - 1
+            sc, sr = float(cn - col), float(rn - row)
+            xx, yx = (ideal[row, cn, 0] - x) * sc, (ideal[row, cn, 1] - y) * sc
+            xy, yy = (ideal[rn, col, 0] - x) * sr, (ideal[rn, col, 1] - y) * sr
+            ids[0], ids[1] = index[2 * row, 2 * col], index[2 * row, 2 * col + 1]
+            ids[2], ids[3] = index[2 * row + 1, 2 * col], index[2 * row + 1, 2 * col + 1]
+            red, green, blue = 0.0, 0.0, 0.0
+            best_weight, best_label, best_depth = 0.0, 255, math.inf
+            for k in range(4):
+                i = ids[k]
+                # One evaluation for each primitive that is new among the four samples.
+                seen_before = False
+                for m in range(k):
+                    if ids[m] == i:
+                        seen_before = True
+                if seen_before:
+                    continue
+                count, off_x, off_y = 0, 0.0, 0.0
+                for m in range(k, 4):
+                    if ids[m] == i:
+                        count += 1
+                        off_x += 0.25 if m & 1 else -0.25
+                        off_y += 0.25 if m & 2 else -0.25
+                off_x, off_y = off_x / count, off_y / count
+                px, py = x + off_x * xx + off_y * xy, y + off_x * yx + off_y * yy
+                weight = count / 4.0
+                # The pixel's class is that of most samples.
+                if i < 0:
+                    d0 = world_from_cam[0, 0] * px + world_from_cam[0, 1] * py + world_from_cam[0, 2]
+                    d1 = world_from_cam[1, 0] * px + world_from_cam[1, 1] * py + world_from_cam[1, 2]
+                    d2 = world_from_cam[2, 0] * px + world_from_cam[2, 1] * py + world_from_cam[2, 2]
+                    norm = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+                    d0, d1, d2 = d0 / norm, d1 / norm, d2 / norm
+                    up = min(max(d2, 0.0) * 1.6, 1.0)
+                    glow = max(0.0, d0 * to_sun[0] + d1 * to_sun[1] + d2 * to_sun[2]) ** 24
+                    spread = 0.12 / (max(d2, 0.0) + 0.15)
+                    cloud, _, _ = _bilinear(
+                        sky_texture, 1, 0.5 + d0 * spread, 0.5 + d1 * spread, texels, offset, log2_w, log2_h
+                    )
+                    cover = light[5, 2] * cloud / 255.0 * min(1.0, max(d2, 0.0) * 6.0)
+                    red += weight * ((1 - up) * light[3, 0] + up * light[4, 0] + cover * 0.5 + glow * light[6, 0])
+                    green += weight * ((1 - up) * light[3, 1] + up * light[4, 1] + cover * 0.42 + glow * light[6, 1])
+                    blue += weight * ((1 - up) * light[3, 2] + up * light[4, 2] + cover * 0.3 + glow * light[6, 2])
+                    if weight > best_weight:
+                        best_weight, best_label, best_depth = weight, _SKY, math.inf
+                    continue
+                a = plane[i, 0, 0] * px + plane[i, 0, 1] * py + plane[i, 0, 2]
+                b = plane[i, 1, 0] * px + plane[i, 1, 1] * py + plane[i, 1, 2]
+                w = plane[i, 2, 0] * px + plane[i, 2, 1] * py + plane[i, 2, 2]
+                w = max(w, 1e-5)
+                a, b, z = a / w, b / w, 1.0 / w
+                # Change of a and b from pixel to pixel, by the quotient rule. No views of arrays in here: each one
+                # would count references, which costs more than the arithmetic.
+                wx, wy = plane[i, 2, 0] * xx + plane[i, 2, 1] * yx, plane[i, 2, 0] * xy + plane[i, 2, 1] * yy
+                ax = (plane[i, 0, 0] * xx + plane[i, 0, 1] * yx - a * wx) * z
+                ay = (plane[i, 0, 0] * xy + plane[i, 0, 1] * yy - a * wy) * z
+                bx = (plane[i, 1, 0] * xx + plane[i, 1, 1] * yx - b * wx) * z
+                by = (plane[i, 1, 0] * xy + plane[i, 1, 1] * yy - b * wy) * z
+                a, b = min(max(a, 0.0), 1.0), min(max(b, 0.0), 1.0)
+                u0, v0, ua, va, ub, vb = (
+                    texture_uv[i, 0],
+                    texture_uv[i, 1],
+                    texture_uv[i, 2],
+                    texture_uv[i, 3],
+                    texture_uv[i, 4],
+                    texture_uv[i, 5],
+                )
+                r, g, bl = _filtered(
+                    texture[i],
+                    u0 + a * ua + b * ub,
+                    v0 + a * va + b * vb,
+                    ua * ax + ub * bx,
+                    va * ax + vb * bx,
+                    ua * ay + ub * by,
+                    va * ay + vb * by,
+                    texels,
+                    offset,
+                    log2_w,
+                    log2_h,
+                    levels,
+                )
+                scale = 1.0 / 255.0
+                if detail[i] >= 0:
+                    u0, v0, ua, va, ub, vb = (
+                        detail_uv[i, 0],
+                        detail_uv[i, 1],
+                        detail_uv[i, 2],
+                        detail_uv[i, 3],
+                        detail_uv[i, 4],
+                        detail_uv[i, 5],
+                    )
+                    f = _filtered_grey(
+                        detail[i],
+                        u0 + a * ua + b * ub,
+                        v0 + a * va + b * vb,
+                        ua * ax + ub * bx,
+                        va * ax + vb * bx,
+                        ua * ay + ub * by,
+                        va * ay + vb * by,
+                        texels,
+                        offset,
+                        log2_w,
+                        log2_h,
+                        levels,
+                    )
+                    scale *= f / 128.0
+                wx = world_from_cam[0, 0] * px + world_from_cam[0, 1] * py + world_from_cam[0, 2]
+                wy = world_from_cam[1, 0] * px + world_from_cam[1, 1] * py + world_from_cam[1, 2]
+                wz = world_from_cam[2, 0] * px + world_from_cam[2, 1] * py + world_from_cam[2, 2]
+                nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+                # Two-sided surfaces show the viewer their lit or unlit face.
+                if nx * wx + ny * wy + nz * wz > 0:
+                    nx, ny, nz = -nx, -ny, -nz
+                facing = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
+                unoriented = nx == 0.0 and ny == 0.0 and nz == 0.0
+                if unoriented:
+                    facing = 0.6
+                sun = 0.0
+                if facing > 0:
+                    sun = facing
+                    # A moving object would otherwise stand in the shadow of its own box.
+                    casters = 0 if is_moving[i] else boxes.shape[0]
+                    reach = _sun_reaches(
+                        world_from_cam[0, 3] + z * wx + 0.09 * nx,
+                        world_from_cam[1, 3] + z * wy + 0.09 * ny,
+                        world_from_cam[2, 3] + z * wz + 0.09 * nz,
+                        to_sun,
+                        sun_from_world,
+                        shadow_map,
+                        shadow_frame,
+                        boxes,
+                        casters,
+                    )
+                    sun *= 1.0 - light[5, 1] * (1.0 - reach)
+                ambient = 0.75 + 0.25 * nz
+                clear = math.exp(-z / light[5, 0])
+                r *= scale * tint[i, 0] * math.sqrt(sun * light[1, 0] + ambient * light[2, 0])
+                g *= scale * tint[i, 1] * math.sqrt(sun * light[1, 1] + ambient * light[2, 1])
+                bl *= scale * tint[i, 2] * math.sqrt(sun * light[1, 2] + ambient * light[2, 2])
+                red += weight * (clear * r + (1 - clear) * light[3, 0])
+                green += weight * (clear * g + (1 - clear) * light[3, 1])
+                blue += weight * (clear * bl + (1 - clear) * light[3, 2])
+                if weight > best_weight:
+                    best_weight, best_label, best_depth = weight, int(label[i]), z
+            image[row, col, 0], image[row, col, 1], image[row, col, 2] = red, green, blue
+            labels[row, col] = best_label
+            depth[row, col] = best_depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def expose(image: Any, vignetting: Any, gain: float, shot: float, read: float, seed: int, out: Any) -> None:
+    """Turn square-root intensities into 8 bits as a sensor does: exposure, lens fall-off, shot and read noise.
+
+    `shot` and `read` are the standard deviations of white's shot noise and of the read noise, in parts of white.
+    In square-root intensities y the linear noise sqrt(shot^2 y^2 + read^2) becomes itself over 2 y.
+    """
+    state = (seed * 2862933555777941757 + 3037000493) & 0x7FFFFFFFFFFFFFFF
+    state |= 1
+    for row in range(image.shape[0]):
+        for col in range(image.shape[1]):
+            factor = gain * vignetting[row, col]
+            for channel in range(3):
+                y = image[row, col, channel] * factor
+                if shot > 0 or read > 0:
+                    state ^= (state << 13) & 0x7FFFFFFFFFFFFFFF
+                    state ^= state >> 7
+                    state ^= (state << 17) & 0x7FFFFFFFFFFFFFFF
+                    # The sum of three uniform numbers is normal enough; its variance is 3 / 12.
+                    total = (state & 0xFFFFF) + ((state >> 20) & 0xFFFFF) + ((state >> 40) & 0xFFFFF)
+                    normal = (total / 1048576.0 - 1.5) * 2.0
+                    dark = max(y, 0.06)
+                    y += normal * math.sqrt(shot * shot * dark * dark + read * read) / (2.0 * dark)
+                value = y * 255.0 + 0.5
+                out[row, col, channel] = int(min(max(value, 0.0), 255.0))

@@ -1,0 +1,161 @@
+"""Noisy observations of random points from a driving camera set, without images: for testing solvers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.synthetic.rigs import true_cameras
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedObservations:
+    """A drive reduced to numbers; everything but `xy_px` is exact.
+
+    Observations are sorted by unit, then camera, then point.
+    """
+
+    world_from_rig: Floats  # (units, 4, 4)
+    rig_from_cam: Floats  # (cameras, 4, 4)
+    camera_params: Floats  # (cameras, 4): PINHOLE's fx fy cx cy, px
+    image_size_px: tuple[int, int]  # width, height
+    timestamps_us: NDArray[np.int64]  # (units,), 10 Hz
+    points_m: Floats  # (points, 3), world frame
+    unit: Ints  # (observations,) index into world_from_rig
+    camera: Ints  # (observations,) index into rig_from_cam
+    point: Ints  # (observations,) index into points_m
+    xy_px: Floats  # (observations, 2), the centre of the top left pixel is at (0.5, 0.5)
+    exact_xy_px: Floats  # (observations, 2), without noise and outliers
+    is_outlier: NDArray[np.bool_]  # (observations,), where xy_px is anywhere in the image
+
+
+def simulate_trajectory(units: int, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
+    """`world_from_rig` (units, 4, 4) of a car on a gently winding (or straight) flat street, world z up.
+
+    Over 40 units of 1.1 m the heading of the winding street varies by 29 degrees.
+    """
+    # Fine steps, then every n-th: the units' headings and positions belong to one smooth curve.
+    fine = 20
+    s = np.arange(units * fine) * (spacing_m / fine)
+    heading = np.radians(25.0) + (
+        np.zeros_like(s) if straight else np.radians(24.0) * np.sin(s / 19.0) + np.radians(5.0) * np.sin(s / 4.0)
+    )
+    step = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(s)], -1) * (spacing_m / fine)
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum(step, 0)[:-1]])
+    pitch_roll = np.radians(0.4) * np.stack([np.sin(s / 1.3), np.sin(s / 2.1 + 1.0)], -1)
+    rotation = (
+        se3.exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0]))
+        @ se3.exp_so3(pitch_roll[:, :1] * np.array([0.0, 1.0, 0.0]))
+        @ se3.exp_so3(pitch_roll[:, 1:] * np.array([1.0, 0.0, 0.0]))
+    )
+    return se3.transform(rotation, position)[::fine]
+
+
+def _points_along(world_from_rig: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """Points (count, 3) on facades, in trees and on the road beside a trajectory and up to 40 m beyond its ends."""
+    spacing_m = 1.1 if len(world_from_rig) < 2 else float(np.linalg.norm(np.diff(world_from_rig[:2, :3, 3], axis=0)))
+    beyond = 40.0 / max(spacing_m, 0.1)
+    place = rng.uniform(-beyond, len(world_from_rig) - 1 + beyond, count)
+    near = world_from_rig[np.clip(np.round(place), 0, len(world_from_rig) - 1).astype(int)]
+    # Beyond the ends, and between units, go straight on along the nearest unit's heading.
+    ahead_m = (place - np.clip(np.round(place), 0, len(world_from_rig) - 1)) * spacing_m
+    side = rng.choice([-1.0, 1.0], count)
+    kind = rng.random(count)
+    lateral = np.where(kind < 0.6, side * rng.uniform(7.5, 11.0, count), side * rng.uniform(4.0, 25.0, count))
+    height = np.where(kind < 0.6, rng.uniform(0.2, 11.0, count), rng.uniform(0.5, 5.0, count))
+    road = kind > 0.85
+    lateral = np.where(road, rng.uniform(-6.0, 6.0, count), lateral)
+    height = np.where(road, 0.0, height)
+    local = np.stack([ahead_m, lateral, height], -1)
+    level = near.copy()
+    heading = np.arctan2(near[:, 1, 0], near[:, 0, 0])
+    level[:, :3, :3] = se3.exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0]))
+    return se3.apply(level, local[:, None, :])[:, 0]
+
+
+def simulate_observations(
+    *,
+    units: int = 20,
+    cameras: int = 6,
+    points: int = 2000,
+    noise_px: float = 0.5,
+    outlier_fraction: float = 0.0,
+    spacing_m: float = 1.1,
+    straight: bool = False,
+    max_depth_m: float = 60.0,
+    image_size_px: tuple[int, int] = (960, 540),
+    rng: np.random.Generator,
+) -> SimulatedObservations:
+    """Random points around a trajectory and what the cameras see of them.
+
+    Parameters
+    ----------
+    units, cameras, points
+        How many; cameras as in `rigs.mounts`. Points that fewer than two images see are left out, so that fewer than
+        `points` may remain.
+    noise_px
+        Standard deviation of each image coordinate.
+    outlier_fraction
+        Share of observations that are put anywhere in their image.
+    spacing_m
+        Distance between units.
+    straight
+        Whether the street is straight.
+    max_depth_m
+        Farther points are not seen.
+    image_size_px
+        Width and height of every image.
+    rng
+        Source of everything random.
+
+    Raises
+    ------
+    InputError
+        When a number makes no sense.
+    """
+    if units < 1 or points < 1 or noise_px < 0 or not 0 <= outlier_fraction <= 1 or spacing_m <= 0:
+        raise InputError(
+            f"cannot simulate {units} units, {points} points, {noise_px} px noise, {outlier_fraction} outliers, "
+            f"{spacing_m} m spacing",
+            remedy="Give positive numbers and a fraction from 0 to 1.",
+        )
+    width, height = image_size_px
+    rig = true_cameras(cameras, width=width, height=height, rng=rng)
+    rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
+    params = np.array([camera.params for camera in rig])
+    world_from_rig = simulate_trajectory(units, spacing_m=spacing_m, straight=straight)
+    world = _points_along(world_from_rig, points, rng)
+
+    cam_from_world = se3.inverse(world_from_rig[:, None] @ rig_from_cam[None])
+    in_camera = se3.apply(cam_from_world, world)  # (units, cameras, points, 3)
+    depth = in_camera[..., 2]
+    safe = np.where(depth > 0.3, depth, np.inf)
+    xy = in_camera[..., :2] / safe[..., None] * params[:, None, :2] + params[:, None, 2:]
+    seen = (depth > 0.3) & (depth < max_depth_m) & np.all((xy > 0) & (xy < np.array([width, height])), -1)
+    kept = np.flatnonzero(seen.sum((0, 1)) >= 2)
+    unit, camera, point = np.nonzero(seen[:, :, kept])
+    exact = xy[:, :, kept][unit, camera, point]
+    noisy = exact + rng.normal(0.0, noise_px, exact.shape) if noise_px > 0 else exact.copy()
+    is_outlier = rng.random(len(exact)) < outlier_fraction
+    noisy[is_outlier] = rng.uniform(0.0, 1.0, (int(is_outlier.sum()), 2)) * np.array([width, height])
+    return SimulatedObservations(
+        world_from_rig=world_from_rig,
+        rig_from_cam=rig_from_cam,
+        camera_params=params,
+        image_size_px=image_size_px,
+        timestamps_us=1_750_000_000_000_000 + np.arange(units, dtype=np.int64) * 100_000,
+        points_m=world[kept],
+        unit=unit.astype(np.int32),
+        camera=camera.astype(np.int32),
+        point=point.astype(np.int32),
+        xy_px=noisy,
+        exact_xy_px=exact,
+        is_outlier=is_outlier,
+    )

@@ -1,0 +1,144 @@
+"""Tracks: keypoints of different images that are one point, joined from verified matches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keypoints:
+    """The keypoints of all images in one row of arrays; keypoint k of image i is at `first[i] + k`."""
+
+    first: Ints  # (images + 1,)
+    image: Ints  # (n,)
+    unit: Ints  # (n,)
+    camera: Ints  # (n,)
+    xy_px: Floats  # (n, 2)
+    rays: Floats  # (n, 3) unit viewing rays in camera axes under the given intrinsics
+
+    @staticmethod
+    def of(drive: Drive, features: Sequence[ImageFeatures]) -> Keypoints:
+        """Line up the features of all images of a drive."""
+        counts = np.array([len(f.xy_px) for f in features], dtype=np.int64)
+        image = np.repeat(np.arange(len(features), dtype=np.int64), counts)
+        unit_of_image = np.array([i.unit for i in drive.images], dtype=np.int64)
+        camera_of_image = np.array([i.camera for i in drive.images], dtype=np.int64)
+        xy = np.concatenate([f.xy_px for f in features]).astype(np.float64).reshape(-1, 2)
+        camera = camera_of_image[image]
+        rays = np.empty((len(xy), 3))
+        kinds, params = pack_cameras(drive.cameras)
+        for c, (kind, p) in enumerate(zip(kinds, params, strict=True)):
+            rows = camera == c
+            rays[rows] = unproject_pixels(int(kind), p, xy[rows])
+        return Keypoints(
+            first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            image=image,
+            unit=unit_of_image[image],
+            camera=camera,
+            xy_px=xy,
+            rays=rays,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracks:
+    """Which keypoints belong together. No track has two keypoints of one image."""
+
+    of_keypoint: Ints  # (n,) -1 where a keypoint is in no track
+    first: Ints  # (tracks + 1,)
+    keypoints: Ints  # members of track t: keypoints[first[t]:first[t + 1]], ascending
+
+    @staticmethod
+    def from_labels(of_keypoint: Ints) -> Tracks:
+        """Tracks of the keypoints' labels, -1 for none; labels are numbered anew without gaps."""
+        members = np.flatnonzero(of_keypoint >= 0)
+        _, labels = np.unique(of_keypoint[members], return_inverse=True)
+        result = np.full(len(of_keypoint), -1, dtype=np.int64)
+        result[members] = labels
+        order = np.argsort(labels, kind="stable")
+        count = int(labels.max()) + 1 if len(labels) else 0
+        return Tracks(
+            of_keypoint=result,
+            first=np.searchsorted(labels[order], np.arange(count + 1)).astype(np.int64),
+            keypoints=members[order].astype(np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+
+@njit(cache=True, nogil=True)
+def _join(edges: Any, image: Any, parent: Any, following: Any, last: Any, stamp: Any) -> None:
+    """Union-find over edges in the given order that never joins two keypoints of one image.
+
+    Members of a set are a linked list from its root (`following`, `last`), so that images can be compared.
+    """
+    for n in range(len(edges)):
+        a, b = edges[n, 0], edges[n, 1]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        if a == b:
+            continue
+        k = a
+        while k >= 0:
+            stamp[image[k]] = n
+            k = following[k]
+        conflict = False
+        k = b
+        while k >= 0 and not conflict:
+            conflict = stamp[image[k]] == n
+            k = following[k]
+        if conflict:
+            continue
+        following[last[a]] = b
+        last[a] = last[b]
+        parent[b] = a
+
+
+def build_tracks(keypoints: Keypoints, pairs: Sequence[PairMatches]) -> Tracks:
+    """Join verified matches into tracks.
+
+    Matches of pairs with many inliers come first; a match that would put two keypoints of one image into one track is
+    left out, which keeps single wrong matches from growing tracks together.
+    """
+    n = len(keypoints.image)
+    order = sorted(range(len(pairs)), key=lambda i: -int(pairs[i].inliers.sum()))
+    edges = [
+        np.stack(
+            [
+                keypoints.first[pairs[i].image_a] + pairs[i].matches[pairs[i].inliers, 0],
+                keypoints.first[pairs[i].image_b] + pairs[i].matches[pairs[i].inliers, 1],
+            ],
+            axis=1,
+        )
+        for i in order
+    ]
+    parent = np.arange(n, dtype=np.int64)
+    following, last = np.full(n, -1, dtype=np.int64), np.arange(n, dtype=np.int64)
+    stamp = np.full(int(keypoints.image.max(initial=-1)) + 1, -1, dtype=np.int64)
+    all_edges = np.concatenate(edges).astype(np.int64) if edges else np.zeros((0, 2), dtype=np.int64)
+    _join(all_edges, keypoints.image, parent, following, last, stamp)
+    while True:
+        up = parent[parent]
+        if (up == parent).all():
+            break
+        parent = up
+    sizes = np.bincount(parent, minlength=n)
+    return Tracks.from_labels(np.where(sizes[parent] > 1, parent, -1))

@@ -1,0 +1,262 @@
+"""Points of tracks, given poses: robust multi-view triangulation as a pure function of poses and tracks.
+
+For every track the pairs of its rays are tried as hypotheses, the best by truncated squared reprojection error over all
+observations is refined with a Cauchy loss, and observations within the threshold are kept. Nothing depends on the order
+in which units were registered, so everything can be triangulated anew whenever poses have changed much.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+MAX_HYPOTHESES = 24  # pairs of rays tried a track
+MAX_OBSERVATIONS = 256  # of a track that are looked at
+MIN_DEPTH_M = 0.05
+
+
+@njit(cache=True, inline="always")
+def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, work: Any, proj: Any) -> float:
+    """Squared reprojection error of x under cam_from_world (r, t); huge behind the camera."""
+    for i in range(3):
+        cam[i] = r[i, 0] * x[0] + r[i, 1] * x[1] + r[i, 2] * x[2] + t[i]
+    if cam[2] < 0.05:
+        return 1e12
+    project(kind, params, cam[0], cam[1], cam[2], work, proj)
+    return (proj[0] - xy[0]) ** 2 + (proj[1] - xy[1]) ** 2
+
+
+@njit(cache=True, inline="always")
+def _refine(
+    count: int, use: Any, members: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any, params: Any,
+    x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
+) -> None:  # fmt: skip
+    """A few Gauss-Newton steps on a point with Cauchy weights over the observations in use."""
+    for _ in range(4):
+        h[:] = 0.0
+        g[:] = 0.0
+        for m in range(count):
+            if not use[m]:
+                continue
+            k = members[m]
+            r = cfw_r[image[k]]
+            c = camera[k]
+            e2 = _error2(r, cfw_t[image[k]], kind[c], params[c], x, xy[k], cam, work, proj)
+            if e2 > 1e11:
+                continue
+            w = 1.0 / (1.0 + e2 / scale2)
+            for i in range(2):
+                e = proj[i] - xy[k, i]
+                j0 = proj[2 + 3 * i] * r[0, 0] + proj[3 + 3 * i] * r[1, 0] + proj[4 + 3 * i] * r[2, 0]
+                j1 = proj[2 + 3 * i] * r[0, 1] + proj[3 + 3 * i] * r[1, 1] + proj[4 + 3 * i] * r[2, 1]
+                j2 = proj[2 + 3 * i] * r[0, 2] + proj[3 + 3 * i] * r[1, 2] + proj[4 + 3 * i] * r[2, 2]
+                h[0] += w * j0 * j0
+                h[1] += w * j0 * j1
+                h[2] += w * j0 * j2
+                h[3] += w * j1 * j1
+                h[4] += w * j1 * j2
+                h[5] += w * j2 * j2
+                g[0] += w * j0 * e
+                g[1] += w * j1 * e
+                g[2] += w * j2 * e
+        h0, h3, h5 = h[0] * 1.0001, h[3] * 1.0001, h[5] * 1.0001
+        c0, c1, c2 = h3 * h5 - h[4] * h[4], h[2] * h[4] - h[1] * h5, h[1] * h[4] - h[2] * h3
+        det = h0 * c0 + h[1] * c1 + h[2] * c2
+        if not det > 0.0:
+            return
+        d0 = (c0 * g[0] + c1 * g[1] + c2 * g[2]) / det
+        d1 = (c1 * g[0] + (h0 * h5 - h[2] * h[2]) * g[1] + (h[1] * h[2] - h0 * h[4]) * g[2]) / det
+        d2 = (c2 * g[0] + (h[1] * h[2] - h0 * h[4]) * g[1] + (h0 * h3 - h[1] * h[1]) * g[2]) / det
+        x[0] -= d0
+        x[1] -= d1
+        x[2] -= d2
+
+
+@njit(cache=True, nogil=True)
+def _triangulate(
+    which: Any, first: Any, track_keypoints: Any, image: Any, camera: Any, xy: Any, rays: Any, usable: Any,
+    cfw_r: Any, cfw_t: Any, kind: Any, params: Any, max_error2: float, min_angle: float, points: Any, solved: Any, kept: Any,
+) -> None:  # fmt: skip
+    members, use = np.empty(MAX_OBSERVATIONS, np.int64), np.empty(MAX_OBSERVATIONS, np.bool_)
+    origin, direction = np.empty((MAX_OBSERVATIONS, 3)), np.empty((MAX_OBSERVATIONS, 3))
+    cam, work, proj, h, g = np.empty(3), np.empty(6), np.empty(8), np.empty(6), np.empty(3)
+    x, best = np.empty(3), np.empty(3)
+    cos_limit = math.cos(min_angle)
+    for n in range(len(which)):
+        track = which[n]
+        solved[track] = False
+        count = 0
+        for s in range(first[track], first[track + 1]):
+            k = track_keypoints[s]
+            kept[k] = False
+            if count < MAX_OBSERVATIONS and usable[image[k]]:
+                r, t = cfw_r[image[k]], cfw_t[image[k]]
+                for i in range(3):
+                    origin[count, i] = -(r[0, i] * t[0] + r[1, i] * t[1] + r[2, i] * t[2])
+                    direction[count, i] = r[0, i] * rays[k, 0] + r[1, i] * rays[k, 1] + r[2, i] * rays[k, 2]
+                members[count] = k
+                count += 1
+        if count < 2:
+            continue
+        best_score, tried = 0.0, 0
+        total = count * (count - 1) // 2
+        stride = max(1, total // MAX_HYPOTHESES)
+        if stride > 1 and stride % 2 == 0:
+            stride += 1  # an odd stride does not fall into step with the images of a unit
+        flat = 0
+        for i in range(count):
+            for j in range(i + 1, count):
+                flat += 1
+                if flat % stride != 0 and total > MAX_HYPOTHESES:
+                    continue
+                c = (
+                    direction[i, 0] * direction[j, 0]
+                    + direction[i, 1] * direction[j, 1]
+                    + direction[i, 2] * direction[j, 2]
+                )
+                if c > cos_limit:
+                    continue
+                w0, w1, w2 = origin[j, 0] - origin[i, 0], origin[j, 1] - origin[i, 1], origin[j, 2] - origin[i, 2]
+                pi = w0 * direction[i, 0] + w1 * direction[i, 1] + w2 * direction[i, 2]
+                pj = w0 * direction[j, 0] + w1 * direction[j, 1] + w2 * direction[j, 2]
+                det = 1.0 - c * c
+                if det < 1e-12:
+                    continue
+                si, sj = (pi - c * pj) / det, (c * pi - pj) / det
+                if si < MIN_DEPTH_M or sj < MIN_DEPTH_M:
+                    continue
+                for q in range(3):
+                    x[q] = 0.5 * (origin[i, q] + si * direction[i, q] + origin[j, q] + sj * direction[j, q])
+                tried += 1
+                score = 0.0
+                for m in range(count):
+                    k = members[m]
+                    e2 = _error2(
+                        cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+                    )
+                    if e2 < max_error2:
+                        score += max_error2 - e2
+                if score > best_score:
+                    best_score = score
+                    best[:] = x
+        if best_score <= 0.0:
+            continue
+        x[:] = best
+        for _ in range(2):
+            inliers = 0
+            for m in range(count):
+                k = members[m]
+                e2 = _error2(
+                    cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+                )
+                use[m] = e2 < max_error2
+                inliers += use[m]
+            if inliers < 2:
+                break
+            _refine(
+                count, use, members, image, camera, xy, cfw_r, cfw_t, kind, params, x, 0.25 * max_error2, cam, work, proj, h, g
+            )
+        inliers = 0
+        for m in range(count):
+            k = members[m]
+            e2 = _error2(cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj)
+            use[m] = e2 < max_error2
+            inliers += use[m]
+        if inliers < 2:
+            continue
+        wide = False
+        for i in range(count):
+            if wide:
+                break
+            if use[i]:
+                for j in range(i + 1, count):
+                    if use[j]:
+                        c = (
+                            direction[i, 0] * direction[j, 0]
+                            + direction[i, 1] * direction[j, 1]
+                            + direction[i, 2] * direction[j, 2]
+                        )
+                        if c < cos_limit:
+                            wide = True
+                            break
+        if not wide:
+            continue
+        solved[track] = True
+        for i in range(3):
+            points[track, i] = x[i]
+        for m in range(count):
+            if use[m]:
+                kept[members[m]] = True
+
+
+@njit(cache=True, nogil=True)
+def _errors(
+    rows: Any, point: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any, params: Any, points: Any, out: Any
+) -> None:
+    cam, work, proj = np.empty(3), np.empty(6), np.empty(8)
+    for n in range(len(rows)):
+        k = rows[n]
+        c = camera[k]
+        out[n] = _error2(
+            cfw_r[image[k]], cfw_t[image[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj
+        )
+
+
+def cam_from_world(state: State, keypoint_units: Ints, keypoint_cameras: Ints) -> tuple[Floats, Floats]:
+    """Rotations (n, 3, 3) and translations (n, 3) of images of the given units and cameras."""
+    world_from_cam = state.unit_rotation[keypoint_units] @ state.camera_rotation[keypoint_cameras]
+    centre = (
+        np.einsum("nij,nj->ni", state.unit_rotation[keypoint_units], state.camera_position_m[keypoint_cameras])
+        + state.unit_position_m[keypoint_units]
+    )
+    rotation = np.ascontiguousarray(np.swapaxes(world_from_cam, 1, 2))
+    return rotation, -np.einsum("nij,nj->ni", rotation, centre)
+
+
+class Triangulator:
+    """Triangulates tracks of one drive; it keeps no result, only arrays that do not change."""
+
+    def __init__(
+        self, keypoints: Keypoints, image_unit: Ints, image_camera: Ints, camera_kind: Ints, *, max_error_px: float, min_angle_deg: float
+    ) -> None:
+        self._keypoints = keypoints
+        self._image_unit, self._image_camera, self._kind = image_unit, image_camera, camera_kind
+        self.max_error_px = max_error_px
+        self._min_angle = math.radians(min_angle_deg)
+
+    def triangulate(
+        self, state: State, tracks: Tracks, registered_units: Bools, *, which: Ints, points_m: Floats, solved: Bools, kept: Bools
+    ) -> None:
+        """Triangulate the tracks `which` from their observations in registered units.
+
+        Writes the points into points_m (tracks, 3), whether there is one into solved (tracks,), and which keypoints are
+        its observations into kept (keypoints,).
+        """
+        r, t = cam_from_world(state, self._image_unit, self._image_camera)
+        _triangulate(
+            which, tracks.first, tracks.keypoints, self._keypoints.image, self._keypoints.camera, self._keypoints.xy_px,
+            self._keypoints.rays, registered_units[self._image_unit], r, t, self._kind, state.camera_params,
+            self.max_error_px**2, self._min_angle, points_m, solved, kept,
+        )  # fmt: skip
+
+    def errors_px(self, state: State, rows: Ints, points_m: Floats, point: Ints) -> Floats:
+        """Reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) of points_m; 1e6 behind."""
+        r, t = cam_from_world(state, self._image_unit, self._image_camera)
+        out = np.empty(len(rows))
+        _errors(
+            rows, point, self._keypoints.image, self._keypoints.camera, self._keypoints.xy_px, r, t, self._kind,
+            state.camera_params, points_m, out,
+        )  # fmt: skip
+        return np.sqrt(out)

@@ -1,0 +1,139 @@
+"""Strict reading of JSON from outside: what is ambiguous or out of range is refused with the field's path."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Never, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from schemas.drive import DriveManifest
+
+MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
+MAX_PROBLEMS_SHOWN = 5
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class FieldProblem:
+    """One defect: where (dotted path, empty for the document as a whole) and what."""
+
+    path: str
+    what: str
+
+
+class DocumentError(ValueError):
+    """A JSON document does not follow its contract.
+
+    Parameters
+    ----------
+    problems
+        All defects that were found, in document order; at least one.
+    """
+
+    def __init__(self, problems: list[FieldProblem]) -> None:
+        self.problems = problems
+        shown = [f"{p.path}: {p.what}" if p.path else p.what for p in problems[:MAX_PROBLEMS_SHOWN]]
+        if len(problems) > MAX_PROBLEMS_SHOWN:
+            shown.append(f"and {len(problems) - MAX_PROBLEMS_SHOWN} more")
+        super().__init__("; ".join(shown))
+
+
+def parse_manifest(raw: bytes) -> DriveManifest:
+    """The manifest in the bytes of a `drive.json`.
+
+    Raises
+    ------
+    DocumentError
+        For all that `parse_document` refuses.
+    """
+    return parse_document(raw, DriveManifest)
+
+
+def parse_document(
+    raw: bytes, model: type[Model], *, strict: bool = True, max_bytes: int = MAX_MANIFEST_BYTES
+) -> Model:
+    """A pydantic model from JSON bytes.
+
+    Parameters
+    ----------
+    raw
+        UTF-8 text, at most `max_bytes`.
+    strict
+        Whether types must match exactly (no numbers in strings, no true for 1) and keys may not repeat. Large tables of
+        published datasets are read faster without.
+
+    Raises
+    ------
+    DocumentError
+        If the text is too large, no valid UTF-8 or JSON, holds NaN or Infinity or a key twice in one object, or does
+        not fit the model.
+    """
+    if len(raw) > max_bytes:
+        raise DocumentError([FieldProblem("", f"has {len(raw)} bytes, over the bound of {max_bytes}")])
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    if strict:
+        parse_json(raw)
+    try:
+        return model.model_validate_json(raw, strict=strict)
+    except ValidationError as error:
+        raise DocumentError([_problem(dict(detail)) for detail in error.errors(include_url=False)]) from None
+
+
+def parse_json(raw: bytes) -> Any:
+    """The value of JSON bytes, without the extensions that Python's parser allows.
+
+    Raises
+    ------
+    DocumentError
+        If the text is no valid UTF-8 or JSON, or holds NaN, Infinity or a key twice in one object.
+    """
+    try:
+        text = raw.removeprefix(b"\xef\xbb\xbf").decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DocumentError([FieldProblem("", f"is not UTF-8 text (byte {error.start})")]) from None
+    try:
+        return json.loads(text, object_pairs_hook=_object_without_repeats, parse_constant=_refuse_constant)
+    except DocumentError:
+        raise
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise DocumentError([FieldProblem("", f"is not valid JSON: {error.msg} at {where}")]) from None
+    except RecursionError:
+        raise DocumentError([FieldProblem("", "is not valid: nested too deeply")]) from None
+    except ValueError as error:
+        raise DocumentError([FieldProblem("", f"is not valid JSON: {error}")]) from None
+
+
+def _object_without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        keys = [key for key, _ in pairs]
+        repeated = next(key for i, key in enumerate(keys) if key in keys[:i])
+        raise DocumentError([FieldProblem("", f"key {repeated!r} appears twice in one object")])
+    return result
+
+
+def _refuse_constant(name: str) -> Never:
+    raise DocumentError([FieldProblem("", f"holds {name}, which is not a JSON number")])
+
+
+def _problem(detail: dict[str, Any]) -> FieldProblem:
+    path = ".".join(str(part) for part in detail["loc"])
+    what = str(detail["msg"]).removeprefix("Value error, ")
+    kind = detail["type"]
+    if kind == "missing":
+        what = "is missing"
+    elif kind == "extra_forbidden":
+        what = "is not a field of this document"
+    elif kind == "finite_number":
+        what = "must be a finite number"
+    elif path.endswith("latitude_deg") and kind in ("less_than_equal", "greater_than_equal"):
+        what = f"{detail['input']} is not a latitude (-90 to 90): are latitude and longitude swapped?"
+    elif path.endswith("timestamp_us") and kind in ("int_type", "int_from_float"):
+        what = f"{detail['input']!r} must be an integer number of microseconds"
+    elif not what.startswith(("must", "coordinates")) and isinstance(detail["input"], str | int | float | None):
+        what = f"{what} (is {str(detail['input'])[:80]!r})"
+    return FieldProblem(path, what)

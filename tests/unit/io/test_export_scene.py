@@ -1,0 +1,343 @@
+from __future__ import annotations
+
+import errno
+import json
+import resource
+import shutil
+import sqlite3
+from collections import namedtuple
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from export_example import (
+    EXTRA_KEYPOINTS,
+    FILES,
+    MISSING_IMAGE,
+    MISSING_UNIT,
+    POINTS,
+    UNITS,
+    assert_nothing_published,
+    make_scene,
+)
+
+from mrasfm_engine.errors import MrasfmError, StorageError
+from mrasfm_engine.geometry import geodesy
+from mrasfm_engine.io import (
+    export_ply,
+    export_scene,
+    feature_database,
+)
+from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.io.read_scene import read_calibration, read_poses
+from mrasfm_engine.scene.scene import ImageFeatures, Scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene()
+
+
+@pytest.fixture(scope="module")
+def written(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("export") / "deep" / "scene"
+    write_scene(scene, out, {"stages": {"seconds": np.float64(1.5)}, "path": Path("a")})
+    return out
+
+
+def load(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
+
+
+def test_the_folder_is_complete_and_alone(written: Path) -> None:
+    assert {p.name for p in written.iterdir()} == FILES
+    assert [p.name for p in written.parent.iterdir()] == ["scene"]
+    assert written.stat().st_mode & 0o777 == written.parent.stat().st_mode & 0o777
+
+
+@pytest.mark.parametrize("folder", ["model", "model/text"])
+def test_colmap_reads_the_model_and_its_points_project_onto_their_keypoints(
+    scene: Scene, written: Path, folder: str
+) -> None:
+    model = pycolmap.Reconstruction(str(written / folder))
+    assert model.is_valid()
+    assert model.num_reg_frames() == UNITS - 1
+    assert sorted(model.images) == [i + 1 for i in np.flatnonzero(scene.image_registered)]
+    assert sorted(model.frames) == [1, 3, 4, 5]
+    errors = []
+    for point in model.points3D.values():
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            errors.append(np.linalg.norm(image.project_point(point.xyz) - image.points2D[element.point2D_idx].xy))
+    assert len(errors) == len(scene.observation_point) == 7 * POINTS
+    assert 0 < max(errors) < 1e-3  # the keypoints are float32
+    model.update_point_3d_errors()
+    assert 0 < model.compute_mean_reprojection_error() < 1e-4
+
+
+def test_the_rig_is_the_vehicle(scene: Scene, written: Path) -> None:
+    model = pycolmap.Reconstruction(str(written / "model"))
+    rig = model.rigs[1]
+    assert rig.ref_sensor_id.type == pycolmap.SensorType.IMU
+    for k, camera in enumerate(scene.calibration):
+        pose = rig.sensor_from_rig(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, k + 1)).inverse().matrix()
+        np.testing.assert_allclose(pose, camera.rig_from_cam[:3], atol=1e-12)
+    pose = model.frames[3].rig_from_world.inverse().matrix()
+    np.testing.assert_allclose(pose, scene.world_from_rig[2][:3], atol=1e-12)
+    assert model.images[6].name == "images/right/002.png"
+    assert model.images[6].num_points2D() == POINTS + EXTRA_KEYPOINTS
+
+
+def test_the_database_has_the_models_ids_and_all_features(scene: Scene, written: Path, tmp_path: Path) -> None:
+    # A copy, because COLMAP turns write-ahead mode on in what it opens.
+    database = pycolmap.Database.open(str(shutil.copy(written / "features.db", tmp_path)))
+    images = database.read_all_images()
+    model = pycolmap.Reconstruction(str(written / "model"))
+    assert [i.image_id for i in images] == list(range(1, 2 * UNITS + 1))
+    for image in images:
+        source = scene.drive.images[image.image_id - 1]
+        assert (image.name, image.camera_id, image.frame_id) == (source.file, source.camera + 1, source.unit + 1)
+        if image.image_id in model.images:
+            assert model.images[image.image_id].name == image.name
+            assert model.images[image.image_id].frame_id == image.frame_id
+        features = scene.features[image.image_id - 1]
+        np.testing.assert_array_equal(database.read_keypoints(image.image_id), features.xy_px)
+        descriptors = database.read_descriptors(image.image_id)
+        np.testing.assert_array_equal(descriptors.data, features.descriptors)
+        assert descriptors.type == pycolmap.FeatureExtractorType.SIFT
+    assert database.num_matched_image_pairs() == len(scene.pairs)
+    assert database.num_verified_image_pairs() == len(scene.pairs) - 1
+    pair = scene.pairs[1]
+    np.testing.assert_array_equal(database.read_matches(1, 5), pair.matches)
+    verified = database.read_two_view_geometry(1, 5)
+    np.testing.assert_array_equal(verified.inlier_matches, pair.matches[pair.inliers])
+    np.testing.assert_array_equal(database.read_camera(2).params, scene.calibration[1].params)
+    database.close()
+
+
+def test_the_database_is_one_file_that_a_read_only_folder_can_hold(written: Path) -> None:
+    with closing(sqlite3.connect(f"file:{written / 'features.db'}?mode=ro", uri=True)) as db:
+        assert db.execute("PRAGMA journal_mode").fetchone() == ("delete",)
+
+
+def test_ply(scene: Scene, written: Path) -> None:
+    head, _, body = (written / "points.ply").read_bytes().partition(b"end_header\n")
+    assert b"property float x" in head
+    assert f"element vertex {POINTS}\n".encode() in head
+    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4)
+    np.testing.assert_allclose(np.frombuffer(body[:12], "<f4"), scene.points_m[0], rtol=1e-6)
+    assert tuple(body[12:15]) == tuple(scene.point_colors[0])
+    assert np.frombuffer(body[15:19], "<i4") == 7
+
+
+def test_ply_far_from_the_origin_is_double(scene: Scene, tmp_path: Path) -> None:
+    export_ply.write_ply(replace(scene, points_m=scene.points_m + 50_000.0), tmp_path / "points.ply")
+    assert b"property double x" in (tmp_path / "points.ply").read_bytes()
+
+
+def test_poses_are_read_back(scene: Scene, written: Path) -> None:
+    poses = read_poses(written)
+    np.testing.assert_array_equal(poses.trajectory.timestamps_us, scene.drive.timestamps_us[scene.unit_registered])
+    np.testing.assert_allclose(poses.trajectory.world_from_rig, scene.world_from_rig[scene.unit_registered], atol=1e-8)
+    assert (poses.total_units, poses.registered_images, poses.total_images) == (5, 7, 10)
+    expected = scene.world_from_rig[2] @ scene.calibration[1].rig_from_cam
+    np.testing.assert_allclose(poses.world_from_cam["images/right/002.png"], expected, atol=1e-9)
+
+
+def test_what_is_not_registered_has_no_pose(written: Path) -> None:
+    poses = load(written / "poses.json")
+    assert poses["units"][MISSING_UNIT].keys() == {"timestamp_us", "source_frame", "registered"}
+    assert poses["images"][MISSING_IMAGE]["registered"] is False
+    assert "world_from_cam" not in poses["images"][MISSING_IMAGE]
+    assert poses["units"][3]["source_frame"] == 30
+    assert poses["units"][3]["sigma_position_m"] == [0.01, 0.01, 0.03]
+
+
+def test_geodetic_positions_lie_where_the_local_ones_do(scene: Scene, written: Path) -> None:
+    image = load(written / "poses.json")["images"][0]
+    place = [image["geodetic"][k] for k in ("latitude_deg", "longitude_deg", "ellipsoidal_height_m")]
+    assert scene.georeference is not None
+    local = geodesy.local_from_geodetic(place, scene.georeference.ecef_from_local)
+    np.testing.assert_allclose(local, image["world_from_cam"]["translation_m"], atol=1e-5)
+
+
+def test_frame_of_a_georeferenced_scene(written: Path) -> None:
+    frame = load(written / "frame.json")
+    assert frame["georeferenced"] is True
+    assert frame["world_crs"] == "EPSG:4978"
+    assert frame["world_crs_wkt2"].startswith("GEODCRS")
+    assert frame["height_datum"] == "EPSG:5773"
+    np.testing.assert_array_equal(frame["ecef_from_local"], geodesy.ecef_from_local([48.1, 11.5, 520.0]))
+
+
+def test_without_georeference_geodetic_fields_are_absent(tmp_path: Path) -> None:
+    write_scene(make_scene(georeferenced=False), tmp_path / "scene", {})
+    frame, poses = load(tmp_path / "scene" / "frame.json"), load(tmp_path / "scene" / "poses.json")
+    assert frame["georeferenced"] is False
+    assert not {"world_crs", "world_crs_wkt2", "height_datum", "origin", "ecef_from_local"} & frame.keys()
+    assert np.array(frame["rough_world_from_local"])[:3, 3].tolist() == [100.0, 200.0, 3.0]
+    assert not any("geodetic" in entry for entry in poses["units"] + poses["images"])
+
+
+def test_calibration(scene: Scene, written: Path) -> None:
+    left = load(written / "calibration.json")["cameras"]["left"]
+    np.testing.assert_allclose(left["difference"]["rotation_vector_deg"], [0.1, -0.2, 0.3], atol=1e-9)
+    np.testing.assert_allclose(left["difference"]["translation_m"], [0.01, -0.02, 0.03], atol=1e-12)
+    assert left["difference"]["focal_px"] == pytest.approx(2.0)
+    assert left["sigma"] == {"rotation_deg": [0.1, 0.2, 0.3], "focal_px": 1.5}
+    assert left["observed"] == {"rotation": [True] * 3, "translation": [False, True, False]}
+    read = read_calibration(written / "calibration.json")
+    np.testing.assert_allclose(read["right"], scene.calibration[1].rig_from_cam, atol=1e-12)
+
+
+def test_report(written: Path) -> None:
+    report = load(written / "report.json")
+    assert report["stages"] == {"seconds": 1.5}
+    assert report["summary"]["registered_images"] == 7
+    assert report["summary"]["mean_track_length"] == 7
+    assert report["summary"]["notes"] == ["an example"]
+
+
+def test_image_names_with_spaces_withhold_the_text_model(tmp_path: Path) -> None:
+    write_scene(make_scene(folder="my images"), tmp_path / "scene", {})
+    model = pycolmap.Reconstruction(str(tmp_path / "scene" / "model"))
+    assert model.images[1].name == "my images/left/000.png"
+    assert not (tmp_path / "scene" / "model" / "text").exists()
+    assert "text is withheld" in load(tmp_path / "scene" / "report.json")["summary"]["notes"][-1]
+
+
+def test_images_without_keypoints_and_scenes_without_points(scene: Scene, tmp_path: Path) -> None:
+    nothing = np.zeros(0, dtype=np.int64)
+    empty = ImageFeatures(
+        xy_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 128), np.uint8), colors=np.zeros((0, 3), np.uint8)
+    )
+    bare = replace(
+        scene,
+        features=[empty] * len(scene.features),
+        pairs=[],
+        points_m=np.zeros((0, 3)),
+        point_colors=np.zeros((0, 3), np.uint8),
+        point_error_px=np.zeros(0),
+        observation_point=nothing,
+        observation_image=nothing,
+        observation_keypoint=nothing,
+    )
+    write_scene(bare, tmp_path / "scene", {})
+    assert pycolmap.Reconstruction(str(tmp_path / "scene" / "model")).num_reg_images() == 7
+
+
+def test_a_report_that_is_not_finite_is_refused(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(MrasfmError, match=r"report\.json"):
+        write_scene(scene, tmp_path / "scene", {"figure": float("nan")})
+    assert_nothing_published(tmp_path / "scene")
+
+
+def test_writing_again_replaces_the_scene_and_keeps_other_files(scene: Scene, tmp_path: Path) -> None:
+    out = tmp_path / "scene"
+    write_scene(scene, out, {"run": 1})
+    (out / "notes.txt").write_text("mine")
+    (out / "model" / "stale.bin").write_text("old")
+    write_scene(scene, out, {"run": 2})
+    assert load(out / "report.json")["run"] == 2
+    assert {p.name for p in out.iterdir()} == FILES | {"notes.txt"}
+    assert not (out / "model" / "stale.bin").exists()
+
+
+@pytest.mark.parametrize("exception", [KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")])
+def test_an_interrupted_run_leaves_the_old_scene(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exception: Any
+) -> None:
+    out = tmp_path / "scene"
+    write_scene(scene, out, {"run": 1})
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+    def stop(*_: Any) -> None:
+        raise exception
+
+    monkeypatch.setattr(feature_database, "write_features", stop)
+    expected = StorageError if isinstance(exception, OSError) else KeyboardInterrupt
+    with pytest.raises(expected):
+        write_scene(scene, out, {"run": 2})
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_run_that_dies_while_files_move_leaves_no_complete_scene(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "scene"
+    write_scene(scene, out, {"run": 1})
+    original = Path.rename
+
+    def stop_at_ply(self: Path, target: Any) -> Path:
+        if self.name == "points.ply":
+            raise KeyboardInterrupt
+        return original(self, target)
+
+    monkeypatch.setattr(Path, "rename", stop_at_ply)
+    with pytest.raises(KeyboardInterrupt):
+        write_scene(scene, out, {"run": 2})
+    assert not (out / "report.json").exists()
+
+
+def test_leftovers_of_killed_runs_are_cleared(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / ".scene.partial-1-00").mkdir()
+    monkeypatch.setattr(export_scene, "LEFTOVER_AGE_S", -1.0)
+    write_scene(scene, tmp_path / "scene", {})
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+def test_too_little_disk_is_said_before_anything_is_written(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(export_scene.shutil, "disk_usage", lambda _: usage(1, 1, 1000))
+    with pytest.raises(StorageError, match=r"scene needs about .* MB free\n  Free space"):
+        write_scene(scene, tmp_path / "scene", {})
+    assert_nothing_published(tmp_path / "scene")
+
+
+@pytest.mark.parametrize("limit", [2_000, 6_000, 20_000, 60_000])
+def test_files_that_cannot_grow_are_a_storage_error(scene: Scene, tmp_path: Path, limit: int) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        with pytest.raises(MrasfmError) as raised:
+            write_scene(scene, tmp_path / "scene", {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    # COLMAP's text writer is silent when the disk is full: there the re-reading finds it and names the file.
+    assert isinstance(raised.value, StorageError) or "disk is not full" in raised.value.remedy
+    assert_nothing_published(tmp_path / "scene")
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "scene"):
+        with pytest.raises(StorageError, match=f"{out} cannot be written"):
+            write_scene(scene, out, {})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("sigma_position_m", lambda s: s.sigma_position_m[:, :1], "sizes do not fit"),
+        ("points_m", lambda s: np.full_like(s.points_m, np.nan), "a point is not finite"),
+        ("world_from_rig", lambda s: np.full_like(s.world_from_rig, np.nan), "pose is not finite"),
+        ("observation_keypoint", lambda s: s.observation_keypoint + 500, "names no keypoint"),
+        ("observation_keypoint", lambda s: s.observation_keypoint * 0, "observes two points"),
+        ("observation_image", lambda s: s.observation_image + 1, "image is not registered"),
+        ("observation_point", lambda s: s.observation_point[::-1], "not sorted"),
+        ("image_registered", lambda s: np.ones_like(s.image_registered), "without its unit"),
+        ("features", lambda s: s.features[1:], "features for every image"),
+    ],
+)
+def test_a_scene_that_contradicts_itself_is_refused(
+    scene: Scene, tmp_path: Path, field: str, value: Any, message: str
+) -> None:
+    with pytest.raises(MrasfmError, match=message):
+        write_scene(replace(scene, **{field: value(scene)}), tmp_path / "scene", {})
+    assert_nothing_published(tmp_path / "scene")
