@@ -200,7 +200,10 @@ def _unpack_pairs(arrays: Arrays) -> list[PairMatches]:
     stops = np.cumsum(arrays["ends"][:, 2])
     return [
         PairMatches(
-            image_a=int(a), image_b=int(b), matches=arrays["matches"][hi - n : hi], inliers=arrays["inliers"][hi - n : hi]
+            image_a=int(a),
+            image_b=int(b),
+            matches=arrays["matches"][hi - n : hi],
+            inliers=arrays["inliers"][hi - n : hi],
         )
         for (a, b, n), hi in zip(arrays["ends"], stops, strict=True)
     ]
@@ -212,9 +215,7 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
 
     def work() -> tuple[Arrays, dict[str, Any]]:
         model = Model(run.drive, keypoints, build_tracks(keypoints, pairs), run.config)
-        log = incremental.grow(
-            model, pairs, known.world_from_rig, progress=run.step("mapping"), cancel=run.cancel
-        )
+        log = incremental.grow(model, pairs, known.world_from_rig, progress=run.step("mapping"), cancel=run.cancel)
         arrays = {
             "of_keypoint": model.tracks.of_keypoint,
             "registered": model.registered,

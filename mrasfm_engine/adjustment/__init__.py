@@ -1,0 +1,1 @@
+"""Camera set bundle adjustment."""

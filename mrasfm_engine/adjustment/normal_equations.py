@@ -41,9 +41,7 @@ def _camera_point(unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, x: Any, from
     for i in range(3):
         from_unit[i] = x[i] - unit_t[i]
     for i in range(3):
-        rig[i] = (
-            unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
-        )
+        rig[i] = unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
     for i in range(3):
         cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
 
@@ -113,7 +111,11 @@ def _invert3(v: Any, out: Any) -> bool:
         return False
     i = 1.0 / det
     out[0], out[1], out[2] = c0 * i, c1 * i, c2 * i
-    out[3], out[4], out[5] = (v[0] * v[5] - v[2] * v[2]) * i, (v[1] * v[2] - v[0] * v[4]) * i, (v[0] * v[3] - v[1] * v[1]) * i
+    out[3], out[4], out[5] = (
+        (v[0] * v[5] - v[2] * v[2]) * i,
+        (v[1] * v[2] - v[0] * v[4]) * i,
+        (v[0] * v[3] - v[1] * v[1]) * i,
+    )
     return True
 
 

@@ -1,0 +1,1 @@
+"""Subcommands of `mrasfm`: arguments in, a call, words out."""

@@ -1,0 +1,1 @@
+"""Stage one: which images see the same, and where."""

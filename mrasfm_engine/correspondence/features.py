@@ -41,9 +41,7 @@ class SiftExtractor:
         if scale < 1.0:
             gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         # A detector an image: OpenCV's objects must not be shared between threads.
-        sift = cv2.SIFT_create(
-            nfeatures=self._config.max_keypoints, contrastThreshold=self._config.contrast_threshold
-        )
+        sift = cv2.SIFT_create(nfeatures=self._config.max_keypoints, contrastThreshold=self._config.contrast_threshold)
         small_mask = None
         if mask is not None:
             small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -56,7 +54,10 @@ class SiftExtractor:
             )
         order = np.argsort([-k.response for k in keypoints], kind="stable")[: self._config.max_keypoints]
         # OpenCV puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
-        xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (gray.shape[1] / rgb.shape[1], gray.shape[0] / rgb.shape[0])
+        xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (
+            gray.shape[1] / rgb.shape[1],
+            gray.shape[0] / rgb.shape[0],
+        )
         root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_KEYPOINT_PX))
         column = np.clip(xy[:, 0].astype(int), 0, rgb.shape[1] - 1)
         row = np.clip(xy[:, 1].astype(int), 0, rgb.shape[0] - 1)

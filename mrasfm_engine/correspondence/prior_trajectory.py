@@ -90,7 +90,9 @@ def _rough(drive: Drive) -> tuple[Floats, Floats]:
     assert rough is not None
     times = np.array([p.timestamp_us for p in rough.poses], dtype=np.int64)
     if (np.diff(times) <= 0).any():
-        raise InputError("rough_poses.poses are not ascending in time", remedy="Sort them and drop repeated timestamps.")
+        raise InputError(
+            "rough_poses.poses are not ascending in time", remedy="Sort them and drop repeated timestamps."
+        )
     poses = np.stack([matrix_from_pose(p.world_from_rig) for p in rough.poses])
     shift = np.round(poses[0, :3, 3])
     poses[:, :3, 3] -= shift

@@ -1,0 +1,1 @@
+"""Rotations, cameras, positions on the earth: pure numpy and small compiled functions."""

@@ -28,7 +28,15 @@ def frustum_samples(kind: int, params: Floats, width: int, height: int, max_dept
 
 @njit(cache=True, nogil=True)
 def _seen_fractions(
-    pairs: Any, world_from_cam: Any, camera: Any, kind: Any, params: Any, size: Any, samples: Any, max_depth: float, out: Any
+    pairs: Any,
+    world_from_cam: Any,
+    camera: Any,
+    kind: Any,
+    params: Any,
+    size: Any,
+    samples: Any,
+    max_depth: float,
+    out: Any,
 ) -> None:
     work, pixel = np.empty(6), np.empty(8)
     x, y = np.empty(3), np.empty(3)

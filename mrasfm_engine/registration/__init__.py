@@ -1,0 +1,1 @@
+"""Stage two: units get poses, one after the other, and the scene is refined."""

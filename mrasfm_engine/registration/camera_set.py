@@ -173,8 +173,7 @@ def _disagreeing(model: Model, seen: _Seen, inlier: NDArray[np.bool_]) -> tuple[
     return tuple(
         camera.name
         for c, camera in enumerate(model.drive.cameras)
-        if (seen.camera == c).sum() >= MIN_CAMERA_MATCHES
-        and inlier[seen.camera == c].mean() < MIN_CAMERA_INLIER_RATIO
+        if (seen.camera == c).sum() >= MIN_CAMERA_MATCHES and inlier[seen.camera == c].mean() < MIN_CAMERA_INLIER_RATIO
     )
 
 

@@ -136,7 +136,10 @@ def _refine(
         s = sigma[inlier]
         r = (p - measured[inlier]) / s
         w = 1.0 / (1.0 + (r**2).sum(1) / LOSS_SCALE**2)
-        j = np.concatenate([-se3.skew(p - pose[:3, 3]), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2) / s[..., None]
+        j = (
+            np.concatenate([-se3.skew(p - pose[:3, 3]), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
+            / s[..., None]
+        )
         h = np.einsum("n,nij,nik->jk", w, j, j)
         g = np.einsum("n,nij,ni->j", w, j, r)
         for direction, prior in ((left, SIGMA_ROLL_RAD), (forward, SIGMA_PITCH_RAD)):

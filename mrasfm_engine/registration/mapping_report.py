@@ -79,7 +79,9 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
 
 def _why_calibration(model: Model, refinement: Refinement) -> str:
     if refinement.calibration_free:
-        return "GNSS makes it observable" if refinement.alignment is not None else "the drive turns enough to observe it"
+        return (
+            "GNSS makes it observable" if refinement.alignment is not None else "the drive turns enough to observe it"
+        )
     if not model.config.adjustment.refine_calibration:
         return "held by the settings"
     if len(model.drive.cameras) < 2:

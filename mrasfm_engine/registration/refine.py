@@ -151,7 +151,9 @@ def _georeference(model: Model, gnss: GnssTrack, antenna: Floats, result: Refine
     _move(model, alignment.world_from_model)
     result.alignment, result.gnss_units = alignment, units
     good = units[alignment.inlier]
-    inflation = alignment.noise_factor * np.sqrt(_samples_per_correlation_time(times[good], settings.correlation_time_s))
+    inflation = alignment.noise_factor * np.sqrt(
+        _samples_per_correlation_time(times[good], settings.correlation_time_s)
+    )
     return PositionPrior(
         unit=good, position_m=measured[good], sigma_m=sigma[good] * inflation, lever_arm_m=np.asarray(antenna)
     )
@@ -210,7 +212,8 @@ def _certainty(model: Model, positions: PositionPrior | None, result: Refinement
         _free_units(model, georeferenced=positions is not None),
         free_cameras=np.full(len(model.camera_kind), several),
         free_focal=result.focal_free,
-        terms=_terms(model, positions, result) + ([] if result.calibration_free or not several else [calibration_prior(model)]),
+        terms=_terms(model, positions, result)
+        + ([] if result.calibration_free or not several else [calibration_prior(model)]),
         options=_options(model, result.sigma_px, iterations=1),
     )
     del tracks

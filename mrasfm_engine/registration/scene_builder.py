@@ -31,9 +31,7 @@ def build_scene(
     """Everything that is exported, as arrays. All images of a registered unit are part of the scene."""
     rows = model.observation_rows()
     tracks, point = np.unique(model.tracks.of_keypoint[rows], return_inverse=True)
-    errors = model.triangulator.errors_px(
-        model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows]
-    )
+    errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
     counts = np.bincount(point, minlength=len(tracks)).clip(1)
     colors = np.concatenate([f.colors for f in features]).astype(np.float64)
     mean_color = np.stack([np.bincount(point, colors[rows, k], minlength=len(tracks)) for k in range(3)], 1)

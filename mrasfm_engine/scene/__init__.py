@@ -1,0 +1,1 @@
+"""What everything else speaks about: drives, scenes, and the state that is being estimated."""

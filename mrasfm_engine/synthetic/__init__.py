@@ -1,0 +1,1 @@
+"""Rendered and simulated drives with ground truth."""

@@ -92,10 +92,7 @@ class SynthOptions:
             refuse(f"images of {self.width}x{self.height} pixels cannot be rendered", "Use sides of 32 to 8192 pixels.")
         if self.texture_px not in (64, 128, 256, 512, 1024):
             refuse(f"textures of {self.texture_px} pixels are not possible", "Use 64, 128, 256, 512 or 1024.")
-        for name in (
-            "parked_cars moving_cars exposure_jitter noise blur_px standing_units time_skew_ms gnss_noise_m "
-            "gnss_drift_m gnss_bias_m rough_noise_m rough_noise_deg perturb_rotation_deg perturb_translation_m seed"
-        ).split():
+        for name in ["parked_cars", "moving_cars", "exposure_jitter", "noise", "blur_px", "standing_units", "time_skew_ms", "gnss_noise_m", "gnss_drift_m", "gnss_bias_m", "rough_noise_m", "rough_noise_deg", "perturb_rotation_deg", "perturb_translation_m", "seed"]:
             if getattr(self, name) < 0:
                 flag = name.replace("_", "-")
                 refuse(f"--{flag} {getattr(self, name)} is negative", "Give zero or a positive number.")

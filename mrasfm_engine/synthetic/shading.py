@@ -14,12 +14,13 @@ from numba import njit
 MAX_TAPS = 8
 
 _SKY = 10
+_DONE = -2
 
 # Reordering of sums is harmless; that infinities and nans do not occur must not be assumed: the sky is at inf.
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
 def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
     """Red, green and blue (0..255) of a texture's level at texture coordinates, which repeat with period 1."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
@@ -38,7 +39,7 @@ def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, 
     return red, green, blue
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
 def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
     """The first channel of `_bilinear`."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
@@ -53,11 +54,11 @@ def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: 
     return (1 - ay) * upper + ay * lower
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
 def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, log2_h: Any, levels: Any) -> Any:
-    """Number of taps, their spacing's direction (whole length) and the mip level for a pixel's footprint.
+    """Number of taps, the edge along which they lie, the mip level and the share of the next coarser one.
 
-    The footprint has the edges (ux, vx) and (uy, vy) in texture coordinates; taps lie along the longer one.
+    The footprint has the edges (ux, vx) and (uy, vy) in texture coordinates.
     """
     w, h = float(1 << log2_w[t]), float(1 << log2_h[t])
     length_x = math.sqrt((ux * w) ** 2 + (vx * h) ** 2)
@@ -67,11 +68,16 @@ def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, 
     else:
         major, minor, du, dv = length_y, length_x, uy, vy
     taps = max(1, min(MAX_TAPS, int(math.ceil(major / max(minor, 1.0) - 0.25))))
-    level = math.log2(max(major / taps, 1.0))
-    return taps, du, dv, min(level, float(levels[t] - 1))
+    exact = min(math.log2(max(major / taps, 1.0)), float(levels[t] - 1))
+    level = int(exact)
+    # Between 1/4 and 3/4 two levels are mixed; elsewhere one is near enough, at half the price.
+    fraction = min(max(2.0 * (exact - level) - 0.5, 0.0), 1.0)
+    if fraction == 1.0:
+        level, fraction = level + 1, 0.0
+    return taps, du, dv, level, fraction
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
 def _filtered(
     t: int,
     u: float,
@@ -87,21 +93,19 @@ def _filtered(
     levels: Any,
 ) -> Any:
     """The texture's mean colour over a pixel, by trilinear taps."""
-    taps, du, dv, exact_level = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
-    level = int(exact_level)
-    fraction = exact_level - level
+    taps, du, dv, level, fraction = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
     red, green, blue = 0.0, 0.0, 0.0
     for k in range(taps):
         f = (k + 0.5) / taps - 0.5
         r, g, b = _bilinear(t, level, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
-        if fraction > 0.02:
+        if fraction > 0.0:
             r2, g2, b2 = _bilinear(t, level + 1, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
             r, g, b = r + fraction * (r2 - r), g + fraction * (g2 - g), b + fraction * (b2 - b)
         red, green, blue = red + r, green + g, blue + b
     return red / taps, green / taps, blue / taps
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
 def _filtered_grey(
     t: int,
     u: float,
@@ -117,26 +121,24 @@ def _filtered_grey(
     levels: Any,
 ) -> float:
     """The first channel of `_filtered`."""
-    taps, du, dv, exact_level = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
-    level = int(exact_level)
-    fraction = exact_level - level
+    taps, du, dv, level, fraction = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
     total = 0.0
     for k in range(taps):
         f = (k + 0.5) / taps - 0.5
         value = _bilinear_grey(t, level, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
-        if fraction > 0.02:
+        if fraction > 0.0:
             coarse = _bilinear_grey(t, level + 1, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
             value += fraction * (coarse - value)
         total += value
     return total / taps
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
 def _sun_reaches(
     x: float,
     y: float,
     z: float,
-    to_sun: Any,
+    light: Any,
     sun_from_world: Any,
     shadow_map: Any,
     shadow_frame: Any,
@@ -154,7 +156,7 @@ def _sun_reaches(
             continue
         c, s = boxes[k, 4], boxes[k, 5]
         ox, oy = c * px + s * py, -s * px + c * py
-        dx, dy, dz = c * to_sun[0] + s * to_sun[1], -s * to_sun[0] + c * to_sun[1], to_sun[2]
+        dx, dy, dz = c * light[0, 0] + s * light[0, 1], -s * light[0, 0] + c * light[0, 1], light[0, 2]
         t0, t1 = (boxes[k, 2] - z) / dz, (boxes[k, 3] - z) / dz
         t0 = max(t0, 0.0)
         if abs(dx) > 1e-6:
@@ -187,6 +189,143 @@ def _sun_reaches(
     if shadow_map[row + 1, col + 1] <= sz:
         lit += ax * ay
     return lit
+
+
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
+def _sky(
+    x: float,
+    y: float,
+    world_from_cam: Any,
+    light: Any,
+    texture: int,
+    texels: Any,
+    offset: Any,
+    log2_w: Any,
+    log2_h: Any,
+) -> Any:
+    """Colour of the sky along the ray (x, y, 1): haze below, blue above, clouds, and a glow around the sun."""
+    d0 = world_from_cam[0, 0] * x + world_from_cam[0, 1] * y + world_from_cam[0, 2]
+    d1 = world_from_cam[1, 0] * x + world_from_cam[1, 1] * y + world_from_cam[1, 2]
+    d2 = world_from_cam[2, 0] * x + world_from_cam[2, 1] * y + world_from_cam[2, 2]
+    norm = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    d0, d1, d2 = d0 / norm, d1 / norm, d2 / norm
+    up = min(max(d2, 0.0) * 1.6, 1.0)
+    glow = max(0.0, d0 * light[0, 0] + d1 * light[0, 1] + d2 * light[0, 2]) ** 24
+    spread = 0.12 / (max(d2, 0.0) + 0.15)
+    cloud = _bilinear_grey(texture, 1, 0.5 + d0 * spread, 0.5 + d1 * spread, texels, offset, log2_w, log2_h)
+    cover = light[5, 2] * cloud / 255.0 * min(1.0, max(d2, 0.0) * 6.0)
+    red = (1 - up) * light[3, 0] + up * light[4, 0] + cover * 0.5 + glow * light[6, 0]
+    green = (1 - up) * light[3, 1] + up * light[4, 1] + cover * 0.42 + glow * light[6, 1]
+    blue = (1 - up) * light[3, 2] + up * light[4, 2] + cover * 0.3 + glow * light[6, 2]
+    return red, green, blue
+
+
+@njit(inline="always", error_model="numpy", fastmath=_FAST)
+def _surface(
+    i: int,
+    x: float,
+    y: float,
+    xx: float,
+    yx: float,
+    xy: float,
+    yy: float,
+    plane: Any,
+    world_from_cam: Any,
+    texture: Any,
+    texture_uv: Any,
+    detail: Any,
+    detail_uv: Any,
+    tint: Any,
+    normal: Any,
+    is_moving: Any,
+    texels: Any,
+    offset: Any,
+    log2_w: Any,
+    log2_h: Any,
+    levels: Any,
+    light: Any,
+    sun_from_world: Any,
+    shadow_map: Any,
+    shadow_frame: Any,
+    boxes: Any,
+) -> Any:
+    """Colour and depth of primitive i along the ray (x, y, 1), which changes by (xx, yx) a column, (xy, yy) a row."""
+    # No views of arrays in here: each one would count references, which costs more than the arithmetic.
+    a = plane[i, 0, 0] * x + plane[i, 0, 1] * y + plane[i, 0, 2]
+    b = plane[i, 1, 0] * x + plane[i, 1, 1] * y + plane[i, 1, 2]
+    z = 1.0 / max(plane[i, 2, 0] * x + plane[i, 2, 1] * y + plane[i, 2, 2], 1e-5)
+    a, b = a * z, b * z
+    # Change of a and b from pixel to pixel, by the quotient rule.
+    wx, wy = plane[i, 2, 0] * xx + plane[i, 2, 1] * yx, plane[i, 2, 0] * xy + plane[i, 2, 1] * yy
+    ax = (plane[i, 0, 0] * xx + plane[i, 0, 1] * yx - a * wx) * z
+    ay = (plane[i, 0, 0] * xy + plane[i, 0, 1] * yy - a * wy) * z
+    bx = (plane[i, 1, 0] * xx + plane[i, 1, 1] * yx - b * wx) * z
+    by = (plane[i, 1, 0] * xy + plane[i, 1, 1] * yy - b * wy) * z
+    a, b = min(max(a, 0.0), 1.0), min(max(b, 0.0), 1.0)
+    ua, va, ub, vb = texture_uv[i, 2], texture_uv[i, 3], texture_uv[i, 4], texture_uv[i, 5]
+    red, green, blue = _filtered(
+        texture[i],
+        texture_uv[i, 0] + a * ua + b * ub,
+        texture_uv[i, 1] + a * va + b * vb,
+        ua * ax + ub * bx,
+        va * ax + vb * bx,
+        ua * ay + ub * by,
+        va * ay + vb * by,
+        texels,
+        offset,
+        log2_w,
+        log2_h,
+        levels,
+    )
+    scale = 1.0 / 255.0
+    if detail[i] >= 0:
+        ua, va, ub, vb = detail_uv[i, 2], detail_uv[i, 3], detail_uv[i, 4], detail_uv[i, 5]
+        scale *= 0.0078125 * _filtered_grey(
+            detail[i],
+            detail_uv[i, 0] + a * ua + b * ub,
+            detail_uv[i, 1] + a * va + b * vb,
+            ua * ax + ub * bx,
+            va * ax + vb * bx,
+            ua * ay + ub * by,
+            va * ay + vb * by,
+            texels,
+            offset,
+            log2_w,
+            log2_h,
+            levels,
+        )
+    dx = world_from_cam[0, 0] * x + world_from_cam[0, 1] * y + world_from_cam[0, 2]
+    dy = world_from_cam[1, 0] * x + world_from_cam[1, 1] * y + world_from_cam[1, 2]
+    dz = world_from_cam[2, 0] * x + world_from_cam[2, 1] * y + world_from_cam[2, 2]
+    nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+    # Two-sided surfaces show the viewer their lit or unlit face.
+    if nx * dx + ny * dy + nz * dz > 0:
+        nx, ny, nz = -nx, -ny, -nz
+    sun = max(0.0, nx * light[0, 0] + ny * light[0, 1] + nz * light[0, 2])
+    if sun > 0:
+        # A moving object would otherwise stand in the shadow of its own box.
+        casters = 0 if is_moving[i] else boxes.shape[0]
+        reach = _sun_reaches(
+            world_from_cam[0, 3] + z * dx + 0.09 * nx,
+            world_from_cam[1, 3] + z * dy + 0.09 * ny,
+            world_from_cam[2, 3] + z * dz + 0.09 * nz,
+            light,
+            sun_from_world,
+            shadow_map,
+            shadow_frame,
+            boxes,
+            casters,
+        )
+        sun *= 1.0 - light[5, 1] * (1.0 - reach)
+    ambient = 0.75 + 0.25 * nz
+    clear = light[5, 0] / (light[5, 0] + z)
+    scale *= clear
+    red = scale * tint[i, 0] * red * math.sqrt(sun * light[1, 0] + ambient * light[2, 0]) + (1 - clear) * light[3, 0]
+    green = (
+        scale * tint[i, 1] * green * math.sqrt(sun * light[1, 1] + ambient * light[2, 1]) + (1 - clear) * light[3, 1]
+    )
+    blue = scale * tint[i, 2] * blue * math.sqrt(sun * light[1, 2] + ambient * light[2, 2]) + (1 - clear) * light[3, 2]
+    return red, green, blue, z
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -222,10 +361,9 @@ def shade(
 
     `index` (2h, 2w) are the primitives that a pixel's four samples see, -1 for sky; `ideal` (h, w, 2) the ideal
     coordinates of pixel centres. `light` (7, 3): direction to the sun, sun, sky light, haze colour, zenith colour,
-    (haze distance, shadow strength, cloudiness), sun's glow.
+    (haze distance, shadow strength, cloudiness), sun's glow. A pixel's class and depth are those of most samples.
     """
     height, width = image.shape[0], image.shape[1]
-    to_sun = light[0]
     ids = np.zeros(4, np.int64)
     for row in range(height):
         for col in range(width):
@@ -238,146 +376,63 @@ def shade(
             ids[0], ids[1] = index[2 * row, 2 * col], index[2 * row, 2 * col + 1]
             ids[2], ids[3] = index[2 * row + 1, 2 * col], index[2 * row + 1, 2 * col + 1]
             red, green, blue = 0.0, 0.0, 0.0
-            best_weight, best_label, best_depth = 0.0, 255, math.inf
-            for k in range(4):
+            most = 0
+            # One evaluation for each different primitive among the four samples, in the middle of its samples.
+            alike = ids[0] == ids[1] and ids[0] == ids[2] and ids[0] == ids[3]
+            for k in range(1 if alike else 4):
                 i = ids[k]
-                # One evaluation for each primitive that is new among the four samples.
-                seen_before = False
-                for m in range(k):
-                    if ids[m] == i:
-                        seen_before = True
-                if seen_before:
+                if i == _DONE:
                     continue
-                count, off_x, off_y = 0, 0.0, 0.0
-                for m in range(k, 4):
-                    if ids[m] == i:
-                        count += 1
-                        off_x += 0.25 if m & 1 else -0.25
-                        off_y += 0.25 if m & 2 else -0.25
-                off_x, off_y = off_x / count, off_y / count
-                px, py = x + off_x * xx + off_y * xy, y + off_x * yx + off_y * yy
-                weight = count / 4.0
-                # The pixel's class is that of most samples.
+                count, px, py = 4, x, y
+                if not alike:
+                    count, off_x, off_y = 0, 0.0, 0.0
+                    for m in range(k, 4):
+                        if ids[m] == i:
+                            count += 1
+                            off_x += 0.25 if m & 1 else -0.25
+                            off_y += 0.25 if m & 2 else -0.25
+                            ids[m] = _DONE
+                    off_x, off_y = off_x / count, off_y / count
+                    px, py = x + off_x * xx + off_y * xy, y + off_x * yx + off_y * yy
+                weight = 0.25 * count
                 if i < 0:
-                    d0 = world_from_cam[0, 0] * px + world_from_cam[0, 1] * py + world_from_cam[0, 2]
-                    d1 = world_from_cam[1, 0] * px + world_from_cam[1, 1] * py + world_from_cam[1, 2]
-                    d2 = world_from_cam[2, 0] * px + world_from_cam[2, 1] * py + world_from_cam[2, 2]
-                    norm = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-                    d0, d1, d2 = d0 / norm, d1 / norm, d2 / norm
-                    up = min(max(d2, 0.0) * 1.6, 1.0)
-                    glow = max(0.0, d0 * to_sun[0] + d1 * to_sun[1] + d2 * to_sun[2]) ** 24
-                    spread = 0.12 / (max(d2, 0.0) + 0.15)
-                    cloud, _, _ = _bilinear(
-                        sky_texture, 1, 0.5 + d0 * spread, 0.5 + d1 * spread, texels, offset, log2_w, log2_h
-                    )
-                    cover = light[5, 2] * cloud / 255.0 * min(1.0, max(d2, 0.0) * 6.0)
-                    red += weight * ((1 - up) * light[3, 0] + up * light[4, 0] + cover * 0.5 + glow * light[6, 0])
-                    green += weight * ((1 - up) * light[3, 1] + up * light[4, 1] + cover * 0.42 + glow * light[6, 1])
-                    blue += weight * ((1 - up) * light[3, 2] + up * light[4, 2] + cover * 0.3 + glow * light[6, 2])
-                    if weight > best_weight:
-                        best_weight, best_label, best_depth = weight, _SKY, math.inf
-                    continue
-                a = plane[i, 0, 0] * px + plane[i, 0, 1] * py + plane[i, 0, 2]
-                b = plane[i, 1, 0] * px + plane[i, 1, 1] * py + plane[i, 1, 2]
-                w = plane[i, 2, 0] * px + plane[i, 2, 1] * py + plane[i, 2, 2]
-                w = max(w, 1e-5)
-                a, b, z = a / w, b / w, 1.0 / w
-                # Change of a and b from pixel to pixel, by the quotient rule. No views of arrays in here: each one
-                # would count references, which costs more than the arithmetic.
-                wx, wy = plane[i, 2, 0] * xx + plane[i, 2, 1] * yx, plane[i, 2, 0] * xy + plane[i, 2, 1] * yy
-                ax = (plane[i, 0, 0] * xx + plane[i, 0, 1] * yx - a * wx) * z
-                ay = (plane[i, 0, 0] * xy + plane[i, 0, 1] * yy - a * wy) * z
-                bx = (plane[i, 1, 0] * xx + plane[i, 1, 1] * yx - b * wx) * z
-                by = (plane[i, 1, 0] * xy + plane[i, 1, 1] * yy - b * wy) * z
-                a, b = min(max(a, 0.0), 1.0), min(max(b, 0.0), 1.0)
-                u0, v0, ua, va, ub, vb = (
-                    texture_uv[i, 0],
-                    texture_uv[i, 1],
-                    texture_uv[i, 2],
-                    texture_uv[i, 3],
-                    texture_uv[i, 4],
-                    texture_uv[i, 5],
-                )
-                r, g, bl = _filtered(
-                    texture[i],
-                    u0 + a * ua + b * ub,
-                    v0 + a * va + b * vb,
-                    ua * ax + ub * bx,
-                    va * ax + vb * bx,
-                    ua * ay + ub * by,
-                    va * ay + vb * by,
-                    texels,
-                    offset,
-                    log2_w,
-                    log2_h,
-                    levels,
-                )
-                scale = 1.0 / 255.0
-                if detail[i] >= 0:
-                    u0, v0, ua, va, ub, vb = (
-                        detail_uv[i, 0],
-                        detail_uv[i, 1],
-                        detail_uv[i, 2],
-                        detail_uv[i, 3],
-                        detail_uv[i, 4],
-                        detail_uv[i, 5],
-                    )
-                    f = _filtered_grey(
-                        detail[i],
-                        u0 + a * ua + b * ub,
-                        v0 + a * va + b * vb,
-                        ua * ax + ub * bx,
-                        va * ax + vb * bx,
-                        ua * ay + ub * by,
-                        va * ay + vb * by,
+                    r, g, b = _sky(px, py, world_from_cam, light, sky_texture, texels, offset, log2_w, log2_h)
+                    z = math.inf
+                else:
+                    r, g, b, z = _surface(
+                        i,
+                        px,
+                        py,
+                        xx,
+                        yx,
+                        xy,
+                        yy,
+                        plane,
+                        world_from_cam,
+                        texture,
+                        texture_uv,
+                        detail,
+                        detail_uv,
+                        tint,
+                        normal,
+                        is_moving,
                         texels,
                         offset,
                         log2_w,
                         log2_h,
                         levels,
-                    )
-                    scale *= f / 128.0
-                wx = world_from_cam[0, 0] * px + world_from_cam[0, 1] * py + world_from_cam[0, 2]
-                wy = world_from_cam[1, 0] * px + world_from_cam[1, 1] * py + world_from_cam[1, 2]
-                wz = world_from_cam[2, 0] * px + world_from_cam[2, 1] * py + world_from_cam[2, 2]
-                nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-                # Two-sided surfaces show the viewer their lit or unlit face.
-                if nx * wx + ny * wy + nz * wz > 0:
-                    nx, ny, nz = -nx, -ny, -nz
-                facing = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
-                unoriented = nx == 0.0 and ny == 0.0 and nz == 0.0
-                if unoriented:
-                    facing = 0.6
-                sun = 0.0
-                if facing > 0:
-                    sun = facing
-                    # A moving object would otherwise stand in the shadow of its own box.
-                    casters = 0 if is_moving[i] else boxes.shape[0]
-                    reach = _sun_reaches(
-                        world_from_cam[0, 3] + z * wx + 0.09 * nx,
-                        world_from_cam[1, 3] + z * wy + 0.09 * ny,
-                        world_from_cam[2, 3] + z * wz + 0.09 * nz,
-                        to_sun,
+                        light,
                         sun_from_world,
                         shadow_map,
                         shadow_frame,
                         boxes,
-                        casters,
                     )
-                    sun *= 1.0 - light[5, 1] * (1.0 - reach)
-                ambient = 0.75 + 0.25 * nz
-                clear = math.exp(-z / light[5, 0])
-                r *= scale * tint[i, 0] * math.sqrt(sun * light[1, 0] + ambient * light[2, 0])
-                g *= scale * tint[i, 1] * math.sqrt(sun * light[1, 1] + ambient * light[2, 1])
-                bl *= scale * tint[i, 2] * math.sqrt(sun * light[1, 2] + ambient * light[2, 2])
-                red += weight * (clear * r + (1 - clear) * light[3, 0])
-                green += weight * (clear * g + (1 - clear) * light[3, 1])
-                blue += weight * (clear * bl + (1 - clear) * light[3, 2])
-                if weight > best_weight:
-                    best_weight, best_label, best_depth = weight, int(label[i]), z
+                red, green, blue = red + weight * r, green + weight * g, blue + weight * b
+                if count > most:
+                    most = count
+                    labels[row, col] = label[i] if i >= 0 else _SKY
+                    depth[row, col] = z
             image[row, col, 0], image[row, col, 1], image[row, col, 2] = red, green, blue
-            labels[row, col] = best_label
-            depth[row, col] = best_depth
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)

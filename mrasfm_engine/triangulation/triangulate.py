@@ -166,12 +166,30 @@ def _triangulate(
             if inliers < 2:
                 break
             _refine(
-                count, use, members, image, camera, xy, cfw_r, cfw_t, kind, params, x, 0.25 * max_error2, cam, work, proj, h, g
+                count,
+                use,
+                members,
+                image,
+                camera,
+                xy,
+                cfw_r,
+                cfw_t,
+                kind,
+                params,
+                x,
+                0.25 * max_error2,
+                cam,
+                work,
+                proj,
+                h,
+                g,
             )
         inliers = 0
         for m in range(count):
             k = members[m]
-            e2 = _error2(cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj)
+            e2 = _error2(
+                cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+            )
             use[m] = e2 < max_error2
             inliers += use[m]
         if inliers < 2:
@@ -203,15 +221,23 @@ def _triangulate(
 
 @njit(cache=True, nogil=True)
 def _errors(
-    rows: Any, point: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any, params: Any, points: Any, out: Any
+    rows: Any,
+    point: Any,
+    image: Any,
+    camera: Any,
+    xy: Any,
+    cfw_r: Any,
+    cfw_t: Any,
+    kind: Any,
+    params: Any,
+    points: Any,
+    out: Any,
 ) -> None:
     cam, work, proj = np.empty(3), np.empty(6), np.empty(8)
     for n in range(len(rows)):
         k = rows[n]
         c = camera[k]
-        out[n] = _error2(
-            cfw_r[image[k]], cfw_t[image[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj
-        )
+        out[n] = _error2(cfw_r[image[k]], cfw_t[image[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj)
 
 
 def cam_from_world(state: State, keypoint_units: Ints, keypoint_cameras: Ints) -> tuple[Floats, Floats]:
@@ -229,7 +255,14 @@ class Triangulator:
     """Triangulates tracks of one drive; it keeps no result, only arrays that do not change."""
 
     def __init__(
-        self, keypoints: Keypoints, image_unit: Ints, image_camera: Ints, camera_kind: Ints, *, max_error_px: float, min_angle_deg: float
+        self,
+        keypoints: Keypoints,
+        image_unit: Ints,
+        image_camera: Ints,
+        camera_kind: Ints,
+        *,
+        max_error_px: float,
+        min_angle_deg: float,
     ) -> None:
         self._keypoints = keypoints
         self._image_unit, self._image_camera, self._kind = image_unit, image_camera, camera_kind
@@ -237,7 +270,15 @@ class Triangulator:
         self._min_angle = math.radians(min_angle_deg)
 
     def triangulate(
-        self, state: State, tracks: Tracks, registered_units: Bools, *, which: Ints, points_m: Floats, solved: Bools, kept: Bools
+        self,
+        state: State,
+        tracks: Tracks,
+        registered_units: Bools,
+        *,
+        which: Ints,
+        points_m: Floats,
+        solved: Bools,
+        kept: Bools,
     ) -> None:
         """Triangulate the tracks `which` from their observations in registered units.
 

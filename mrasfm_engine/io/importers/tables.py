@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
@@ -126,7 +125,7 @@ def read_gnss_csv(path: Path) -> list[GnssSample]:
     """
     lines = read_lines(path, what="GNSS file")
     remedy = f"Give a header and rows with the columns {','.join(GNSS_COLUMNS)}."
-    header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+    header = _cells(lines[0]) if lines else []
     for name in GNSS_COLUMNS:
         if header.count(name) != 1:
             state = "no column" if name not in header else "more than one column"
@@ -136,14 +135,19 @@ def read_gnss_csv(path: Path) -> list[GnssSample]:
     if len(lines) < 2:
         raise InputError(f"GNSS file {path} has no samples", remedy=remedy, code="gnss-empty")
     samples = []
-    for number, row in enumerate(csv.reader(lines[1:]), start=2):
-        where = f"GNSS file {path}, line {number}"
+    for number, line in enumerate(lines[1:], start=2):
+        row, where = _cells(line), f"GNSS file {path}, line {number}"
         if len(row) != len(header):
             raise InputError(
                 f"{where}: has {len(row)} values, the header has {len(header)}", remedy=remedy, code="bad-gnss-file"
             )
         samples.append(_sample(dict(zip(header, row, strict=True)), where=where))
     return samples
+
+
+def _cells(line: str) -> list[str]:
+    """Numbers and names have no commas of their own, so that every line is a row."""
+    return [cell.strip().strip('"') for cell in line.split(",")]
 
 
 def _sample(row: dict[str, str], *, where: str) -> GnssSample:

@@ -71,6 +71,12 @@ def test_16_bits_scale_by_257(tmp_path: Path, channels: int) -> None:
     assert read_image_gray(file).dtype == np.uint8
 
 
+def test_16_bits_are_rounded(tmp_path: Path) -> None:
+    file = tmp_path / "deep.png"
+    cv2.imwrite(str(file), np.array([[128, 129, 257 * 10 + 200, 65535, 65406]], np.uint16))
+    np.testing.assert_array_equal(read_image_gray(file), [[0, 1, 11, 255, 254]])
+
+
 def test_alpha_is_dropped_not_blended(tmp_path: Path, picture: np.ndarray) -> None:
     file = tmp_path / "alpha.png"
     transparent = np.zeros((40, 60, 1), np.uint8)
