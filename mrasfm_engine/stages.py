@@ -30,7 +30,7 @@ from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
-from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, build_tracks
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
@@ -214,8 +214,15 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     keypoints = Keypoints.of(run.drive, found)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        model = Model(run.drive, keypoints, build_tracks(keypoints, pairs), run.config)
-        log = incremental.grow(model, pairs, known.world_from_rig, progress=run.step("mapping"), cancel=run.cancel)
+        model, log = incremental.map_units(
+            run.drive,
+            keypoints,
+            pairs,
+            known.world_from_rig,
+            run.config,
+            progress=run.step("mapping"),
+            cancel=run.cancel,
+        )
         arrays = {
             "of_keypoint": model.tracks.of_keypoint,
             "registered": model.registered,

@@ -35,7 +35,7 @@ BEHIND_PX = 1000.0  # what an observation costs whose point is behind the camera
 MIN_DEPTH_M = 1e-3
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _camera_point(unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, x: Any, from_unit: Any, rig: Any, cam: Any) -> None:
     """from_unit = X - t_u, rig = x_rig - t_c, cam = x_cam."""
     for i in range(3):
@@ -46,7 +46,7 @@ def _camera_point(unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, x: Any, from
         cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def squared_errors(
     unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
     obs_unit: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
@@ -63,7 +63,7 @@ def squared_errors(
         out[n] = (proj[0] - obs_xy[n, 0]) ** 2 + (proj[1] - obs_xy[n, 1]) ** 2
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _linearise(
     unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, ju: Any, jc: Any, jx: Any,
@@ -94,7 +94,7 @@ def _linearise(
     return True
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _slot_of(ids: Any, count: int, block: int) -> int:
     for i in range(count):
         if ids[i] == block:
@@ -102,12 +102,12 @@ def _slot_of(ids: Any, count: int, block: int) -> int:
     return -1
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _invert3(v: Any, out: Any) -> bool:
     """Inverse of a symmetric 3x3 matrix [00, 01, 02, 11, 12, 22]; False where it is singular."""
     c0, c1, c2 = v[3] * v[5] - v[4] * v[4], v[2] * v[4] - v[1] * v[5], v[1] * v[4] - v[2] * v[3]
     det = v[0] * c0 + v[1] * c1 + v[2] * c2
-    if not det > 1e-18 * v[0] * v[3] * v[5] or not det > 0.0:
+    if not det > 1e-14 * v[0] * v[3] * v[5] or not det > 0.0:
         return False
     i = 1.0 / det
     out[0], out[1], out[2] = c0 * i, c1 * i, c2 * i
@@ -119,7 +119,7 @@ def _invert3(v: Any, out: Any) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
     unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
     obs_unit: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any, num_units: int,
@@ -220,7 +220,7 @@ def accumulate(
                         s[oi + r, oj + q] -= y0 * w[j, q, 0] + y1 * w[j, q, 1] + y2 * w[j, q, 2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
     unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
     obs_unit: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any, num_units: int,

@@ -10,6 +10,7 @@ from enum import StrEnum
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.adjustment.normal_equations import accumulate, squared_errors, substitute
 from mrasfm_engine.adjustment.priors import Term
@@ -35,6 +36,9 @@ class SolverOptions:
 
     max_iterations: int = 50
     function_tolerance: float = 1e-6  # relative decrease of the cost below which it has converged
+    # Newton decrement of units and cameras, in squared standard deviations an unknown, below which it has converged:
+    # what is left is points that settle between their robust weights, which moves no pose.
+    decrement_tolerance: float = 1e-4
     loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
     sigma_px: float = 1.0  # standard deviation of an observation
     threads: int = 1
@@ -159,6 +163,10 @@ def _in_ranges(parts: int, count: int, work: Callable[[int, int, int], None]) ->
         list(pool.map(work, bounds[:-1], bounds[1:], range(parts)))
 
 
+_THREADS = ThreadpoolController()
+SMALL_SYSTEM = 1500  # unknowns; on smaller ones BLAS threads cost more than they bring
+
+
 def solve(problem: Problem, *, cancel: Callable[[], bool] | None = None) -> tuple[State, Report]:
     """Minimise the problem's cost.
 
@@ -178,6 +186,13 @@ def solve(problem: Problem, *, cancel: Callable[[], bool] | None = None) -> tupl
     -----
     Damping follows Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems" (2004), section 3.2.
     """
+    if problem.layout.size < SMALL_SYSTEM:
+        with _THREADS.limit(limits=1, user_api="blas"):
+            return _minimise(problem, cancel)
+    return _minimise(problem, cancel)
+
+
+def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[State, Report]:
     options, layout, state = problem.options, problem.layout, problem.state
     cost = initial = problem.cost(state)
     damping, raise_by, iterations = 1e-4, 2.0, 0
@@ -201,8 +216,10 @@ def solve(problem: Problem, *, cancel: Callable[[], bool] | None = None) -> tupl
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        decrease = cost - trial_cost
-        if decrease <= options.function_tolerance * cost:
+        decrement = -float(step @ reduced.gradient) if step is not None else np.inf
+        if cost - trial_cost <= options.function_tolerance * cost or (
+            len(free) and decrement <= options.decrement_tolerance * len(free)
+        ):
             termination = Termination.CONVERGED
         state, cost = trial, trial_cost
         damping, raise_by = max(damping / 5.0, 1e-10), 2.0

@@ -69,7 +69,7 @@ def pack_cameras(cameras: list[Camera]) -> tuple[NDArray[np.int64], Floats]:
     return np.array([kind for kind, _ in packed], dtype=np.int64), np.stack([params for _, params in packed])
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
     """Distorted (a', b') of (a, b) into out[0:2] and d(a', b')/d(a, b), row by row, into out[2:6]."""
     out[0], out[1], out[2], out[3], out[4], out[5] = a, b, 1.0, 0.0, 0.0, 1.0
@@ -99,7 +99,7 @@ def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
             out[4], out[5] = a * b * slope, scale + b * b * slope
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any) -> None:
     """Pixel of a point in camera axes into out[0:2] and d(pixel)/d(x, y, z), row by row, into out[2:8].
 
@@ -119,7 +119,7 @@ def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any
     out[7] = -(out[5] * a + out[6] * b)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _project_points(kind: int, k: Any, points: Any, pixels: Any) -> None:
     work, out = np.empty(6), np.empty(8)
     for i in range(len(points)):
@@ -130,7 +130,7 @@ def _project_points(kind: int, k: Any, points: Any, pixels: Any) -> None:
             pixels[i, 0] = pixels[i, 1] = np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _unproject_pixels(kind: int, k: Any, pixels: Any, rays: Any) -> None:
     work = np.empty(6)
     for i in range(len(pixels)):

@@ -17,6 +17,7 @@ NEIGHBOURS = 5  # samples on each side that a sample is compared with
 NEIGHBOUR_SPAN_S = 3.0
 MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
 HEADING_WINDOWS_S = (0.5, 1.0, 2.0, 4.0, 8.0)  # half widths tried, the narrowest that shows a direction is used
+MIN_WAY_M, MIN_WAY_SIGMAS = 1.0, 6.0  # in a window, below which it may be the receiver's drift while the car stands
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +72,12 @@ def _line_at(dt: Floats, position: Floats) -> Floats:
     """Value (3,) at dt = 0 of the line through positions (n, 3), fitted with L1 weights."""
     a = np.stack([np.ones_like(dt), dt], 1)
     weights = np.ones(len(dt))
-    line = np.zeros((2, position.shape[1]))
-    for _ in range(8):
+    line: Floats = np.zeros((2, position.shape[1]))
+    for _ in range(60):
+        before = line[0]
         line = np.linalg.lstsq(a * weights[:, None], position * weights[:, None], rcond=None)[0]
+        if np.abs(line[0] - before).max() < 0.01:
+            break
         weights = 1.0 / np.sqrt(np.maximum(np.linalg.norm(position - a @ line, axis=1), 0.1))
     result: Floats = line[0]
     return result
@@ -99,7 +103,8 @@ def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Fl
             centre, velocity = _fit_motion(t[near] - now, p[near])
             position[i] = centre
             spread = float(np.sqrt(((t[near] - t[near].mean()) ** 2).sum()))
-            if np.linalg.norm(velocity[:2]) * spread > 3.0 * noise:
+            speed = float(np.linalg.norm(velocity[:2]))
+            if speed * spread > 3.0 * noise and speed * np.ptp(t[near]) > max(MIN_WAY_M, MIN_WAY_SIGMAS * noise):
                 heading[i] = np.arctan2(velocity[1], velocity[0])
                 break
         else:

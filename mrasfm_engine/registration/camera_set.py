@@ -44,21 +44,26 @@ class Registration:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Seen:
-    """Image points of a unit whose tracks have points."""
+class Seen:
+    """Image points of a unit and the scene's points they show."""
 
     xy_px: Floats  # (n, 2)
     points_m: Floats  # (n, 3)
     camera: Ints  # (n,)
 
-    def of(self, rows: Ints) -> _Seen:
-        return _Seen(xy_px=self.xy_px[rows], points_m=self.points_m[rows], camera=self.camera[rows])
+    def of(self, rows: Ints) -> Seen:
+        """Some of them."""
+        return Seen(xy_px=self.xy_px[rows], points_m=self.points_m[rows], camera=self.camera[rows])
 
 
 def register_unit(model: Model, unit: int) -> Registration:
-    """Find the pose of a unit from the model's points."""
-    seen = _points_seen(model, unit)
-    needed = model.config.mapping.min_pnp_inliers
+    """Find the pose of a unit from the points of its tracks."""
+    return register_seen(model, unit, _points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
+
+
+def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int) -> Registration:
+    """Find the pose of a unit from given correspondences."""
+    needed = min_inliers
     if len(seen.camera) < needed:
         return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {needed} are needed")
     sample = seen.of(_spread(len(seen.camera), MAX_CORRESPONDENCES))
@@ -89,7 +94,7 @@ def register_unit(model: Model, unit: int) -> Registration:
     )
 
 
-def _failed(unit: int, seen: _Seen, inliers: int, reason: str) -> Registration:
+def _failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
     return Registration(
         unit=unit,
         world_from_rig=None,
@@ -100,12 +105,12 @@ def _failed(unit: int, seen: _Seen, inliers: int, reason: str) -> Registration:
     )
 
 
-def _points_seen(model: Model, unit: int) -> _Seen:
+def _points_seen(model: Model, unit: int) -> Seen:
     rows = model.rows_of_unit[unit]
     tracks = model.tracks.of_keypoint[rows]
     known = model.solved[tracks]
     rows, tracks = rows[known], tracks[known]
-    return _Seen(
+    return Seen(
         xy_px=model.keypoints.xy_px[rows],
         points_m=model.state.points_m[tracks],
         camera=model.keypoints.camera[rows],
@@ -142,7 +147,7 @@ def _ransac(model: Model) -> pycolmap.RANSACOptions:
     return options
 
 
-def _joint_pose(model: Model, seen: _Seen) -> Floats | None:
+def _joint_pose(model: Model, seen: Seen) -> Floats | None:
     """world_from_rig by one generalised PnP over all cameras."""
     result = pycolmap.estimate_and_refine_generalized_absolute_pose(
         seen.xy_px,
@@ -155,7 +160,7 @@ def _joint_pose(model: Model, seen: _Seen) -> Floats | None:
     return None if result is None else se3.inverse(matrix_of(result["rig_from_world"]))
 
 
-def _errors_px(model: Model, world_from_rig: Floats, seen: _Seen) -> Floats:
+def _errors_px(model: Model, world_from_rig: Floats, seen: Seen) -> Floats:
     """Reprojection errors (n,) under a pose of the unit; infinite behind a camera."""
     cam_from_world = se3.inverse(world_from_rig @ model.state.rig_from_cam)
     errors = np.full(len(seen.camera), np.inf)
@@ -168,7 +173,7 @@ def _errors_px(model: Model, world_from_rig: Floats, seen: _Seen) -> Floats:
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
-def _disagreeing(model: Model, seen: _Seen, inlier: NDArray[np.bool_]) -> tuple[str, ...]:
+def _disagreeing(model: Model, seen: Seen, inlier: NDArray[np.bool_]) -> tuple[str, ...]:
     """Cameras that see enough points but whose points don't fit the joint pose."""
     return tuple(
         camera.name
@@ -177,7 +182,7 @@ def _disagreeing(model: Model, seen: _Seen, inlier: NDArray[np.bool_]) -> tuple[
     )
 
 
-def _vote(model: Model, seen: _Seen) -> tuple[Floats | None, tuple[str, ...]]:
+def _vote(model: Model, seen: Seen) -> tuple[Floats | None, tuple[str, ...]]:
     """Average of the cameras' own poses, and the names of those that are far from it."""
     cameras, votes, names = cameras_of(model), [], []
     options = pycolmap.AbsolutePoseEstimationOptions()

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
+from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.registration.camera_set import Registration, register_unit
 from mrasfm_engine.registration.initialise import Initialisation, initialise
+from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
+from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,6 +37,9 @@ class MappingLog:
     failures: dict[int, Registration] = field(default_factory=dict)  # by unit, the last attempt
     local_adjustments: int = 0
     global_adjustments: list[Report] = field(default_factory=list)
+    revisits_tried: int = 0  # pairs of units across a gap that were compared
+    revisits: list[tuple[int, int]] = field(default_factory=list)  # those that were believed
+    loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
 
 
 def grow(
@@ -77,6 +84,45 @@ def grow(
         if progress is not None:
             progress(int(model.registered.sum()), len(model.registered))
     return log
+
+
+def map_units(
+    drive: Drive,
+    keypoints: Keypoints,
+    pairs: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    config: EngineConfig,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> tuple[Model, MappingLog]:
+    """The whole mapping: the scene grows along the drive, then loops are closed.
+
+    Raises
+    ------
+    ReconstructionError
+        Where the scene cannot even begin.
+    CancelledError
+        Where `cancel` answers True.
+    """
+    image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+    near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
+    model = Model(drive, keypoints, build_tracks(keypoints, near), config)
+    log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
+    revisits, log.revisits_tried = find_revisits(model, far)
+    if not revisits:
+        return model, log
+    log.revisits = [(r.earlier, r.later) for r in revisits]
+    log.loop_moved_m = close_loops(model, revisits)
+    # Tracks anew, now with the matches across the loop that were believed, and points from the moved units.
+    believed = set(log.revisits)
+    across = [p for p in far if (*sorted((int(image_unit[p.image_a]), int(image_unit[p.image_b]))),) in believed]
+    closed = Model(drive, keypoints, build_tracks(keypoints, [*near, *across]), config)
+    closed.state = replace(model.state, points_m=closed.state.points_m)
+    closed.registered = model.registered
+    closed.triangulate()
+    adjust_globally(closed, log, cancel)
+    return closed, log
 
 
 def _register_next(model: Model, log: MappingLog) -> Registration | None:
@@ -170,5 +216,5 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
             cancel=cancel,
         )
         log.global_adjustments.append(report)
-        model.triangulate()
+        model.complete()
         model.filter(error_px)

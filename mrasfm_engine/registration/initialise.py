@@ -24,6 +24,8 @@ MAX_RELATIVE_MATCHES = 1200
 RELATIVE_ERROR_PX = 4.0
 ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
 MIN_POINTS = 30
+GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
+INSIDE = "points inside the first unit"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,8 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
                     model.state.world_from_rig[u],
                     model.state.world_from_rig[v],
                 )
+            if method == INSIDE and points >= GOOD_START_POINTS:
+                break  # the relative pose from images alone costs most; it is for cameras that share no view
     model.clear()
     if best is None or best[0] < MIN_POINTS:
         raise ReconstructionError(
@@ -116,7 +120,7 @@ def _proposals(
     if model.triangulate(model.tracks_of_units(np.array([u]))) >= MIN_POINTS:
         registration = register_unit(model, v)
         if registration.world_from_rig is not None:
-            yield "points inside the first unit", registration.world_from_rig
+            yield INSIDE, registration.world_from_rig
     relative = _generalised_relative_pose(model, pairs, u, v)
     if relative is not None:
         yield "generalised relative pose", anchor @ relative

@@ -36,6 +36,11 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "tracks": len(model.tracks),
         "points": int(model.solved.sum()),
         "observations": int(model.kept.sum()),
+        "revisits": {
+            "unit_pairs_tried": log.revisits_tried,
+            "unit_pairs_believed": len(log.revisits),
+            "moved_at_most_m": log.loop_moved_m,
+        },
         "local_adjustments": log.local_adjustments,
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
     }

@@ -121,6 +121,17 @@ class Model:
         # Also points that the new view contradicts: with it, another hypothesis may win.
         self.triangulate(np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]])))
 
+    def complete(self) -> None:
+        """Let every point have the observations that now fit it, and try again for tracks without a point."""
+        of_keypoint = self.tracks.of_keypoint
+        rows = np.flatnonzero((of_keypoint >= 0) & self.registered[self.keypoints.unit])
+        rows = rows[self.solved[of_keypoint[rows]]]
+        errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, of_keypoint[rows])
+        self.kept[:] = False
+        self.kept[rows] = errors < self.triangulator.max_error_px
+        self.triangulate(np.flatnonzero(~self.solved))
+        self.filter(self.triangulator.max_error_px)
+
     def filter(self, max_error_px: float) -> tuple[int, int]:
         """Drop observations with larger errors, and points left with fewer than two; how many of both."""
         rows = np.flatnonzero(self.kept)

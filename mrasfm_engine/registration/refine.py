@@ -27,9 +27,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-ROUNDS = 3  # of adjusting, triangulating anew and filtering
-TOLERANCE = 1e-5
-SIGMA_PX_RANGE = (0.2, 2.0)
+ROUNDS = 2  # of adjusting, triangulating anew and filtering
+TOLERANCE = 1e-6
+DECREMENT_TOLERANCE = 1e-6  # scale is a weak direction: it must arrive as well
+SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
 MAX_RANK_FOR_COVARIANCE = 12_000  # unknowns; above, the inverse would take gigabytes
 
 
@@ -89,7 +90,7 @@ def refine(
             )
         )
         if done < ROUNDS - 1:
-            model.triangulate()
+            model.complete()
         observations, points = model.filter(model.config.mapping.filter_error_px)
         result.observations_dropped += observations
         result.points_dropped += points
@@ -103,6 +104,7 @@ def _options(model: Model, sigma_px: float, *, iterations: int) -> SolverOptions
     return SolverOptions(
         max_iterations=iterations,
         function_tolerance=TOLERANCE,
+        decrement_tolerance=DECREMENT_TOLERANCE,
         loss_scale=model.config.adjustment.loss_scale,
         sigma_px=sigma_px,
         threads=model.config.threads,

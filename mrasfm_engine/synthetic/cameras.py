@@ -28,7 +28,8 @@ def _distort_opencv(xy: Floats, k: Floats) -> Floats:
 
 def _theta_distorted(theta: Floats, k: Floats) -> Floats:
     t2 = theta * theta
-    return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    result: Floats = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    return result
 
 
 def project(model: str, params: ArrayLike, points_cam: ArrayLike) -> Floats:
@@ -70,10 +71,11 @@ def unproject(model: str, params: ArrayLike, xy_px: ArrayLike) -> Floats:
         return fisheye
     ideal = distorted.copy()
     step = 1e-6
+    dx, dy = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(8):
         error = _distort_opencv(ideal, p[4:]) - distorted
-        jx = (_distort_opencv(ideal + [step, 0.0], p[4:]) - _distort_opencv(ideal - [step, 0.0], p[4:])) / (2 * step)
-        jy = (_distort_opencv(ideal + [0.0, step], p[4:]) - _distort_opencv(ideal - [0.0, step], p[4:])) / (2 * step)
+        jx = (_distort_opencv(ideal + dx, p[4:]) - _distort_opencv(ideal - dx, p[4:])) / (2 * step)
+        jy = (_distort_opencv(ideal + dy, p[4:]) - _distort_opencv(ideal - dy, p[4:])) / (2 * step)
         det = jx[..., 0] * jy[..., 1] - jx[..., 1] * jy[..., 0]
         ideal[..., 0] -= (error[..., 0] * jy[..., 1] - error[..., 1] * jy[..., 0]) / det
         ideal[..., 1] -= (error[..., 1] * jx[..., 0] - error[..., 0] * jx[..., 1]) / det

@@ -69,14 +69,15 @@ def daylight(rng: np.random.Generator) -> Light:
         glow=np.array([0.3, 0.27, 0.2]),
         haze_m=float(rng.uniform(700.0, 1200.0)),
         cloudiness=float(rng.uniform(0.3, 0.8)),
-        gain=float(np.exp(rng.normal(0.0, 0.07))),
+        gain=1.2 * float(np.exp(rng.normal(0.0, 0.07))),
     )
 
 
 def cast_shadows(mesh: Mesh, atlas: Atlas, to_sun: Floats) -> ShadowMap:
     """The shadow map of a mesh under parallel light."""
     keep = np.flatnonzero(mesh.casts_shadow)
-    across = np.cross([0.0, 0.0, 1.0], to_sun)
+    # Any axis will do that the sun is not on.
+    across = np.cross([0.0, 0.0, 1.0] if abs(to_sun[2]) < 0.99 else [1.0, 0.0, 0.0], to_sun)
     across /= np.linalg.norm(across)
     rotation = np.stack([across, np.cross(to_sun, across), to_sun])
     o, u, v = (x[keep] @ rotation.T for x in (mesh.origin, mesh.u, mesh.v))

@@ -56,7 +56,7 @@ def add_building(
     width, depth, height = size_m
     r, t = world_from_front[:3, :3], world_from_front[:3, 3]
     x, y, z = r[:, 0] * width, r[:, 1] * depth, r[:, 2] * height
-    tint = (1.0, 1.0, 1.0) if plain else tuple(float(c) for c in rng.uniform(0.9, 1.08, 3))
+    tint = (1.0, 1.0, 1.0) if plain else tuple(float(c) for c in rng.uniform(0.92, 1.06) * rng.uniform(0.98, 1.02, 3))
     offset = (0.0, 0.0) if plain else _offset(rng)
     front = Surface(
         texture=facade,

@@ -20,8 +20,9 @@ _BOTTOM_M = 0.5
 def _coverage(origin: Floats, rays: Floats, centre: Floats) -> Floats:
     """Share of rays (n, 3) from `origin` that hit lorries (m,) whose boxes are centred at (m, 2) in the rig."""
     length, width, height = TRUCK_SIZE_M
-    low = np.concatenate([centre - [length / 2, width / 2], np.full((len(centre), 1), _BOTTOM_M)], 1)
-    high = np.concatenate([centre + [length / 2, width / 2], np.full((len(centre), 1), height)], 1)
+    half = np.array([length / 2, width / 2])
+    low = np.concatenate([centre - half, np.full((len(centre), 1), _BOTTOM_M)], 1)
+    high = np.concatenate([centre + half, np.full((len(centre), 1), height)], 1)
     safe = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     a = (low[:, None] - origin) / safe
     b = (high[:, None] - origin) / safe

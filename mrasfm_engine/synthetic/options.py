@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.synthetic.rigs import MAX_SYNTHETIC_CAMERAS, mounts
@@ -92,7 +93,23 @@ class SynthOptions:
             refuse(f"images of {self.width}x{self.height} pixels cannot be rendered", "Use sides of 32 to 8192 pixels.")
         if self.texture_px not in (64, 128, 256, 512, 1024):
             refuse(f"textures of {self.texture_px} pixels are not possible", "Use 64, 128, 256, 512 or 1024.")
-        for name in ["parked_cars", "moving_cars", "exposure_jitter", "noise", "blur_px", "standing_units", "time_skew_ms", "gnss_noise_m", "gnss_drift_m", "gnss_bias_m", "rough_noise_m", "rough_noise_deg", "perturb_rotation_deg", "perturb_translation_m", "seed"]:
+        for name in [
+            "parked_cars",
+            "moving_cars",
+            "exposure_jitter",
+            "noise",
+            "blur_px",
+            "standing_units",
+            "time_skew_ms",
+            "gnss_noise_m",
+            "gnss_drift_m",
+            "gnss_bias_m",
+            "rough_noise_m",
+            "rough_noise_deg",
+            "perturb_rotation_deg",
+            "perturb_translation_m",
+            "seed",
+        ]:
             if getattr(self, name) < 0:
                 flag = name.replace("_", "-")
                 refuse(f"--{flag} {getattr(self, name)} is negative", "Give zero or a positive number.")
@@ -132,3 +149,9 @@ class SynthOptions:
     def loop_length_m(self) -> float:
         """Way around the block: every drive ends 10 m into the next one's way."""
         return self.drives * (self.drive_length_m - LOOP_OVERLAP_M)
+
+
+def small_options(**changes: Any) -> SynthOptions:
+    """Options of a drive that is rendered in seconds: 6 units of 2 cameras of 480x270 pixels, with `changes`."""
+    small: dict[str, Any] = {"cameras": 2, "units": 6, "width": 480, "height": 270, "texture_px": 256}
+    return SynthOptions(**{**small, **changes})

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.synthetic.paint_noise import Bytes, Floats32, cracks, fractal, spots, to_bytes
 from mrasfm_engine.synthetic.paint_surfaces import write_text
@@ -27,8 +30,10 @@ _WALL_COLOURS = np.array(
 )
 
 
-def _tone(colour: np.ndarray[tuple[int], np.dtype[np.float64]] | Floats32) -> Colour:
-    r, g, b = (float(c) for c in colour)
+def _tone(colour: NDArray[np.floating[Any]]) -> Colour:
+    """A colour for OpenCV, less saturated than random numbers are."""
+    grey = float(colour.mean())
+    r, g, b = (grey + 0.7 * (float(c) - grey) for c in colour)
     return r, g, b
 
 
@@ -82,9 +87,9 @@ def _window(image: Floats32, rng: np.random.Generator, box: tuple[int, int, int,
         for line in range(y + 4, y + drop, 6):
             cv2.line(image, (x, line), (x + w, line), _tone(np.full(3, tone * 0.8)), 1)
     elif kind < 0.7:
-        tone = _tone(rng.uniform(90, 225, 3))
+        cloth = _tone(rng.uniform(90, 225, 3))
         for side in (x, x + w - int(w * 0.28)):
-            cv2.rectangle(image, (side, y), (side + int(w * rng.uniform(0.15, 0.28)), y + h), tone, -1)
+            cv2.rectangle(image, (side, y), (side + int(w * rng.uniform(0.15, 0.28)), y + h), cloth, -1)
     if rng.random() < 0.4:
         cx, cy = x + int(w * rng.uniform(0.2, 0.8)), y + int(h * 0.85)
         cv2.circle(image, (cx, cy), max(3, int(w * rng.uniform(0.08, 0.2))), _tone(rng.uniform(20, 200, 3)), -1)
@@ -98,12 +103,12 @@ def _window(image: Floats32, rng: np.random.Generator, box: tuple[int, int, int,
         image, (x - border - 4, y + h + border + 9), (x + w + border + 4, y + h + border + 9), (50.0, 48.0, 46.0), 2
     )
     if style["shutters"] > 0.5 and rng.random() < 0.85:
-        tone = np.array([style["shutter_r"], style["shutter_g"], style["shutter_b"]]) * rng.uniform(0.85, 1.15)
+        wood = np.array([style["shutter_r"], style["shutter_g"], style["shutter_b"]]) * rng.uniform(0.85, 1.15)
         width = int(w * 0.42)
         for sx in (x - border - width, x + w + border):
-            cv2.rectangle(image, (sx, y), (sx + width, y + h), _tone(tone), -1)
+            cv2.rectangle(image, (sx, y), (sx + width, y + h), _tone(wood), -1)
             for line in range(y + 4, y + h, 7):
-                cv2.line(image, (sx + 2, line), (sx + width - 2, line), _tone(tone * 0.7), 1)
+                cv2.line(image, (sx + 2, line), (sx + width - 2, line), _tone(wood * 0.7), 1)
     if rng.random() < 0.12:
         ax, ay = x + int(w * 0.1), y + h + border + 12
         cv2.rectangle(image, (ax, ay), (ax + w // 2, ay + w // 4), (205.0, 205.0, 200.0), -1)
@@ -121,8 +126,8 @@ def _shop(image: Floats32, rng: np.random.Generator, box: tuple[int, int, int, i
     cv2.rectangle(image, (gx, gy), (gx + gw, gy + gh), (46.0, 54.0, 62.0), -1)
     for _ in range(26):
         px, py = int(rng.integers(gx, gx + gw - 8)), int(rng.integers(gy, gy + gh - 8))
-        pw, ph = rng.integers(5, max(6, gw // 5)), rng.integers(5, max(6, gh // 2))
-        corner = (int(min(px + pw, gx + gw)), int(min(py + ph, gy + gh)))
+        pw, ph = int(rng.integers(5, max(6, gw // 5))), int(rng.integers(5, max(6, gh // 2)))
+        corner = (min(px + pw, gx + gw), min(py + ph, gy + gh))
         cv2.rectangle(image, (px, py), corner, _tone(rng.uniform(15, 240, 3)), -1)
     for k in range(1, 3):
         cv2.line(image, (gx + gw * k // 3, gy), (gx + gw * k // 3, gy + gh), (150.0, 150.0, 150.0), 4)
@@ -145,7 +150,8 @@ def _door(image: Floats32, rng: np.random.Generator, box: tuple[int, int, int, i
 def facade(size: int, rng: np.random.Generator) -> Bytes:
     """A front (size, size, 3) of 3 to 4 floors, ground floor included, for a width and height of 9 to 15 m each."""
     k = size / 1024
-    colour = _WALL_COLOURS[rng.integers(len(_WALL_COLOURS))] * rng.uniform(0.85, 1.1, 3).astype(np.float32)
+    shift = rng.uniform(0.9, 1.1) * rng.uniform(0.96, 1.04, 3)
+    colour = _WALL_COLOURS[rng.integers(len(_WALL_COLOURS))] * shift.astype(np.float32)
     material = str(rng.choice(["plaster", "brick", "stone", "panel"], p=[0.35, 0.3, 0.2, 0.15]))
     image = wall(1024, rng, material=material, colour=colour)
     floors, columns = int(rng.integers(3, 5)), int(rng.integers(3, 6))
@@ -175,7 +181,7 @@ def facade(size: int, rng: np.random.Generator) -> Bytes:
     while x < 1024 - 150:
         kind = rng.random()
         if kind < 0.5:
-            width = int(min(rng.integers(220, 400), 1024 - x - 14))
+            width = min(int(rng.integers(220, 400)), 1024 - x - 14)
             _shop(image, rng, (x, ground + 16, width, 1024 - ground - 30))
         elif kind < 0.75:
             width = 110

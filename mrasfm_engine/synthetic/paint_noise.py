@@ -12,17 +12,20 @@ Bytes = NDArray[np.uint8]
 
 def fractal(size: int, rng: np.random.Generator, *, coarsest: int = 4, persistence: float = 0.6) -> Floats32:
     """Noise (size, size) of standard deviation 1 with octaves from `size / coarsest` pixels down to single pixels."""
-    total = np.zeros((size, size), np.float32)
-    amplitude, cells = 1.0, coarsest
-    while cells <= size:
-        grid = rng.standard_normal((cells, cells)).astype(np.float32)
-        pad = np.pad(grid, 2, mode="wrap")
-        scale = size // cells
-        wide = cv2.resize(pad, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        total += amplitude * wide[2 * scale : 2 * scale + size, 2 * scale : 2 * scale + size]
-        amplitude *= persistence
+    cells = coarsest
+    total = rng.standard_normal((cells, cells), dtype=np.float32)
+    amplitude = 1.0
+    while cells < size:
+        # From octave to octave everything so far is enlarged, with a border from the other side.
+        pad = np.pad(total, 2, mode="wrap")
+        wide = np.asarray(cv2.resize(pad, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.float32)
         cells *= 2
-    return (total - total.mean()) / total.std()
+        amplitude *= persistence
+        total = wide[4 : 4 + cells, 4 : 4 + cells] + np.float32(amplitude) * rng.standard_normal(
+            (cells, cells), dtype=np.float32
+        )
+    result: Floats32 = (total - total.mean()) / total.std()
+    return result
 
 
 def spots(
@@ -41,7 +44,7 @@ def spots(
         # Spots across the border continue at the other side.
         for ox in (-size, 0, size) if x[i] < r * 1.2 or x[i] > size - r * 1.2 else (0,):
             for oy in (-size, 0, size) if y[i] < r * 1.2 or y[i] > size - r * 1.2 else (0,):
-                points = np.round((outline + [x[i] + ox, y[i] + oy]) * 16).astype(np.int32)
+                points = np.round((outline + np.array([x[i] + ox, y[i] + oy])) * 16).astype(np.int32)
                 cv2.fillPoly(canvas, [points], float(value[i]), cv2.LINE_8, 4)
     return canvas
 
@@ -71,5 +74,5 @@ def to_bytes(image: Floats32) -> Bytes:
 
 def with_alpha(image: Bytes, alpha: NDArray[np.bool_] | Bytes) -> Bytes:
     """The image (h, w, 3) with a fourth channel: opaque where `alpha` is."""
-    mask = (np.asarray(alpha) > 0).astype(np.uint8) * 255
+    mask = np.asarray(alpha).astype(bool).astype(np.uint8) * 255
     return np.concatenate([image, mask[..., None]], 2)

@@ -7,7 +7,6 @@ A, B, W and the depth key D that the kernels speak of. For a parallel projection
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -92,8 +91,8 @@ def _opaque(
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
     tu = uv[i, 0] + a * uv[i, 2] + b * uv[i, 4]
     tv = uv[i, 1] + a * uv[i, 3] + b * uv[i, 5]
-    x = int(math.floor(tu * w)) & (w - 1)
-    y = int(math.floor(tv * h)) & (h - 1)
+    x = int(np.floor(tu * w)) & (w - 1)
+    y = int(np.floor(tv * h)) & (h - 1)
     opaque: bool = (texels[offset[t, level] + y * w + x] >> 24) >= 128
     return opaque
 
@@ -156,7 +155,7 @@ def rasterise_linear(
             if not first <= last:
                 continue
             if has_alpha[i]:
-                for col in range(int(math.ceil(first)), int(math.floor(last)) + 1):
+                for col in range(int(np.ceil(first)), int(np.floor(last)) + 1):
                     d = d0 + d1 * col
                     if d > depth[row, col]:
                         w = w0 + w1 * col
@@ -165,7 +164,7 @@ def rasterise_linear(
                             depth[row, col] = d
                             index[row, col] = i
             else:
-                for col in range(int(math.ceil(first)), int(math.floor(last)) + 1):
+                for col in range(int(np.ceil(first)), int(np.floor(last)) + 1):
                     d = d0 + d1 * col
                     if d > depth[row, col]:
                         depth[row, col] = d

@@ -12,10 +12,11 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.atlas import Atlas
 from mrasfm_engine.synthetic.cameras import ideal_map
 from mrasfm_engine.synthetic.light import Light, ShadowMap
-from mrasfm_engine.synthetic.mesh import Mesh
+from mrasfm_engine.synthetic.mesh import Label, Mesh
 from mrasfm_engine.synthetic.rasteriser import prepare_perspective, rasterise_linear, rasterise_mapped
 from mrasfm_engine.synthetic.rigs import TrueCamera
-from mrasfm_engine.synthetic.shading import expose, shade
+from mrasfm_engine.synthetic.sensor import expose
+from mrasfm_engine.synthetic.shading import shade
 
 Floats = NDArray[np.float64]
 
@@ -175,6 +176,7 @@ def render(
         view.labels,
         view.depth_m,
     )
+    view.depth_m[view.labels == Label.SKY] = np.inf
     return view
 
 
@@ -186,7 +188,8 @@ def _alpha_levels(mesh: Mesh, atlas: Atlas, lens: Lens, nearest: Floats) -> NDAr
     level = np.floor(np.log2(np.maximum(texels / samples, 1e-6)))
     # Coarser than 16 texels a side, holes are gone.
     finest = np.minimum(atlas.log2_width, atlas.log2_height)[mesh.texture] - 4
-    return np.clip(level, 0, np.maximum(finest, 0)).astype(np.int32)
+    result: NDArray[np.int32] = np.clip(level, 0, np.maximum(finest, 0)).astype(np.int32)
+    return result
 
 
 def develop(

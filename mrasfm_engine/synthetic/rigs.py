@@ -55,7 +55,7 @@ _FRONT_LEFT = Mount(name="front_left", position_m=(1.52, 0.49, 1.50), yaw_deg=55
 _FRONT_RIGHT = Mount(name="front_right", position_m=(1.55, -0.49, 1.49), yaw_deg=-55.0, fov_deg=72.0)
 _BACK_LEFT = Mount(name="back_left", position_m=(1.04, 0.48, 1.56), yaw_deg=110.0, fov_deg=72.0)
 _BACK_RIGHT = Mount(name="back_right", position_m=(1.01, -0.48, 1.56), yaw_deg=-110.0, fov_deg=72.0)
-_BACK = Mount(name="back", position_m=(0.03, 0.00, 1.57), yaw_deg=180.0, fov_deg=90.0)
+_BACK = Mount(name="back", position_m=(0.03, 0.00, 1.57), yaw_deg=180.0, fov_deg=98.0)
 _SURROUND = (_FRONT, _FRONT_LEFT, _FRONT_RIGHT, _BACK_LEFT, _BACK_RIGHT, _BACK)
 
 

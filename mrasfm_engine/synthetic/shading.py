@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-MAX_TAPS = 8
+MAX_TAPS = 4
 
 _SKY = 10
 _DONE = -2
 
-# Reordering of sums is harmless; that infinities and nans do not occur must not be assumed: the sky is at inf.
-_FAST = {"reassoc", "contract", "arcp", "nsz"}
+# Depth of the sky; fast arithmetic must not meet infinities.
+_SKY_DEPTH = 1e9
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
     """Red, green and blue (0..255) of a texture's level at texture coordinates, which repeat with period 1."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
     x, y = u * w - 0.5, v * h - 0.5
-    fx, fy = math.floor(x), math.floor(y)
+    fx, fy = np.floor(x), np.floor(y)
     ax, ay = x - fx, y - fy
     c0, r0 = int(fx) & (w - 1), int(fy) & (h - 1)
     c1, r1 = (c0 + 1) & (w - 1), (r0 + 1) & (h - 1)
@@ -39,12 +39,12 @@ def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, 
     return red, green, blue
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
     """The first channel of `_bilinear`."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
     x, y = u * w - 0.5, v * h - 0.5
-    fx, fy = math.floor(x), math.floor(y)
+    fx, fy = np.floor(x), np.floor(y)
     ax, ay = x - fx, y - fy
     c0, r0 = int(fx) & (w - 1), int(fy) & (h - 1)
     c1, r1 = (c0 + 1) & (w - 1), (r0 + 1) & (h - 1)
@@ -54,7 +54,7 @@ def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: 
     return (1 - ay) * upper + ay * lower
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, log2_h: Any, levels: Any) -> Any:
     """Number of taps, the edge along which they lie, the mip level and the share of the next coarser one.
 
@@ -67,7 +67,7 @@ def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, 
         major, minor, du, dv = length_x, length_y, ux, vx
     else:
         major, minor, du, dv = length_y, length_x, uy, vy
-    taps = max(1, min(MAX_TAPS, int(math.ceil(major / max(minor, 1.0) - 0.25))))
+    taps = max(1, min(MAX_TAPS, int(np.ceil(major / max(minor, 1.0) - 0.25))))
     exact = min(math.log2(max(major / taps, 1.0)), float(levels[t] - 1))
     level = int(exact)
     # Between 1/4 and 3/4 two levels are mixed; elsewhere one is near enough, at half the price.
@@ -77,7 +77,7 @@ def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, 
     return taps, du, dv, level, fraction
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _filtered(
     t: int,
     u: float,
@@ -105,7 +105,7 @@ def _filtered(
     return red / taps, green / taps, blue / taps
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _filtered_grey(
     t: int,
     u: float,
@@ -119,7 +119,7 @@ def _filtered_grey(
     log2_w: Any,
     log2_h: Any,
     levels: Any,
-) -> float:
+) -> Any:
     """The first channel of `_filtered`."""
     taps, du, dv, level, fraction = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
     total = 0.0
@@ -133,7 +133,7 @@ def _filtered_grey(
     return total / taps
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _sun_reaches(
     x: float,
     y: float,
@@ -144,15 +144,16 @@ def _sun_reaches(
     shadow_frame: Any,
     boxes: Any,
     casters: int,
-) -> float:
+) -> Any:
     """Share of the sun that a world point sees: 0 in full shadow, 1 in none.
 
-    `shadow_frame` is the map's x0, y0 and cell size in the sun's frame; the first `casters` rows of `boxes` (k, 8) move: centre x, y,
-    lower and upper z, cosine and sine of the heading, half length, half width.
+    `shadow_frame` is the map's x0, y0 and cell size in the sun's frame. The first `casters` rows of `boxes` (k, 8)
+    move: centre x, y, lower and upper z, cosine and sine of the heading, half length, half width.
     """
     for k in range(casters):
         px, py = x - boxes[k, 0], y - boxes[k, 1]
-        if (px * px + py * py) > 900.0:
+        # Under a sun that is not low, no shadow is farther from its vehicle than this.
+        if px * px + py * py > 200.0:
             continue
         c, s = boxes[k, 4], boxes[k, 5]
         ox, oy = c * px + s * py, -s * px + c * py
@@ -175,7 +176,7 @@ def _sun_reaches(
     sy = sun_from_world[1, 0] * x + sun_from_world[1, 1] * y + sun_from_world[1, 2] * z + sun_from_world[1, 3]
     sz = sun_from_world[2, 0] * x + sun_from_world[2, 1] * y + sun_from_world[2, 2] * z + sun_from_world[2, 3]
     cx, cy = (sx - shadow_frame[0]) / shadow_frame[2] - 0.5, (sy - shadow_frame[1]) / shadow_frame[2] - 0.5
-    col, row = int(math.floor(cx)), int(math.floor(cy))
+    col, row = int(np.floor(cx)), int(np.floor(cy))
     if col < 0 or row < 0 or col + 1 >= shadow_map.shape[1] or row + 1 >= shadow_map.shape[0]:
         return 1.0
     ax, ay = cx - col, cy - row
@@ -191,7 +192,7 @@ def _sun_reaches(
     return lit
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _sky(
     x: float,
     y: float,
@@ -220,7 +221,7 @@ def _sky(
     return red, green, blue
 
 
-@njit(inline="always", error_model="numpy", fastmath=_FAST)
+@njit(inline="always", error_model="numpy", fastmath=True)
 def _surface(
     i: int,
     x: float,
@@ -328,7 +329,7 @@ def _surface(
     return red, green, blue, z
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def shade(
     index: Any,
     ideal: Any,
@@ -357,7 +358,7 @@ def shade(
     labels: Any,
     depth: Any,
 ) -> None:
-    """Fill `image` (h, w, 3) in 0..1, `labels` (h, w) and `depth` (h, w; metres along z, inf for sky).
+    """Fill `image` (h, w, 3) in 0..1, `labels` (h, w) and `depth` (h, w; metres along z, 1e9 for sky).
 
     `index` (2h, 2w) are the primitives that a pixel's four samples see, -1 for sky; `ideal` (h, w, 2) the ideal
     coordinates of pixel centres. `light` (7, 3): direction to the sun, sun, sky light, haze colour, zenith colour,
@@ -397,7 +398,7 @@ def shade(
                 weight = 0.25 * count
                 if i < 0:
                     r, g, b = _sky(px, py, world_from_cam, light, sky_texture, texels, offset, log2_w, log2_h)
-                    z = math.inf
+                    z = _SKY_DEPTH
                 else:
                     r, g, b, z = _surface(
                         i,
@@ -433,30 +434,3 @@ def shade(
                     labels[row, col] = label[i] if i >= 0 else _SKY
                     depth[row, col] = z
             image[row, col, 0], image[row, col, 1], image[row, col, 2] = red, green, blue
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def expose(image: Any, vignetting: Any, gain: float, shot: float, read: float, seed: int, out: Any) -> None:
-    """Turn square-root intensities into 8 bits as a sensor does: exposure, lens fall-off, shot and read noise.
-
-    `shot` and `read` are the standard deviations of white's shot noise and of the read noise, in parts of white.
-    In square-root intensities y the linear noise sqrt(shot^2 y^2 + read^2) becomes itself over 2 y.
-    """
-    state = (seed * 2862933555777941757 + 3037000493) & 0x7FFFFFFFFFFFFFFF
-    state |= 1
-    for row in range(image.shape[0]):
-        for col in range(image.shape[1]):
-            factor = gain * vignetting[row, col]
-            for channel in range(3):
-                y = image[row, col, channel] * factor
-                if shot > 0 or read > 0:
-                    state ^= (state << 13) & 0x7FFFFFFFFFFFFFFF
-                    state ^= state >> 7
-                    state ^= (state << 17) & 0x7FFFFFFFFFFFFFFF
-                    # The sum of three uniform numbers is normal enough; its variance is 3 / 12.
-                    total = (state & 0xFFFFF) + ((state >> 20) & 0xFFFFF) + ((state >> 40) & 0xFFFFF)
-                    normal = (total / 1048576.0 - 1.5) * 2.0
-                    dark = max(y, 0.06)
-                    y += normal * math.sqrt(shot * shot * dark * dark + read * read) / (2.0 * dark)
-                value = y * 255.0 + 0.5
-                out[row, col, channel] = int(min(max(value, 0.0), 255.0))

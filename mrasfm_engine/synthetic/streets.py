@@ -35,12 +35,13 @@ class Street:
 
     @cached_property
     def _s(self) -> Floats:
-        return np.arange(len(self.points)) * _STEP_M
+        return np.linspace(0.0, (len(self.points) - 1) * _STEP_M, len(self.points))
 
     @cached_property
     def _heading(self) -> Floats:
         dx, dy = np.gradient(self.points, axis=0).T
-        return np.unwrap(np.arctan2(dy, dx))
+        result: Floats = np.asarray(np.unwrap(np.arctan2(dy, dx)), dtype=np.float64)
+        return result
 
     def at(self, s_m: ArrayLike, lateral_m: ArrayLike = 0.0) -> tuple[Floats, Floats]:
         """Positions (..., 2) and headings (...) in radians at arc lengths, `lateral_m` to the left of the axis."""
@@ -81,7 +82,7 @@ class Ground:
         result: Floats = np.interp(q, at, self.nodes_m)
         return result
 
-    def lift(self, xy: ArrayLike, above_m: ArrayLike = 0.0) -> Floats:
+    def lift(self, xy: ArrayLike, above_m: float = 0.0) -> Floats:
         """Points (..., 3) above the ground at (..., 2)."""
         xy = np.asarray(xy, dtype=np.float64)
         return np.concatenate([xy, (self.height(xy) + above_m)[..., None]], -1)

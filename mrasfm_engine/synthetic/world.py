@@ -36,7 +36,9 @@ def build_world(options: SynthOptions, rng: np.random.Generator) -> StaticWorld:
     """Lay out, paint and furnish a world."""
     layout = lay_out(options, rng)
     length = sum(street.length_m for street in layout.streets)
-    facades = _REPEATED_FACADES if options.world is World.REPEATED else min(_MAX_FACADES, max(8, round(length / 6)))
+    # Painting takes most of the time before the first image; small textures are for those in a hurry.
+    most = _MAX_FACADES if options.texture_px > 256 else _MAX_FACADES // 3
+    facades = _REPEATED_FACADES if options.world is World.REPEATED else min(most, max(8, round(length / 6)))
     materials = paint_materials(facades=facades, size=options.texture_px, rng=rng)
     builder = MeshBuilder()
     _add_ground(builder, materials, layout)

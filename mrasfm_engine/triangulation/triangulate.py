@@ -27,7 +27,7 @@ MAX_OBSERVATIONS = 256  # of a track that are looked at
 MIN_DEPTH_M = 0.05
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, work: Any, proj: Any) -> float:
     """Squared reprojection error of x under cam_from_world (r, t); huge behind the camera."""
     for i in range(3):
@@ -38,7 +38,7 @@ def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, w
     return (proj[0] - xy[0]) ** 2 + (proj[1] - xy[1]) ** 2
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _refine(
     count: int, use: Any, members: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any, params: Any,
     x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
@@ -84,7 +84,7 @@ def _refine(
         x[2] -= d2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _triangulate(
     which: Any, first: Any, track_keypoints: Any, image: Any, camera: Any, xy: Any, rays: Any, usable: Any,
     cfw_r: Any, cfw_t: Any, kind: Any, params: Any, max_error2: float, min_angle: float, points: Any, solved: Any, kept: Any,
@@ -219,7 +219,7 @@ def _triangulate(
                 kept[members[m]] = True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _errors(
     rows: Any,
     point: Any,

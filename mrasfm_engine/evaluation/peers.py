@@ -1,0 +1,165 @@
+"""COLMAP's own mappers on the features and matches of a scene, to compare with side by side."""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_trajectories
+from mrasfm_engine.geometry import se3
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class Mapper(StrEnum):
+    """Which of COLMAP's mappers, and what it is told about the calibration it gets."""
+
+    GLOBAL = "global"  # its defaults: focal lengths and poses of the cameras vary
+    GLOBAL_FIXED_CALIBRATION = "global, calibration fixed"
+    INCREMENTAL = "incremental"  # its defaults, the same
+    INCREMENTAL_FIXED_CALIBRATION = "incremental, calibration fixed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerResult:
+    """What a mapper made of a scene's matches.
+
+    Attributes
+    ----------
+    seconds
+        Of mapping alone, from the database to the model.
+    registered_images
+        Of the largest model, where there are several.
+    world_from_rig
+        Poses (units, 4, 4) in that model's own world; NaN for units that are not in it.
+    failure
+        Why there is no model; empty where there is one.
+    """
+
+    mapper: Mapper
+    seconds: float
+    registered_images: int
+    world_from_rig: Floats
+    failure: str = ""
+
+    @property
+    def registered(self) -> Bools:
+        """Units (n,) that the model holds."""
+        result: Bools = np.isfinite(self.world_from_rig[:, 0, 0])
+        return result
+
+    def errors(self, truth_world_from_rig: Floats) -> TrajectoryErrors | None:
+        """Errors over the registered units against the truth (units, 4, 4); None for fewer than three of them."""
+        kept = self.registered
+        if kept.sum() < MIN_POSES:
+            return None
+        return compare_trajectories(self.world_from_rig[kept], truth_world_from_rig[kept])
+
+
+def run_peer(database: Path, mapper: Mapper, *, threads: int, timeout_s: float = 3600.0) -> PeerResult:
+    """Run one mapper on a copy of a scene's `features.db`, in a process of its own because COLMAP may abort it.
+
+    Parameters
+    ----------
+    database
+        As `export_scene` writes it: with the rig as refined, and verified matches.
+
+    Raises
+    ------
+    InputError
+        Where there is no such file.
+    """
+    if not database.is_file():
+        raise InputError(f"{database} does not exist", remedy="Give the features.db of a scene.")
+    with tempfile.TemporaryDirectory(prefix="mrasfm-peer-") as name:
+        folder = Path(name)
+        shutil.copyfile(database, folder / "features.db")  # COLMAP writes into databases that it only reads
+        started = time.perf_counter()
+        process = multiprocessing.get_context("spawn").Process(target=_map, args=(folder, mapper, threads))
+        process.start()
+        process.join(timeout_s)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        seconds = time.perf_counter() - started
+        if not (folder / "result.npz").is_file():
+            why = f"not finished within {timeout_s:g} s" if seconds >= timeout_s else f"ended with {process.exitcode}"
+            return PeerResult(
+                mapper=mapper, seconds=seconds, registered_images=0, world_from_rig=np.zeros((0, 4, 4)), failure=why
+            )
+        with np.load(folder / "result.npz") as result:
+            return PeerResult(
+                mapper=mapper,
+                seconds=float(result["seconds"]),
+                registered_images=int(result["images"]),
+                world_from_rig=result["world_from_rig"],
+                failure="" if int(result["images"]) else "no model",
+            )
+
+
+def _map(folder: Path, mapper: Mapper, threads: int) -> None:
+    pycolmap.logging.minloglevel = 3
+    out = folder / "models"
+    out.mkdir()
+    database = str(folder / "features.db")
+    started = time.perf_counter()
+    if mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
+        models = pycolmap.global_mapping(database, folder, out, _global_options(mapper, threads))
+    else:
+        models = pycolmap.incremental_mapping(database, folder, out, _incremental_options(mapper, threads))
+    seconds = time.perf_counter() - started
+    with pycolmap.Database.open(database) as opened:
+        units = max(frame.frame_id for frame in opened.read_all_frames())
+    largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    np.savez(
+        folder / "result.npz",
+        seconds=seconds,
+        images=0 if largest is None else largest.num_reg_images(),
+        world_from_rig=_world_from_rig(largest, units),
+    )
+
+
+def _global_options(mapper: Mapper, threads: int) -> Any:
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = 0
+    if mapper is Mapper.GLOBAL_FIXED_CALIBRATION:
+        options.mapper.refine_sensor_from_rig = False
+        options.mapper.bundle_adjustment.refine_sensor_from_rig = False
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
+    return options
+
+
+def _incremental_options(mapper: Mapper, threads: int) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = 0
+    options.extract_colors = False
+    if mapper is Mapper.INCREMENTAL_FIXED_CALIBRATION:
+        options.ba_refine_sensor_from_rig = False
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def _world_from_rig(model: Any, units: int) -> Floats:
+    """Poses (units, 4, 4) of a model whose frames are numbered from 1 as the scene's units are from 0."""
+    poses = np.full((units, 4, 4), np.nan)
+    if model is not None:
+        for frame_id in model.reg_frame_ids():
+            rig_from_world = model.frame(frame_id).rig_from_world.matrix()
+            poses[frame_id - 1] = se3.inverse(se3.transform(rig_from_world[:, :3], rig_from_world[:, 3]))
+    return poses

@@ -1,0 +1,153 @@
+"""A route that returns to where it was: finding it, believing it, and closing it.
+
+The scene first grows along the drive from matches of neighbouring units alone, so that a wrong revisit cannot bend it.
+Then every pair of units that matches across a larger gap is tried: the later unit is registered against points that the
+earlier one sees. The difference to its current pose is the drift since, as this pair sees it. Drift changes slowly, so a
+revisit is believed where several pairs of neighbouring units report the same drift, and that drift is plausible for the
+way in between. A pose graph then spreads it over the loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.registration.camera_set import Seen, register_seen
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.pose_graph import Edges, optimise_pose_graph
+from mrasfm_engine.scene.scene import PairMatches
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MIN_INLIERS = 30
+MIN_SUPPORT = 3  # pairs of units that report one drift
+NEIGHBOUR_UNITS = 6  # how far apart two pairs of units may be to support one another
+SAME_DRIFT_M, SAME_DRIFT_DEG = 0.3, 1.0
+MAX_DRIFT_M, MAX_DRIFT_PER_M, MAX_DRIFT_DEG = 1.0, 0.03, 10.0  # what a drive of some length may have gone off
+SIGMA_STEP_ROTATION_RAD, SIGMA_STEP_TRANSLATION_M = np.radians(0.05), 0.01  # from one unit to the next
+SIGMA_LOOP_ROTATION_RAD, SIGMA_LOOP_TRANSLATION_M = np.radians(0.1), 0.03
+
+
+@dataclass(frozen=True, kw_only=True)
+class Revisit:
+    """Two units that see the same place."""
+
+    earlier: int
+    later: int
+    world_from_rig: Floats  # pose of the later unit from points that the earlier one sees
+    drift: Floats  # (4, 4) that moves the later unit's current pose there: world_from_rig @ inverse(current)
+    inliers: int
+
+
+def split_pairs(
+    pairs: Sequence[PairMatches], image_unit: Ints, window_units: int
+) -> tuple[list[PairMatches], list[PairMatches]]:
+    """Pairs of neighbouring units, and pairs across larger gaps."""
+    near, far = [], []
+    for pair in pairs:
+        gap = abs(int(image_unit[pair.image_a]) - int(image_unit[pair.image_b]))
+        (near if gap <= window_units else far).append(pair)
+    return near, far
+
+
+def find_revisits(model: Model, far_pairs: Sequence[PairMatches]) -> tuple[list[Revisit], int]:
+    """Believed revisits, and how many pairs of units were tried."""
+    by_units: dict[tuple[int, int], list[PairMatches]] = {}
+    for pair in far_pairs:
+        units = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
+        if model.registered[units].all():
+            by_units.setdefault((units[0], units[1]), []).append(pair)
+    found = [r for (i, j), own in sorted(by_units.items()) if (r := _try(model, i, j, own)) is not None]
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(model.state.unit_position_m, axis=0), axis=1))])
+    plausible = [r for r in found if _plausible(r, model, float(way[r.later] - way[r.earlier]))]
+    believed = [r for r in plausible if sum(_agree(r, other, model) for other in plausible) >= MIN_SUPPORT]
+    return believed, len(by_units)
+
+
+def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -> Revisit | None:
+    """Register the later unit against points that the earlier one observes."""
+    rows_later, tracks = [], []
+    for pair in pairs:
+        a = model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
+        b = model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
+        if model.image_unit[pair.image_a] != earlier:
+            a, b = b, a
+        observed = model.kept[a]
+        rows_later.append(b[observed])
+        tracks.append(model.tracks.of_keypoint[a[observed]])
+    rows, track = np.concatenate(rows_later), np.concatenate(tracks)
+    seen = Seen(
+        xy_px=model.keypoints.xy_px[rows],
+        points_m=model.state.points_m[track],
+        camera=model.keypoints.camera[rows],
+    )
+    registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS)
+    if registration.world_from_rig is None:
+        return None
+    current = model.state.world_from_rig[later]
+    return Revisit(
+        earlier=earlier,
+        later=later,
+        world_from_rig=registration.world_from_rig,
+        drift=registration.world_from_rig @ se3.inverse(current),
+        inliers=registration.inliers,
+    )
+
+
+def _moved(drift: Floats, at: Floats) -> Floats:
+    """By how much a drift moves a point of the world."""
+    result: Floats = drift[:3, :3] @ at + drift[:3, 3] - at
+    return result
+
+
+def _plausible(revisit: Revisit, model: Model, way_m: float) -> bool:
+    shift = np.linalg.norm(_moved(revisit.drift, model.state.unit_position_m[revisit.later]))
+    turn = float(se3.rotation_angle_deg(revisit.drift[:3, :3]))
+    return bool(shift <= MAX_DRIFT_M + MAX_DRIFT_PER_M * way_m and turn <= MAX_DRIFT_DEG)
+
+
+def _agree(one: Revisit, other: Revisit, model: Model) -> bool:
+    """Whether two revisits (or one and itself) are neighbours and report the same drift."""
+    near = abs(one.earlier - other.earlier) <= NEIGHBOUR_UNITS and abs(one.later - other.later) <= NEIGHBOUR_UNITS
+    if not near:
+        return False
+    at = model.state.unit_position_m[one.later]
+    shift = np.linalg.norm(_moved(one.drift, at) - _moved(other.drift, at))
+    turn = float(se3.rotation_angle_deg(one.drift[:3, :3] @ other.drift[:3, :3].T))
+    return bool(shift <= SAME_DRIFT_M and turn <= SAME_DRIFT_DEG)
+
+
+def close_loops(model: Model, revisits: Sequence[Revisit]) -> float:
+    """Move the units by a pose graph of the drive's own steps and the revisits; by how much at most, in metres.
+
+    Points stay where they are: they have to be triangulated anew.
+    """
+    poses = model.state.world_from_rig
+    units = np.flatnonzero(model.registered)
+    chain = np.stack([units[:-1], units[1:]], axis=1)
+    loops = np.array([(r.earlier, r.later) for r in revisits], dtype=np.int64).reshape(-1, 2)
+    measured = [
+        se3.inverse(poses[chain[:, 0]]) @ poses[chain[:, 1]],
+        se3.inverse(poses[loops[:, 0]]) @ np.stack([r.world_from_rig for r in revisits]),
+    ]
+    # A step over missing units is as uncertain as the units' number says.
+    steps = np.sqrt(np.diff(units).astype(np.float64))
+    edges = Edges(
+        units=np.concatenate([chain, loops]),
+        a_from_b=np.concatenate(measured),
+        sigma_rotation_rad=np.concatenate([SIGMA_STEP_ROTATION_RAD * steps, np.full(len(loops), SIGMA_LOOP_ROTATION_RAD)]),
+        sigma_translation_m=np.concatenate(
+            [SIGMA_STEP_TRANSLATION_M * steps, np.full(len(loops), SIGMA_LOOP_TRANSLATION_M)]
+        ),
+        robust=np.arange(len(chain) + len(loops)) >= len(chain),
+    )
+    closed = optimise_pose_graph(poses, edges)
+    moved = float(np.linalg.norm(closed[units, :3, 3] - poses[units, :3, 3], axis=1).max())
+    for unit in units:
+        model.set_pose(int(unit), closed[unit])
+    return moved

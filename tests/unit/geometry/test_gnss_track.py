@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.gnss_track import GnssTrack, find_gross_errors, rough_trajectory
+
+ARM_M = np.array([-0.5, 0.2, 1.8])
+
+
+def times_us(count: int, step_s: float = 0.1) -> np.ndarray:
+    return 1_700_000_000_000_000 + np.round(np.arange(count) * step_s * 1e6).astype(np.int64)
+
+
+def bend(t_us: np.ndarray, speed_mps: float = 8.0) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and headings on a circle of 40 m radius."""
+    heading = (t_us - t_us[0]) / 1e6 * speed_mps / 40.0
+    return 40.0 * np.stack([np.sin(heading), 1 - np.cos(heading), 0 * heading], 1), heading
+
+
+def track(t_us: np.ndarray, position: np.ndarray, sigma_m: float = 0.05, good: np.ndarray | None = None) -> GnssTrack:
+    return GnssTrack(
+        timestamps_us=t_us,
+        position_m=position,
+        sigma_m=np.full((len(t_us), 3), sigma_m),
+        good=np.ones(len(t_us), dtype=np.bool_) if good is None else good,
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pitfall_4_gross_errors_are_found_and_only_those(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t = times_us(120)
+    position, _ = bend(t)
+    position += rng.normal(size=position.shape) * 0.1
+    wrong = np.arange(8, 115, 13) + rng.integers(-3, 4, 9)
+    position[wrong] += rng.choice([-1.0, 1.0], (9, 3)) * rng.uniform(5, 300, (9, 3))
+    bad = find_gross_errors(t, position, np.full((120, 3), 0.1), outlier_sigmas=4.0)
+    assert sorted(np.flatnonzero(bad)) == sorted(wrong)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pitfall_4_gross_errors_in_bursts_are_all_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t = times_us(120)
+    position, _ = bend(t)
+    position += rng.normal(size=position.shape) * 0.1
+    wrong = rng.choice(120, 10, replace=False)
+    position[wrong] += rng.choice([-1.0, 1.0], (10, 3)) * rng.uniform(5, 300, (10, 3))
+    bad = find_gross_errors(t, position, np.full((120, 3), 0.1), outlier_sigmas=4.0)
+    assert bad[wrong].all()
+    # Between several wrong neighbours, and at the ends, a good sample may be lost with them.
+    assert bad.sum() - 10 <= 3
+
+
+def test_pitfall_4_a_jump_that_stays_costs_no_more_than_its_edge() -> None:
+    t = times_us(100)
+    position, _ = bend(t)
+    position[50:] += [0.0, 0.0, 30.0]
+    bad = find_gross_errors(t, position, np.full((100, 3), 0.1), outlier_sigmas=4.0)
+    assert bad.sum() <= 10
+    assert not bad[:45].any()
+    assert not bad[55:].any()
+
+
+def test_a_sharp_turn_and_a_stop_are_no_gross_errors() -> None:
+    t = times_us(80)
+    along = np.minimum(np.arange(80) * 0.5, 20.0)  # 5 m/s, then standing
+    position = np.stack([along, np.where(along > 10, along - 10, 0.0), 0 * along], 1)
+    assert not find_gross_errors(t, position, np.full((80, 3), 0.02), outlier_sigmas=4.0).any()
+
+
+def test_interpolation_is_linear_and_keeps_the_larger_sigma() -> None:
+    t = times_us(5, step_s=1.0)
+    gnss = GnssTrack(
+        timestamps_us=t,
+        position_m=np.arange(5.0)[:, None] * [1.0, 2.0, 3.0],
+        sigma_m=np.array([0.1, 0.1, 0.5, 0.1, 0.1])[:, None] * [1.0, 1.0, 2.0],
+        good=np.ones(5, dtype=np.bool_),
+    )
+    position, sigma = gnss.at(t[[0, 1, 1, 4]] + np.array([0, 250_000, 0, 0]), max_gap_us=2_000_000)
+    np.testing.assert_allclose(position, np.array([0.0, 1.25, 1.0, 4.0])[:, None] * [1.0, 2.0, 3.0], atol=1e-9)
+    np.testing.assert_allclose(sigma[1], [0.5, 0.5, 1.0])
+    np.testing.assert_allclose(sigma[0], [0.1, 0.1, 0.2])
+
+
+def test_interpolation_over_gaps_and_outside_is_nan() -> None:
+    t = times_us(10, step_s=1.0)
+    good = np.ones(10, dtype=np.bool_)
+    good[4:7] = False  # 4 s between good samples
+    gnss = track(t, np.arange(10.0)[:, None] * np.ones(3), good=good)
+    asked = np.array([t[0] - 1, t[9] + 1, t[5], t[3], t[7], t[2] + 500_000])
+    position, sigma = gnss.at(asked, max_gap_us=2_000_000)
+    assert np.isnan(position[:3]).all()
+    assert np.isnan(sigma[:3]).all()
+    np.testing.assert_allclose(position[3:, 0], [3.0, 7.0, 2.5], atol=1e-9)
+    wide, _ = gnss.at(asked, max_gap_us=5_000_000)
+    assert wide[2, 0] == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("samples", [0, 1])
+def test_a_track_of_hardly_any_samples_answers_all_the_same(samples: int) -> None:
+    t = times_us(3)
+    good = np.zeros(3, dtype=np.bool_)
+    good[:samples] = True
+    position, _ = track(t, np.ones((3, 3)), good=good).at(t, max_gap_us=2_000_000)
+    assert np.isfinite(position).all(1).sum() == samples
+
+
+def test_pitfall_4_the_rough_trajectory_applies_the_lever_arm() -> None:
+    rng = np.random.default_rng(0)
+    t = times_us(100)
+    rig, heading = bend(t)
+    rotation = se3.exp_so3(heading[:, None] * [0.0, 0.0, 1.0])
+    antenna = rig + rotation @ ARM_M + rng.normal(size=rig.shape) * 0.02
+    poses = rough_trajectory(track(t, antenna, 0.02), t, ARM_M)
+    assert poses is not None
+    inner = slice(10, 90)
+    off = np.linalg.norm(poses[inner, :3, 3] - rig[inner], axis=1)
+    assert 1e-4 < np.sqrt((off**2).mean()) < 0.15
+    assert 0.01 < se3.rotation_angle_deg(np.swapaxes(rotation, 1, 2) @ poses[:, :3, :3])[inner].max() < 6.0
+    np.testing.assert_allclose(poses[:, 2, :3], np.tile([0.0, 0.0, 1.0], (100, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("drift", [False, True])
+@pytest.mark.parametrize("sigma_m", [0.05, 1.0])
+def test_pitfall_4_a_standing_car_keeps_the_heading_it_came_with(sigma_m: float, drift: bool) -> None:
+    rng = np.random.default_rng(1)
+    t = times_us(400)
+    along = np.minimum(np.arange(400) * 0.5, 50.0)  # 5 m/s north-east for 10 s, then 30 s at a light
+    noise = rng.normal(size=(400, 3)) * sigma_m
+    if drift:  # receivers' errors change slowly, which looks like driving
+        for k in range(1, 400):
+            noise[k] = 0.98 * noise[k - 1] + 0.2 * noise[k]
+    antenna = along[:, None] * np.array([0.6, 0.8, 0.0]) + noise
+    poses = rough_trajectory(track(t, antenna, sigma_m), t, np.zeros(3))
+    assert poses is not None
+    heading = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    expected = np.degrees(np.arctan2(0.8, 0.6))
+    assert 0.01 < np.abs((heading - expected + 180) % 360 - 180).max() < (12.0 if sigma_m < 0.1 else 40.0)
+    assert np.linalg.norm(poses[-1, :3, 3] - [30.0, 40.0, 0.0]) < max(0.3, 4 * sigma_m)
+
+
+def test_pitfall_4_gross_errors_are_left_out_of_the_rough_trajectory() -> None:
+    t = times_us(60)
+    rig, heading = bend(t)
+    antenna = rig.copy()
+    antenna[20] += [100.0, 0.0, 0.0]
+    good = np.ones(60, dtype=np.bool_)
+    good[20] = False
+    poses = rough_trajectory(track(t, antenna, good=good), t, np.zeros(3))
+    assert poses is not None
+    assert np.linalg.norm(poses[:, :3, 3] - rig, axis=1).max() < 0.5
+
+
+@pytest.mark.parametrize("count", [2, 40])
+def test_no_direction_no_rough_trajectory(count: int) -> None:
+    noise = np.random.default_rng(2).normal(size=(count, 3)) * 0.02
+    assert rough_trajectory(track(times_us(count), noise), times_us(count), np.zeros(3)) is None

@@ -1,0 +1,52 @@
+"""The simulator without images."""
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.synthetic import simulate_observations
+from mrasfm_engine.synthetic.simulate import simulate_trajectory
+
+
+def test_exact_observations_are_projections() -> None:
+    s = simulate_observations(units=8, points=300, rng=np.random.default_rng(0))
+    cam_from_world = se3.inverse(s.world_from_rig[s.unit] @ s.rig_from_cam[s.camera])
+    x = se3.apply(cam_from_world, s.points_m[s.point][:, None])[:, 0]
+    k = s.camera_params[s.camera]
+    xy = x[:, :2] / x[:, 2:] * k[:, :2] + k[:, 2:]
+    assert len(xy) > 1000
+    np.testing.assert_allclose(xy, s.exact_xy_px, atol=1e-8)
+    assert x[:, 2].min() > 0.3
+
+
+def test_noise_and_outliers_are_as_asked() -> None:
+    s = simulate_observations(units=20, noise_px=0.7, outlier_fraction=0.1, rng=np.random.default_rng(1))
+    error = (s.xy_px - s.exact_xy_px)[~s.is_outlier]
+    assert 0.68 < error.std() < 0.72
+    assert 0.09 < s.is_outlier.mean() < 0.11
+    assert np.abs(s.xy_px - s.exact_xy_px)[s.is_outlier].mean() > 50
+
+
+def test_every_point_is_seen_twice_and_all_cameras_see() -> None:
+    s = simulate_observations(units=12, points=500, rng=np.random.default_rng(2))
+    assert np.bincount(s.point, minlength=len(s.points_m)).min() >= 2
+    assert (np.bincount(s.camera, minlength=6) > 50).all()
+
+
+def test_same_seed_same_numbers() -> None:
+    a, b = (simulate_observations(units=3, points=100, rng=np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(a.xy_px, b.xy_px)
+
+
+def test_winding_street_turns_and_straight_one_does_not() -> None:
+    for straight, low, high in ((False, 20.0, 40.0), (True, -1e-9, 1.0)):
+        poses = simulate_trajectory(40, straight=straight)
+        heading = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+        assert low <= np.ptp(heading) < high
+        assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) == pytest.approx(1.1, abs=0.01)
+
+
+def test_nonsense_is_refused() -> None:
+    with pytest.raises(InputError, match="cannot simulate"):
+        simulate_observations(units=0, rng=np.random.default_rng(0))
