@@ -1,5 +1,6 @@
-"""The stages of a reconstruction: each takes its input, leaves its result and a report in the store, and is skipped where
-both are there already.
+"""The stages of a reconstruction.
+
+Each takes its input, leaves its result and a report in the store, and is skipped where both are there already.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory, prior
 from mrasfm_engine.correspondence.revisits import revisit_pairs
 from mrasfm_engine.correspondence.search import match_pairs
 from mrasfm_engine.errors import CancelledError, ReconstructionError
+from mrasfm_engine.io.findings import as_json
 from mrasfm_engine.io.preflight import check_drive, require_sound
 from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
 from mrasfm_engine.registration import incremental, mapping_report
@@ -79,9 +81,7 @@ class Run:
 def preflight(run: Run) -> None:
     """Check the manifest and the files' headers; refuse what cannot work before any long work."""
     findings = check_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"))
-    run.report["findings"] = [
-        {"severity": str(f.severity), "code": f.code, "what": f.what, "remedy": f.remedy} for f in findings
-    ]
+    run.report["findings"] = [as_json(finding) for finding in findings]
     require_sound(findings)
 
 
@@ -258,6 +258,8 @@ def scene(
         progress=run.step("refinement"),
         cancel=run.cancel,
     )
+    if refinement.placement is not None:
+        run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
     run.report["stages"].append(
         {
             "stage": "refinement",

@@ -13,7 +13,7 @@ With P = d pixel / d x_cam (2x3), M = P R_c' and N = M R_u' the derivatives in t
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
 reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
 
-For every point its 3x3 block V and gradient e are eliminated on the spot: with W_i the 3-column coupling of free block i,
+For every point its 3x3 block V and gradient e are eliminated on the spot: with W_i its coupling to free block i,
 
     S_ij -= W_i V^-1 W_j'         g_i -= W_i V^-1 e
 

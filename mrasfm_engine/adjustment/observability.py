@@ -42,9 +42,9 @@ def covariances(problem: Problem, state: State) -> Covariances:
     d = 1.0 / np.sqrt(np.maximum(np.diagonal(a), 1e-300))
     scaled = a * d[:, None] * d[None, :]
     try:
-        inverse = scipy.linalg.cho_solve(scipy.linalg.cho_factor(scaled, lower=True), np.eye(len(free)))
+        inverse = np.asarray(scipy.linalg.cho_solve(scipy.linalg.cho_factor(scaled, lower=True), np.eye(len(free))))
     except np.linalg.LinAlgError:
-        inverse = np.linalg.pinv(scaled, hermitian=True)
+        inverse = np.asarray(np.linalg.pinv(scaled, hermitian=True))
     covariance = np.zeros((layout.size, layout.size))
     covariance[np.ix_(free, free)] = inverse * d[:, None] * d[None, :]
     variance = np.maximum(np.diagonal(covariance), 0.0)
@@ -69,7 +69,7 @@ def _sigma_scale(position: Floats, covariance: Floats) -> float:
     functional = np.zeros((len(position), UNIT_DOF))
     functional[:, 3:] = centred / max(float((centred**2).sum()), 1e-12)
     row = functional.ravel()
-    return float(np.sqrt(max(row @ covariance @ row, 0.0)))
+    return float(np.sqrt(max(float(row @ covariance @ row), 0.0)))
 
 
 def observed_directions(sigma_camera: Floats, sigma_rotation_rad: Floats, sigma_translation_m: Floats) -> Bools:

@@ -159,7 +159,7 @@ class PositionPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class UprightPrior:
-    """Vehicles are upright on average: roll and pitch against the vertical are zero within a road's cross fall and grade.
+    """Vehicles are upright on average: roll and pitch are zero within a road's cross fall and grade.
 
     A road's slope is common to the units of a drive, so together they count as one measurement. On a straight way this
     alone says how the scene is turned about that line.

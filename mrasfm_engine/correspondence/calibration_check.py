@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -76,12 +76,18 @@ def require_calibration_direction(
                 raise InputError(
                     "rig.cameras: rig_from_cam looks like its inverse, cam_from_rig: the first units agree "
                     f"{inverse_ok:.0%} with the inverse and {given_ok:.0%} with what is given",
-                    remedy="Give the camera's pose in the rig: its translation is where the camera sits on the vehicle.",
+                    remedy="Give the camera's pose in the rig: its translation is where the camera sits on the "
+                    "vehicle.",
                     code="calibration-inverted",
                 )
 
 
-def _motion_agreement(drive: Drive, unit: int, where, verified) -> list[float] | None:  # type: ignore[no-untyped-def]
+def _motion_agreement(
+    drive: Drive,
+    unit: int,
+    where: dict[tuple[int, int], int],
+    verified: Callable[[int, int], tuple[Floats, Floats] | None],
+) -> list[float] | None:
     """Length (0..1) of the mean of the cameras' directions of motion in the rig, as given and inverted."""
     directions = []
     for camera in range(len(drive.cameras)):

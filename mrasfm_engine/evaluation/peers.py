@@ -113,22 +113,69 @@ def _map(folder: Path, mapper: Mapper, threads: int) -> None:
     pycolmap.logging.minloglevel = 3
     out = folder / "models"
     out.mkdir()
-    database = str(folder / "features.db")
+    database = str(folder / "peer.db")
+    reference_from_rig, units = _rewrite(folder / "features.db", folder / "peer.db")
     started = time.perf_counter()
     if mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
         models = pycolmap.global_mapping(database, folder, out, _global_options(mapper, threads))
     else:
         models = pycolmap.incremental_mapping(database, folder, out, _incremental_options(mapper, threads))
     seconds = time.perf_counter() - started
-    with pycolmap.Database.open(database) as opened:
-        units = max(frame.frame_id for frame in opened.read_all_frames())
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     np.savez(
         folder / "result.npz",
         seconds=seconds,
         images=0 if largest is None else largest.num_reg_images(),
-        world_from_rig=_world_from_rig(largest, units),
+        world_from_rig=_world_from_rig(largest, units, reference_from_rig),
     )
+
+
+def _rewrite(source: Path, target: Path) -> tuple[Floats, int]:
+    """Copy a scene's database with the first camera as the rig's reference, without descriptors.
+
+    The scene's own reference is the vehicle, on which the incremental mapper finds no initial pair.
+
+    Returns
+    -------
+    tuple
+        `reference_from_rig` (4, 4), and the number of units.
+    """
+    with pycolmap.Database.open(str(source)) as old, pycolmap.Database.open(str(target)) as new:
+        for camera in old.read_all_cameras():
+            new.write_camera(camera, use_camera_id=True)
+        (vehicle,) = old.read_all_rigs()
+        sensors = sorted(vehicle.non_ref_sensors, key=lambda sensor: int(sensor.id))
+        reference_from_rig = vehicle.sensor_from_rig(sensors[0])
+        rig = pycolmap.Rig(rig_id=vehicle.rig_id)
+        rig.add_ref_sensor(sensors[0])
+        for sensor in sensors[1:]:
+            rig.add_sensor(sensor, vehicle.sensor_from_rig(sensor) * reference_from_rig.inverse())
+        new.write_rig(rig, use_rig_id=True)
+        _copy_images(old, new)
+        units = _copy_frames(old, new)
+        for pair, geometry in zip(*old.read_two_view_geometries(), strict=True):
+            images = pycolmap.pair_id_to_image_pair(pair)
+            new.write_matches(*images, geometry.inlier_matches)
+            new.write_two_view_geometry(*images, geometry)
+    matrix = reference_from_rig.matrix()
+    return se3.transform(matrix[:, :3], matrix[:, 3]), units
+
+
+def _copy_images(old: Any, new: Any) -> None:
+    for image in old.read_all_images():
+        copy = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        new.write_image(copy, use_image_id=True)
+        new.write_keypoints(image.image_id, old.read_keypoints(image.image_id))
+
+
+def _copy_frames(old: Any, new: Any) -> int:
+    frames = old.read_all_frames()
+    for frame in frames:
+        copy = pycolmap.Frame(frame_id=frame.frame_id, rig_id=frame.rig_id)
+        for item in frame.data_ids:
+            copy.add_data_id(item)
+        new.write_frame(copy, use_frame_id=True)
+    return max(int(frame.frame_id) for frame in frames)
 
 
 def _global_options(mapper: Mapper, threads: int) -> Any:
@@ -155,11 +202,12 @@ def _incremental_options(mapper: Mapper, threads: int) -> Any:
     return options
 
 
-def _world_from_rig(model: Any, units: int) -> Floats:
+def _world_from_rig(model: Any, units: int, reference_from_rig: Floats) -> Floats:
     """Poses (units, 4, 4) of a model whose frames are numbered from 1 as the scene's units are from 0."""
     poses = np.full((units, 4, 4), np.nan)
     if model is not None:
         for frame_id in model.reg_frame_ids():
-            rig_from_world = model.frame(frame_id).rig_from_world.matrix()
-            poses[frame_id - 1] = se3.inverse(se3.transform(rig_from_world[:, :3], rig_from_world[:, 3]))
+            reference_from_world = model.frame(frame_id).rig_from_world.matrix()
+            world_from_reference = se3.inverse(se3.transform(reference_from_world[:, :3], reference_from_world[:, 3]))
+            poses[frame_id - 1] = world_from_reference @ reference_from_rig
     return poses

@@ -13,8 +13,8 @@ Floats = NDArray[np.float64]
 def robust_mean_rotation(rotations: Floats, *, iterations: int = 20, epsilon_rad: float = 1e-4) -> Floats:
     """L1 mean (3, 3) of rotations (n, 3, 3) by iteratively reweighted least squares.
 
-    Source: Hartley, Aftab and Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011. The start is the
-    rotation with the smallest sum of angles to the others, so that fewer than half of them can be arbitrarily wrong.
+    Source: Hartley, Aftab and Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011. The start is
+    the rotation with the smallest sum of angles to the others, so that fewer than half can be arbitrarily wrong.
     """
     pairwise = np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None]
     mean: Floats = rotations[np.linalg.norm(se3.log_so3(pairwise), axis=-1).sum(1).argmin()]

@@ -75,7 +75,7 @@ def _line_at(dt: Floats, position: Floats) -> Floats:
     line: Floats = np.zeros((2, position.shape[1]))
     for _ in range(60):
         before = line[0]
-        line = np.linalg.lstsq(a * weights[:, None], position * weights[:, None], rcond=None)[0]
+        line = np.asarray(np.linalg.lstsq(a * weights[:, None], position * weights[:, None], rcond=None)[0])
         if np.abs(line[0] - before).max() < 0.01:
             break
         weights = 1.0 / np.sqrt(np.maximum(np.linalg.norm(position - a @ line, axis=1), 0.1))

@@ -37,6 +37,16 @@ class Finding:
         return f"{self.severity}: {self.what}\n  {self.remedy}"
 
 
+def as_json(finding: Finding) -> dict[str, str]:
+    """A finding as it stands in a report."""
+    return {
+        "severity": str(finding.severity),
+        "code": finding.code,
+        "what": finding.what,
+        "remedy": finding.remedy,
+    }
+
+
 def error(code: str, what: str, remedy: str) -> Finding:
     """A finding that stops the reconstruction."""
     return Finding(severity=Severity.ERROR, code=code, what=what, remedy=remedy)

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import secrets
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -48,12 +47,15 @@ class StageStore:
         """Arrays and report of a stage, or None where it has not been finished with this fingerprint."""
         path = self._folder / f"{name}.npz"
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            # Opened here: np.load leaves a file open that turns out not to be an archive.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 header = json.loads(str(archive["header"]))
                 if header["key"] != key:
                     return None
-                return {k: archive[k] for k in archive.files if k != "header"}, header["report"]
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+                # By name: a damaged directory can hide arrays.
+                return {name: archive[name] for name in header["arrays"]}, header["report"]
+        except Exception:
+            # On a damaged file zipfile and numpy raise a dozen kinds.
             return None
 
     def save(self, name: str, key: str, arrays: Mapping[str, NDArray[Any]], report: Mapping[str, Any]) -> None:
@@ -70,7 +72,9 @@ class StageStore:
             self._folder.mkdir(parents=True, exist_ok=True)
             try:
                 with partial.open("wb") as file:
-                    np.savez(file, header=np.array(json.dumps({"key": key, "report": report})), **dict(arrays))
+                    header = json.dumps({"key": key, "report": report, "arrays": list(arrays)})
+                    named: dict[str, Any] = {"header": np.array(header), **arrays}
+                    np.savez(file, **named)
                     file.flush()
                     os.fsync(file.fileno())
                 partial.replace(path)

@@ -2,8 +2,8 @@
 
 First one generalised PnP over all cameras. Where that fails, or a camera disagrees with it, every camera is registered
 alone, its pose turned into one of the unit through `rig_from_cam`, and the unit's pose is their robust average (MRASfM,
-section 3(a)); cameras far from it are voted out by name. Either way all images of the unit get their pose from the unit,
-also those that see too little to be registered alone.
+section 3(a)); cameras far from it are voted out by name. Either way all images of the unit get their pose from the
+unit, also those that see too little to be registered alone.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int) -> R
     if pose is not None:
         inlier = _errors_px(model, pose, seen) < MAX_ERROR_PX
     disagreeing = _disagreeing(model, seen, inlier)
-    method, voted_out = "joint", ()
+    method = "joint"
+    voted_out: tuple[str, ...] = ()
     if pose is None or disagreeing or inlier.mean() < model.config.mapping.min_pnp_inlier_ratio:
         vote, out = _vote(model, sample)
         if vote is not None:

@@ -15,6 +15,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import rotation_between
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
@@ -67,7 +68,7 @@ def align_with_gnss(
     """
     if len(antenna_m) < 3:
         return f"only {len(antenna_m)} registered units have a position at their time, 3 are needed"
-    level = se3.transform(rotation_between(_unit(up.sum(0)), np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    level = se3.transform(rotation_between(np.array([0.0, 0.0, 1.0]), _unit(up.sum(0))), np.zeros(3))
     a = se3.apply(level, antenna_m)
     spread = np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1)
     if np.sqrt((spread**2).sum()) < MIN_EXTENT_SIGMAS * float(np.median(sigma_m[:, :2])):
@@ -75,8 +76,8 @@ def align_with_gnss(
     start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng)
     if inlier.sum() < 3 or inlier.mean() < 0.3:
         return (
-            f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and longitude "
-            "swapped, or the receiver's clock off?)"
+            f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and "
+            "longitude swapped, or the receiver's clock off?)"
         )
     turned = start @ level
     pose, factor = turned, 1.0
@@ -96,6 +97,31 @@ def align_with_gnss(
         scale=_scale(se3.apply(pose, antenna_m)[inlier], measured_m[inlier], sigma_m[inlier]),
         noise_factor=factor,
     )
+
+
+def clock_offset(antenna_m: Floats, measured_m: Floats, sigma_m: Floats, times_us: Ints) -> tuple[float, float] | None:
+    """By how many seconds measured positions are ahead of aligned ones (n, 3), and the standard deviation of that.
+
+    A clock that is off moves every position along the track by speed times offset. Where the speed or the direction
+    changes, this cannot be mistaken for a shift or a turn of the whole track; else the standard deviation is large.
+    None with fewer than 5 positions.
+    """
+    if len(antenna_m) < 5:
+        return None
+    p = antenna_m
+    velocity = np.gradient(p, times_us / 1e6, axis=0)
+    centred = p - p.mean(0)
+    rows = np.zeros((len(p), 3, 5))
+    rows[:, :, 0] = velocity
+    rows[:, :, 1:4] = np.eye(3)
+    rows[:, :, 4] = np.cross([0.0, 0.0, 1.0], centred)
+    a = (rows / sigma_m[:, :, None]).reshape(-1, 5)
+    r = ((measured_m - p) / sigma_m).ravel()
+    solution, _, rank, _ = np.linalg.lstsq(a, r, rcond=None)
+    if rank < a.shape[1]:
+        return None
+    noise = max(1.0, float(np.mean((r - a @ solution) ** 2)))
+    return float(solution[0]), float(np.sqrt(noise * np.linalg.inv(a.T @ a)[0, 0]))
 
 
 def _unit(v: Floats) -> Floats:

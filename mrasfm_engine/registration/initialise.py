@@ -82,14 +82,13 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
     model.clear()
     if best is None or best[0] < MIN_POINTS:
         raise ReconstructionError(
-            f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the best "
-            f"two units share {0 if best is None else best[0]} points",
-            remedy="Check that the images show a textured scene while the car moves, that cameras and files are not mixed "
-            "up, and that intrinsics fit the images.",
+            f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the "
+            f"best two units share {0 if best is None else best[0]} points",
+            remedy="Check that the images show a textured scene while the car moves, that cameras and files are not "
+            "mixed up, and that intrinsics fit the images.",
             code="nothing-matches",
         )
-    points, result, pose_u, pose_v = best
-    del points
+    _, result, pose_u, pose_v = best
     model.set_pose(result.units[0], pose_u)
     model.set_pose(result.units[1], pose_v)
     model.triangulate()
@@ -121,26 +120,18 @@ def _proposals(
         registration = register_unit(model, v)
         if registration.world_from_rig is not None:
             yield INSIDE, registration.world_from_rig
-    relative = _generalised_relative_pose(model, pairs, u, v)
+    relative = (
+        _single_camera_relative_pose(model, pairs, u, v, prior_world_from_rig)
+        if len(model.drive.cameras) == 1
+        else _generalised_relative_pose(model, pairs, u, v)
+    )
     if relative is not None:
         yield "generalised relative pose", anchor @ relative
 
 
 def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> Floats | None:
     """rig_u_from_rig_v from matches between all cameras of the two units."""
-    rows_u, rows_v = [], []
-    for pair in pairs:
-        if {int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])} != {u, v}:
-            continue
-        a = model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]
-        b = model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]
-        if model.image_unit[pair.image_a] != u:
-            a, b = b, a
-        rows_u.append(a)
-        rows_v.append(b)
-    a, b = np.concatenate(rows_u), np.concatenate(rows_v)
-    keep = np.unique(np.linspace(0, len(a) - 1, min(len(a), MAX_RELATIVE_MATCHES)).astype(np.int64))
-    a, b = a[keep], b[keep]
+    a, b = _matches_between(model, pairs, u, v)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
     options.min_num_trials, options.max_num_trials = 100, 2000
@@ -156,6 +147,46 @@ def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: in
     if result is None or "rig2_from_rig1" not in result:
         return None
     return se3.inverse(matrix_of(result["rig2_from_rig1"]))
+
+
+def _single_camera_relative_pose(
+    model: Model, pairs: Sequence[PairMatches], u: int, v: int, prior_world_from_rig: Floats | None
+) -> Floats | None:
+    """rig_u_from_rig_v of a rig with one camera: its length is the prior's, or one metre, as images do not tell it."""
+    a, b = _matches_between(model, pairs, u, v)
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
+    camera = cameras_of(model)[0]
+    result = pycolmap.estimate_essential_matrix(
+        model.keypoints.xy_px[a], model.keypoints.xy_px[b], camera, camera, estimation_options=options
+    )
+    if result is None:
+        return None
+    length_m = 1.0
+    if prior_world_from_rig is not None:
+        length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
+    u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))
+    u_from_v[:3, 3] *= length_m / max(float(np.linalg.norm(u_from_v[:3, 3])), 1e-9)
+    rig_from_cam = model.state.rig_from_cam[0]
+    result_pose: Floats = rig_from_cam @ u_from_v @ se3.inverse(rig_from_cam)
+    return result_pose
+
+
+def _matches_between(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> tuple[Ints, Ints]:
+    """Keypoints of unit u and of unit v that match, over all cameras; a sample where there are many."""
+    rows_u, rows_v = [], []
+    for pair in pairs:
+        if {int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])} != {u, v}:
+            continue
+        a = model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]
+        b = model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]
+        if model.image_unit[pair.image_a] != u:
+            a, b = b, a
+        rows_u.append(a)
+        rows_v.append(b)
+    a, b = np.concatenate(rows_u), np.concatenate(rows_v)
+    keep = np.unique(np.linspace(0, len(a) - 1, min(len(a), MAX_RELATIVE_MATCHES)).astype(np.int64))
+    return a[keep], b[keep]
 
 
 def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int:

@@ -1,10 +1,10 @@
 """A route that returns to where it was: finding it, believing it, and closing it.
 
-The scene first grows along the drive from matches of neighbouring units alone, so that a wrong revisit cannot bend it.
-Then every pair of units that matches across a larger gap is tried: the later unit is registered against points that the
-earlier one sees. The difference to its current pose is the drift since, as this pair sees it. Drift changes slowly, so a
-revisit is believed where several pairs of neighbouring units report the same drift, and that drift is plausible for the
-way in between. A pose graph then spreads it over the loop.
+The scene first grows along the drive from matches of neighbouring units alone, so that no wrong revisit bends it. Then
+every pair of units that matches across a larger gap is tried: the later unit is registered against points that the
+earlier one sees. The difference to its current pose is the drift since, as this pair sees it. Drift changes slowly: a
+revisit is believed where several pairs of neighbouring units report the same drift, and where that drift is plausible
+for the way in between. A pose graph then spreads it over the loop.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def split_pairs(
     pairs: Sequence[PairMatches], image_unit: Ints, window_units: int
 ) -> tuple[list[PairMatches], list[PairMatches]]:
     """Pairs of neighbouring units, and pairs across larger gaps."""
-    near, far = [], []
+    near: list[PairMatches] = []
+    far: list[PairMatches] = []
     for pair in pairs:
         gap = abs(int(image_unit[pair.image_a]) - int(image_unit[pair.image_b]))
         (near if gap <= window_units else far).append(pair)
@@ -140,7 +141,9 @@ def close_loops(model: Model, revisits: Sequence[Revisit]) -> float:
     edges = Edges(
         units=np.concatenate([chain, loops]),
         a_from_b=np.concatenate(measured),
-        sigma_rotation_rad=np.concatenate([SIGMA_STEP_ROTATION_RAD * steps, np.full(len(loops), SIGMA_LOOP_ROTATION_RAD)]),
+        sigma_rotation_rad=np.concatenate(
+            [SIGMA_STEP_ROTATION_RAD * steps, np.full(len(loops), SIGMA_LOOP_ROTATION_RAD)]
+        ),
         sigma_translation_m=np.concatenate(
             [SIGMA_STEP_TRANSLATION_M * steps, np.full(len(loops), SIGMA_LOOP_TRANSLATION_M)]
         ),

@@ -22,7 +22,7 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         {
             "unit": int(u),
             "source_frame": frames[u].source_frame,
-            "reason": log.failures[u].reason if u in log.failures else "it sees no point of the scene",
+            "reason": log.failures[int(u)].reason if int(u) in log.failures else "it sees no point of the scene",
         }
         for u in np.flatnonzero(~model.registered)
     ]
@@ -48,7 +48,8 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
 
 def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     """Alignment, adjustments and certainty of the last stage."""
-    alignment, certainty = refinement.alignment, refinement.certainty
+    placement, certainty = refinement.placement, refinement.certainty
+    alignment = None if placement is None else placement.alignment
     free = refinement.calibration_free
     result: dict[str, Any] = {
         "points": int(model.solved.sum()),
@@ -61,15 +62,15 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
             "reason": _why_calibration(model, refinement),
             "heading_change_deg": heading_change_deg(model),
         },
-        "georeferenced": alignment is not None,
+        "georeferenced": refinement.georeferenced,
     }
     if certainty is not None and np.isfinite(certainty.sigma_scale):
         result["scale"] = {
             "sigma_relative": certainty.sigma_scale,
             "from": "baselines of the rig and GNSS" if alignment is not None else "baselines of the rig",
         }
-    if alignment is not None:
-        times = model.drive.timestamps_us[refinement.gnss_units[~alignment.inlier]]
+    if placement is not None and alignment is not None:
+        times = model.drive.timestamps_us[placement.units[~alignment.inlier]]
         result["gnss"] = {
             "units_used": int(alignment.inlier.sum()),
             "outliers_at_us": [int(t) for t in times],
@@ -77,16 +78,14 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
             "noise_factor": alignment.noise_factor,
             "scale_of_rig_against_gnss": alignment.scale,
         }
-    elif refinement.not_georeferenced:
-        result["gnss"] = {"not_used": refinement.not_georeferenced}
+    elif placement is not None:
+        result["gnss"] = {"not_used": placement.reason}
     return result
 
 
 def _why_calibration(model: Model, refinement: Refinement) -> str:
     if refinement.calibration_free:
-        return (
-            "GNSS makes it observable" if refinement.alignment is not None else "the drive turns enough to observe it"
-        )
+        return "GNSS makes it observable" if refinement.georeferenced else "the drive turns enough to observe it"
     if not model.config.adjustment.refine_calibration:
         return "held by the settings"
     if len(model.drive.cameras) < 2:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,9 +68,7 @@ class Model:
         order = np.argsort(keypoints.unit, kind="stable")
         bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
         tracked = tracks.of_keypoint >= 0
-        self.rows_of_unit = [
-            rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in zip(bounds[:-1], bounds[1:], strict=True))
-        ]
+        self.rows_of_unit = [rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in pairwise(bounds))]
 
     def set_pose(self, unit: int, world_from_rig: Floats) -> None:
         """Give a unit a pose and count it as registered."""

@@ -26,7 +26,9 @@ class Edges:
     robust: NDArray[np.bool_]  # (n,) with a Cauchy loss: the measurement may be wrong
 
 
-def optimise_pose_graph(world_from_rig: Floats, edges: Edges, *, iterations: int = 30, loss_scale: float = 3.0) -> Floats:
+def optimise_pose_graph(
+    world_from_rig: Floats, edges: Edges, *, iterations: int = 30, loss_scale: float = 3.0
+) -> Floats:
     """Poses (n, 4, 4) that agree best with the edges; the first unit of the first edge stays where it is.
 
     Gauss-Newton with a sparse direct factorisation. With steps omega, tau in world axes as in `adjustment.problem`, the
@@ -42,14 +44,17 @@ def optimise_pose_graph(world_from_rig: Floats, edges: Edges, *, iterations: int
     moving = used[used != edges.units[0, 0]]
     column[moving] = np.arange(len(moving))
     sigma = np.concatenate(
-        [np.repeat(edges.sigma_rotation_rad[:, None], 3, 1), np.repeat(edges.sigma_translation_m[:, None], 3, 1)], axis=1
+        [np.repeat(edges.sigma_rotation_rad[:, None], 3, 1), np.repeat(edges.sigma_translation_m[:, None], 3, 1)],
+        axis=1,
     )
     for _ in range(iterations):
         residual, jacobian_a, jacobian_b = _linearise(rotation, position, edges)
         r = residual / sigma
         weight = np.where(edges.robust, 1.0 / (1.0 + (r**2).sum(1) / loss_scale**2), 1.0)
         scale = np.sqrt(weight)[:, None] / sigma
-        step = _solve(residual * scale, jacobian_a * scale[..., None], jacobian_b * scale[..., None], column[a], column[b])
+        step = _solve(
+            residual * scale, jacobian_a * scale[..., None], jacobian_b * scale[..., None], column[a], column[b]
+        )
         step = step.reshape(-1, 6)
         rotation[moving] = se3.exp_so3(step[:, :3]) @ rotation[moving]
         position[moving] += step[:, 3:]

@@ -11,17 +11,11 @@ from numpy.typing import NDArray
 from mrasfm_engine.adjustment.observability import Covariances, covariances
 from mrasfm_engine.adjustment.priors import FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
-from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
-from mrasfm_engine.registration.georeference import (
-    SIGMA_PITCH_RAD,
-    SIGMA_ROLL_RAD,
-    GnssAlignment,
-    align_with_gnss,
-)
+from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.incremental import calibration_is_free, calibration_prior
 from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,15 +33,18 @@ class Refinement:
     """What the last stage did."""
 
     sigma_px: float = 1.0
-    alignment: GnssAlignment | None = None
-    gnss_units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # units that took part in aligning
-    not_georeferenced: str = ""
+    placement: Placement | None = None  # by GNSS, where it was to be used
     calibration_free: bool = False
     focal_free: bool = False
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
     points_dropped: int = 0
     certainty: Covariances | None = None
+
+    @property
+    def georeferenced(self) -> bool:
+        """Whether the scene stands where the receiver says."""
+        return self.placement is not None and self.placement.prior is not None
 
 
 def refine(
@@ -71,9 +68,10 @@ def refine(
     result = Refinement()
     positions = None
     if gnss is not None and antenna_in_rig_m is not None:
-        positions = _georeference(model, gnss, antenna_in_rig_m, result)
+        result.placement = place_by_gnss(model, gnss, antenna_in_rig_m)
+        positions = result.placement.prior
     if positions is None and rough_world_from_rig is not None:
-        _move(model, _rough_alignment(model, rough_world_from_rig))
+        place_by_rough_poses(model, rough_world_from_rig)
     result.calibration_free = calibration_is_free(model, georeferenced=positions is not None)
     result.focal_free = model.config.adjustment.refine_focal and result.calibration_free
     for done in range(ROUNDS):
@@ -131,58 +129,6 @@ def _observation_sigma(model: Model) -> float:
     return float(np.clip(sigma, *SIGMA_PX_RANGE))
 
 
-def _georeference(model: Model, gnss: GnssTrack, antenna: Floats, result: Refinement) -> PositionPrior | None:
-    """Move the model into the receiver's frame; the prior for the adjustment, or None with the reason noted."""
-    settings = model.config.gnss
-    times = model.drive.timestamps_us
-    measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
-    units = np.flatnonzero(model.registered & np.isfinite(measured[:, 0]))
-    rotation = model.state.unit_rotation[units]
-    alignment = align_with_gnss(
-        model.state.unit_position_m[units] + rotation @ antenna,
-        rotation[:, :, 2],
-        rotation[:, :, 0],
-        measured[units],
-        sigma[units],
-        outlier_sigmas=settings.outlier_sigmas,
-        rng=np.random.default_rng(model.config.seed),
-    )
-    if isinstance(alignment, str):
-        result.not_georeferenced = alignment
-        return None
-    _move(model, alignment.world_from_model)
-    result.alignment, result.gnss_units = alignment, units
-    good = units[alignment.inlier]
-    inflation = alignment.noise_factor * np.sqrt(
-        _samples_per_correlation_time(times[good], settings.correlation_time_s)
-    )
-    return PositionPrior(
-        unit=good, position_m=measured[good], sigma_m=sigma[good] * inflation, lever_arm_m=np.asarray(antenna)
-    )
-
-
-def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> float:
-    """How many samples share one error, as errors of a receiver change slowly: their information counts once."""
-    if len(times_us) < 2:
-        return 1.0
-    return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
-
-
-def _rough_alignment(model: Model, rough_world_from_rig: Floats) -> Floats:
-    """Rigid transform from the model's frame to that of the rough poses, by the units' own rotations."""
-    units = np.flatnonzero(model.registered)
-    rough, own = rough_world_from_rig[units], model.state.world_from_rig[units]
-    rotation = robust_mean_rotation(rough[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
-    return se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T))
-
-
-def _move(model: Model, world_from_model: Floats) -> None:
-    state = model.state
-    state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
-    state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)
-    state.points_m[:] = se3.apply(world_from_model, state.points_m)
-
-
 def _terms(model: Model, positions: PositionPrior | None, result: Refinement) -> list[Term]:
     terms: list[Term] = []
     if result.calibration_free:
@@ -208,17 +154,18 @@ def _focal_prior(model: Model) -> FocalPrior:
 
 
 def _certainty(model: Model, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
-    """Covariances with the calibration free under its prior, also where it was held: its error is there all the same."""
+    """Covariances with the calibration free under its prior, also where it was held: its error is there as well."""
     several = len(model.drive.cameras) > 1
-    problem, tracks = model.problem(
+    terms = _terms(model, positions, result)
+    if several and not result.calibration_free:
+        terms.append(calibration_prior(model))
+    problem, _ = model.problem(
         _free_units(model, georeferenced=positions is not None),
         free_cameras=np.full(len(model.camera_kind), several),
         free_focal=result.focal_free,
-        terms=_terms(model, positions, result)
-        + ([] if result.calibration_free or not several else [calibration_prior(model)]),
+        terms=terms,
         options=_options(model, result.sigma_px, iterations=1),
     )
-    del tracks
     if problem.layout.size > MAX_RANK_FOR_COVARIANCE:
         return None
     return covariances(problem, problem.state)

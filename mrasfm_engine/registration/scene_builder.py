@@ -41,7 +41,7 @@ def build_scene(
     sigma = np.full((units, 3), np.nan)
     if refinement.certainty is not None:
         sigma = refinement.certainty.sigma_unit_position_m
-    georeferenced = refinement.alignment is not None
+    georeferenced = refinement.georeferenced
     return Scene(
         drive=model.drive,
         unit_registered=model.registered.copy(),

@@ -28,7 +28,7 @@ MIN_DEPTH_M = 0.05
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, work: Any, proj: Any) -> float:
+def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, work: Any, proj: Any) -> Any:
     """Squared reprojection error of x under cam_from_world (r, t); huge behind the camera."""
     for i in range(3):
         cam[i] = r[i, 0] * x[0] + r[i, 1] * x[1] + r[i, 2] * x[2] + t[i]
@@ -40,8 +40,8 @@ def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, w
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _refine(
-    count: int, use: Any, members: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any, params: Any,
-    x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
+    count: int, use: Any, members: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any,
+    params: Any, x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
 ) -> None:  # fmt: skip
     """A few Gauss-Newton steps on a point with Cauchy weights over the observations in use."""
     for _ in range(4):
@@ -87,7 +87,8 @@ def _refine(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _triangulate(
     which: Any, first: Any, track_keypoints: Any, image: Any, camera: Any, xy: Any, rays: Any, usable: Any,
-    cfw_r: Any, cfw_t: Any, kind: Any, params: Any, max_error2: float, min_angle: float, points: Any, solved: Any, kept: Any,
+    cfw_r: Any, cfw_t: Any, kind: Any, params: Any, max_error2: float, min_angle: float,
+    points: Any, solved: Any, kept: Any,
 ) -> None:  # fmt: skip
     members, use = np.empty(MAX_OBSERVATIONS, np.int64), np.empty(MAX_OBSERVATIONS, np.bool_)
     origin, direction = np.empty((MAX_OBSERVATIONS, 3)), np.empty((MAX_OBSERVATIONS, 3))

@@ -56,7 +56,7 @@ def all_terms(case: Case) -> list[CalibrationPrior | PositionPrior | UprightPrio
         FocalPrior(focal_px=truth.camera_params[:, 0], sigma=np.full(len(truth.camera_params), 0.002)),
         PositionPrior(
             unit=units,
-            position_m=truth.unit_position_m + [0.1, -0.2, 0.3],
+            position_m=truth.unit_position_m + np.array([0.1, -0.2, 0.3]),
             sigma_m=np.tile([0.05, 0.06, 0.1], (len(units), 1)),
             lever_arm_m=np.array([-0.5, 0.3, 1.8]),
         ),

@@ -219,7 +219,7 @@ def test_corrections_are_in_rig_axes() -> None:
     state = replace(
         case.truth,
         camera_rotation=step @ case.truth.camera_rotation,
-        camera_position_m=case.truth.camera_position_m + [0.01, 0.02, 0.03],
+        camera_position_m=case.truth.camera_position_m + np.array([0.01, 0.02, 0.03]),
     )
     expected = np.concatenate([np.radians([0.1, 0.2, -0.3]), [0.01, 0.02, 0.03]])
     corrections = calibration_prior(case.truth).corrections(state)
@@ -284,7 +284,7 @@ def test_pitfall_9_one_bad_camera_is_found_and_the_others_keep_their_places_to_e
     assert np.delete(corrections, 3).max() < 0.6
 
 
-@pytest.mark.xfail(reason="the gauge's weights compare with the prior's sigma: 3 deg pull all cameras by 0.41 deg")
+@pytest.mark.xfail(strict=True, reason="the gauge's weights compare with the prior's sigma: 3 deg pull all by 0.41")
 @pytest.mark.parametrize("axis", range(3))
 def test_pitfall_9_one_bad_camera_does_not_pull_the_others(axis: int) -> None:
     case, _, solution, _ = solve_with_bad_camera(axis, 3.0)
@@ -292,7 +292,7 @@ def test_pitfall_9_one_bad_camera_does_not_pull_the_others(axis: int) -> None:
     assert 1e-4 < errors.max() < 0.1
 
 
-@pytest.mark.xfail(reason="the gauge's weights change within a step, which the step does not know: 100 iterations")
+@pytest.mark.xfail(strict=True, reason="the gauge's weights change within a step: 100 iterations and no end")
 def test_a_very_bad_camera_does_not_keep_the_solver_from_converging() -> None:
     case, _, solution, report = solve_with_bad_camera(2, 10.0)
     assert report.termination is Termination.CONVERGED

@@ -11,9 +11,7 @@ from mrasfm_engine.scene.scene import ImageFeatures
 
 def features(descriptors: np.ndarray) -> ImageFeatures:
     n = len(descriptors)
-    return ImageFeatures(
-        xy_px=np.zeros((n, 2), np.float32), descriptors=descriptors, colors=np.zeros((n, 3), np.uint8)
-    )
+    return ImageFeatures(xy_px=np.zeros((n, 2), np.float32), descriptors=descriptors, colors=np.zeros((n, 3), np.uint8))
 
 
 def brute_force(similarity: np.ndarray, ratio: float) -> list[tuple[int, int]]:
@@ -50,11 +48,15 @@ def test_planted_matches_are_found_and_nothing_else() -> None:
     assert sorted(map(tuple, matches.tolist())) == sorted(zip(order.tolist(), range(120), strict=True))
 
 
-def test_repeated_descriptors_do_not_match() -> None:
-    d = random_descriptors(30, np.random.default_rng(2))
+def test_pitfall_7_what_repeats_does_not_match() -> None:
+    rng = np.random.default_rng(2)
+    d = random_descriptors(30, rng)
+    alike = [np.clip(d.astype(int) + rng.integers(-6, 7, d.shape), 0, 255).astype(np.uint8) for _ in range(2)]
     matcher = NearestNeighbourMatcher(MatchConfig())
-    twice = matcher.prepare(features(np.concatenate([d, d])))
-    assert len(matcher.match(matcher.prepare(features(d)), twice)) == 0
+    twice, once = (matcher.prepare(features(np.concatenate(f))) for f in (alike, alike[:1]))
+    prepared = matcher.prepare(features(d))
+    assert len(matcher.match(prepared, twice)) < 3
+    assert len(matcher.match(prepared, once)) == 30
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 50), (50, 0), (1, 50), (50, 1), (2, 2)])

@@ -54,7 +54,7 @@ def test_cameras_back_to_back_apart_do_not_overlap() -> None:
 
 
 def test_a_turn_by_half_the_view_halves_the_overlap() -> None:
-    # 90 degrees across; 5 rays across at -38.7, -21.8, 0, 21.8, 38.7 degrees: turned by 45, two and a half of five stay.
+    # 90 degrees across; of 5 rays across at -38.7, -21.8, 0, 21.8, 38.7 degrees, two and a half stay.
     assert 0.3 < overlap(camera_at(), camera_at(yaw_deg=45.0))[0] < 0.65
 
 

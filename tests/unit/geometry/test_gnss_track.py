@@ -144,7 +144,7 @@ def test_pitfall_4_a_standing_car_keeps_the_heading_it_came_with(sigma_m: float,
 
 def test_pitfall_4_gross_errors_are_left_out_of_the_rough_trajectory() -> None:
     t = times_us(60)
-    rig, heading = bend(t)
+    rig, _ = bend(t)
     antenna = rig.copy()
     antenna[20] += [100.0, 0.0, 0.0]
     good = np.ones(60, dtype=np.bool_)

@@ -196,5 +196,3 @@ def scaled_rig(rig_from_cam: np.ndarray, scale: float) -> np.ndarray:
 def inverted(rig_from_cam: np.ndarray) -> np.ndarray:
     """The mistake of the trade: cam_from_rig where rig_from_cam is asked for."""
     return se3.inverse(rig_from_cam)
-
-

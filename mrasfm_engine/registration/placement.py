@@ -1,0 +1,141 @@
+"""Moving the model to where the receiver, or rough poses, say that it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.priors import PositionPrior
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
+from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.io.findings import Finding, warning
+from mrasfm_engine.registration.georeference import GnssAlignment, align_with_gnss, clock_offset
+from mrasfm_engine.registration.model import Model
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MIN_CLOCK_OFFSET_S = 0.05
+CLOCK_OFFSET_SIGMAS = 5.0
+MAX_SCALE_DISAGREEMENT = 0.05
+SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
+
+
+@dataclass(kw_only=True)
+class Placement:
+    """How the model fits the receiver's positions; without a prior it does not, and the reason says why."""
+
+    prior: PositionPrior | None = None
+    reason: str = ""
+    alignment: GnssAlignment | None = None
+    units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that took part in aligning
+    findings: list[Finding] = field(default_factory=list)  # what a user should look at
+
+
+def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Placement:
+    """Move the model into the receiver's frame, and make its positions a prior for the adjustment.
+
+    The model keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
+    """
+    settings, times = model.config.gnss, model.drive.timestamps_us
+    measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
+    units = np.flatnonzero(model.registered & np.isfinite(measured[:, 0]))
+    single = len(model.drive.cameras) == 1
+    if single and len(units) > 1:
+        _scale(model, _extent(measured[units]) / _extent(model.state.unit_position_m[units]))
+    alignment: GnssAlignment | str = ""
+    for _ in range(SCALE_ROUNDS if single else 1):
+        rotation = model.state.unit_rotation[units]
+        alignment = align_with_gnss(
+            model.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
+            rotation[:, :, 2],
+            rotation[:, :, 0],
+            measured[units],
+            sigma[units],
+            outlier_sigmas=settings.outlier_sigmas,
+            rng=np.random.default_rng(model.config.seed),
+        )
+        if isinstance(alignment, str):
+            return Placement(reason=alignment)
+        _move(model, alignment.world_from_model)
+        if single:
+            _scale(model, alignment.scale)
+    assert not isinstance(alignment, str)
+    good = units[alignment.inlier]
+    correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
+    prior = PositionPrior(
+        unit=good,
+        position_m=measured[good],
+        sigma_m=sigma[good] * alignment.noise_factor * np.sqrt(correlated),
+        lever_arm_m=np.asarray(antenna_in_rig_m),
+    )
+    findings = [] if single else _findings(model, alignment, prior)
+    return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
+
+
+def place_by_rough_poses(model: Model, rough_world_from_rig: Floats) -> None:
+    """Move the model into the frame of the rough poses (units, 4, 4), by the units' own rotations."""
+    units = np.flatnonzero(model.registered)
+    rough, own = rough_world_from_rig[units], model.state.world_from_rig[units]
+    if len(model.drive.cameras) == 1 and len(units) > 1:
+        _scale(model, _extent(rough[:, :3, 3]) / _extent(own[:, :3, 3]))
+        own = model.state.world_from_rig[units]
+    rotation = robust_mean_rotation(rough[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
+    _move(model, se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T)))
+
+
+def _extent(position_m: Floats) -> float:
+    """Median distance of positions from their median: a size that single wrong ones do not change."""
+    return max(float(np.median(np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1))), 1e-9)
+
+
+def _move(model: Model, world_from_model: Floats) -> None:
+    state = model.state
+    state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
+    state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)
+    state.points_m[:] = se3.apply(world_from_model, state.points_m)
+
+
+def _scale(model: Model, factor: float) -> None:
+    """Scale a model whose only camera leaves the images unchanged by it, if the camera sits at the rig's origin or the
+    lever arm is small; adjustment settles the rest.
+    """
+    model.state.unit_position_m[:] *= factor
+    model.state.points_m[:] *= factor
+
+
+def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> float:
+    """How many samples share one error, as errors of a receiver change slowly: their information counts once."""
+    if len(times_us) < 2:
+        return 1.0
+    return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
+
+
+def _findings(model: Model, alignment: GnssAlignment, prior: PositionPrior) -> list[Finding]:
+    """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
+    findings = []
+    units = prior.unit
+    antenna = model.state.unit_position_m[units] + model.state.unit_rotation[units] @ prior.lever_arm_m
+    offset = clock_offset(antenna, prior.position_m, prior.sigma_m, model.drive.timestamps_us[units])
+    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
+        direction = "ahead of" if offset[0] > 0 else "behind"
+        findings.append(
+            warning(
+                "gnss-clock-offset",
+                f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
+                f"(sigma {offset[1]:.2f} s)",
+                "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
+            )
+        )
+    if abs(alignment.scale - 1.0) > MAX_SCALE_DISAGREEMENT:
+        findings.append(
+            warning(
+                "scale-disagreement",
+                f"GNSS makes the way {alignment.scale:.3f} times as long as the rig does",
+                "Check the baselines in rig.cameras (metres), and the receiver's positions.",
+            )
+        )
+    return findings

@@ -1,0 +1,130 @@
+"""Line 3: rendered drives whose truth is known exactly. The worst of all seeds counts."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mrasfm_engine.evaluation.cameras import compare_calibrations
+from mrasfm_engine.geometry.alignment import align_rigid
+from mrasfm_engine.io.read_scene import read_calibration, read_poses
+from mrasfm_engine.io.trajectory_file import read_tum
+from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.table import Figure, exactly
+
+SEEDS = (1, 2, 3, 4, 5)
+CAMERAS, UNITS = 6, 40
+LOOP_UNITS = 64
+LOOP_SPACING_M = 2.0
+FIRST_UNITS = 5  # on which the loop is aligned
+PERTURBATION = ("--perturb-rotation-deg", 0.3, "--perturb-translation-m", 0.02)
+# What `mrasfm synth --tight` declares.
+TIGHT = {"sigma_rotation_deg": 0.01, "sigma_translation_m": 0.001}
+
+
+def rendered(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
+    """Line 3."""
+    for seed in seeds:
+        drive = work / f"seed {seed}"
+        mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", seed, *PERTURBATION, "--out", drive)
+        yield from perturbed(drive, work / f"seed {seed} perturbed scene", seed)
+        yield from tight(_with_true_calibration(drive, work / f"seed {seed} tight"), work / f"seed {seed} tight scene")
+        for folder in work.glob(f"seed {seed}*"):
+            shutil.rmtree(folder)
+    for seed in seeds:
+        drive = work / f"loop {seed}"
+        route = ("--world", "loop", "--units", LOOP_UNITS, "--spacing-m", LOOP_SPACING_M)
+        mrasfm("synth", "--cameras", CAMERAS, "--seed", seed, *route, "--no-masks", "--tight", "--out", drive)
+        yield from loop(drive, work / f"loop {seed} scene", seed)
+        for folder in work.glob(f"loop {seed}*"):
+            shutil.rmtree(folder)
+
+
+def perturbed(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:
+    """Line 3a: the calibration is found again, and the scale is as good as the report says."""
+    mrasfm("reconstruct", drive, "--out", scene)
+    errors = evaluate(scene, drive)
+    title = f"seed {seed}, calibration off by 0.3 deg and 2 cm"
+    yield exactly("3a", f"{title}: images registered", errors["registered_images"], CAMERAS * UNITS)
+    similarity = errors["similarity"]
+    yield Figure(line="3a", what=f"{title}: similarity RMSE", value=similarity["rmse_m"], unit="m", most=0.03)
+    pairs = compare_calibrations(
+        read_calibration(scene / "calibration.json"), read_calibration(drive / "truth_calibration.json")
+    )
+    worst = max(pairs, key=lambda pair: pair.rotation_deg)
+    yield Figure(
+        line="3a",
+        what=f"{title}: worst relative rotation ({worst.camera_a}, {worst.camera_b})",
+        value=worst.rotation_deg,
+        unit="deg",
+        most=0.05,
+    )
+    sigma = read_report(scene)["by_stage"]["refinement"]["scale"]["sigma_relative"]
+    yield Figure(line="3a", what=f"{title}: sigma of the scale, as reported", value=100 * sigma, unit="%")
+    yield Figure(
+        line="3a",
+        what=f"{title}: error of the scale in sigmas",
+        value=abs(similarity["scale"] - 1) / sigma,
+        most=3.0,
+    )
+
+
+def tight(drive: Path, scene: Path) -> Iterator[Figure]:
+    """Line 3b: with a calibration known to 0.01 deg and 1 mm the scale is that of the rig."""
+    mrasfm("reconstruct", drive, "--out", scene)
+    errors = evaluate(scene, drive)
+    yield exactly("3b", f"{drive.name}: images registered", errors["registered_images"], CAMERAS * UNITS)
+    yield Figure(line="3b", what=f"{drive.name}: metric RMSE", value=errors["metric"]["rmse_m"], unit="m", most=0.05)
+
+
+def _with_true_calibration(drive: Path, out: Path) -> Path:
+    """The drive that `synth --tight` would render without the perturbation: the same images under another manifest."""
+    shutil.copytree(drive, out, copy_function=os.link)
+    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+    truth = json.loads((drive / "truth_calibration.json").read_text(encoding="utf-8"))
+    for camera in manifest["rig"]["cameras"]:
+        camera |= {"rig_from_cam": truth[camera["name"]], **TIGHT}
+    (out / "drive.json").unlink()  # a link to the other drive's
+    (out / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return out
+
+
+def loop(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:
+    """Line 3c: a route that returns, without GNSS."""
+    mrasfm("reconstruct", drive, "--out", scene, "--no-gnss")
+    poses = read_poses(scene)
+    yield exactly("3c", f"loop {seed}: units registered", len(poses.trajectory.timestamps_us), LOOP_UNITS)
+    if len(poses.trajectory.timestamps_us) < LOOP_UNITS:
+        return
+    truth = read_tum(drive / "truth.tum").world_from_rig
+    length_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    error_m = end_error_m(poses.trajectory.world_from_rig, truth)
+    yield Figure(line="3c", what=f"loop {seed}: length of the way", value=length_m, unit="m")
+    yield Figure(
+        line="3c",
+        what=f"loop {seed}: error at the end, of the way's length (aligned on the first {FIRST_UNITS} units)",
+        value=100 * error_m / length_m,
+        unit="%",
+        most=0.2,
+    )
+
+
+def end_error_m(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Distance of the last unit from its true place, after a rigid alignment on the first units' poses.
+
+    Aligned are the first units' positions and points 10 m along each of their axes, so that rotations count as well: a
+    few positions on a line leave the roll about it free.
+    """
+    arms = np.concatenate([np.zeros((1, 3)), 10 * np.eye(3)])
+
+    def points(poses: np.ndarray) -> np.ndarray:
+        first = poses[:FIRST_UNITS]
+        return (np.einsum("nij,kj->nki", first[:, :3, :3], arms) + first[:, None, :3, 3]).reshape(-1, 3)
+
+    aligned = align_rigid(points(truth), points(estimate)).a_from_b @ estimate[-1]
+    return float(np.linalg.norm(aligned[:3, 3] - truth[-1, :3, 3]))

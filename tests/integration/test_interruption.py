@@ -1,0 +1,72 @@
+"""Ctrl-C and a full disk leave nothing half-written, and the next run goes on from there."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from mrasfm_engine.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from tests.integration.conftest import Ran, Variant, leftovers, mrasfm_process, read_report
+
+Run = Callable[..., Ran]
+
+
+def _wait_for(path: Path, seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < end, f"{path} did not appear"
+        time.sleep(0.02)
+
+
+def test_interrupted_run_resumes(variant: Variant, mrasfm: Run) -> None:
+    variant.keep(cameras=["front", "left"], units=5).save()
+    process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene)
+    _wait_for(variant.scene / ".stages" / "features.npz")
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == EXIT_INTERRUPTED
+    assert "Traceback" not in errors
+    assert "cancelled" in errors
+    assert {path.name for path in variant.scene.iterdir()} == {".stages"}
+    assert leftovers(variant.scene.parent) == []
+    result = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    assert result.code == 0
+    stages = read_report(variant.scene)["by_stage"]
+    assert stages["features"]["reused"]
+    assert not stages["mapping"]["reused"]
+
+
+def _small_files() -> None:
+    """As a full disk: writing beyond 200 kB fails, with an error and not with a signal."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+
+
+def test_full_disk(variant: Variant) -> None:
+    variant.keep(cameras=["front", "left"], units=3).save()
+    process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene, preexec_fn=_small_files)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == EXIT_BAD_INPUT
+    assert "Traceback" not in errors
+    assert "cannot write" in errors or "no space left" in errors
+    assert leftovers(variant.scene.parent) == []
+    assert list(variant.scene.rglob("*.npz")) == []
+
+
+def test_disk_fills_while_the_scene_is_written(surround_drive: Path, variant: Variant, mrasfm: Run) -> None:
+    """The stages are kept, and of the scene there is nothing."""
+    variant.keep(cameras=["front", "left"], units=3).save()
+    assert mrasfm("reconstruct", variant.root, "--out", variant.scene).code == 0
+    stages = variant.scene / ".stages"
+    other = variant.scene.parent / "other"
+    other.mkdir()
+    stages.rename(other / ".stages")
+    process = mrasfm_process("reconstruct", variant.root, "--out", other, preexec_fn=_small_files)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == EXIT_BAD_INPUT
+    assert "Traceback" not in errors
+    assert "cannot be written" in errors
+    assert {path.name for path in other.iterdir()} == {".stages"}

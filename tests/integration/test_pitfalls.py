@@ -1,0 +1,77 @@
+"""What drives do to a reconstruction (pitfalls of the method), each on a small rendered drive."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.integration.conftest import Ran, Variant, read_report, synth
+
+Run = Callable[..., Ran]
+
+
+def reconstructed(run: Run, drive: Path, scene: Path, *options: str) -> dict:  # type: ignore[type-arg]
+    """Errors of the scene against the truth."""
+    result = run("reconstruct", drive, "--out", scene, *options)
+    assert result.code == 0, result.err
+    evaluated = run("evaluate", scene, "--truth", drive / "truth.tum", "--json")
+    errors: dict = json.loads(evaluated.out)  # type: ignore[type-arg]
+    return errors
+
+
+def test_standing_car_and_missing_images(tmp_path: Path, mrasfm: Run) -> None:
+    drive = synth(
+        tmp_path / "drive", "--cameras", 3, "--units", 10, "--standing", 4, "--drop-images", 0.15, "--seed", 5
+    )
+    errors = reconstructed(mrasfm, drive, tmp_path / "scene")
+    assert errors["registered_units"] == 10
+    assert errors["registered_images"] == errors["total_images"] < 30
+    assert 0 < errors["metric"]["rmse_m"] < 0.15
+    assert 0 < errors["similarity"]["rmse_m"] < 0.03
+
+
+def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None:
+    drive = synth(
+        tmp_path / "drive", "--cameras", 4, "--units", 8, "--moving-cars", 8, "--occlude", "left", "--seed", 6
+    )
+    errors = reconstructed(mrasfm, drive, tmp_path / "scene")
+    assert errors["registered_units"] == 8
+    assert 0 < errors["metric"]["rmse_m"] < 0.15
+    assert 0 < errors["similarity"]["rmse_m"] < 0.03
+
+
+def test_cameras_that_are_not_simultaneous(tmp_path: Path, mrasfm: Run) -> None:
+    drive = synth(tmp_path / "drive", "--cameras", 3, "--units", 6, "--time-skew-ms", 40, "--seed", 7)
+    errors = reconstructed(mrasfm, drive, tmp_path / "scene")
+    assert errors["registered_units"] == 6
+    assert 0 < errors["metric"]["rmse_m"] < 1.0  # not compensated: up to 0.2 m of way between cameras
+
+
+def test_opposite_gnss_outliers(variant: Variant, mrasfm: Run) -> None:
+    """Two samples that are 55 m off in opposite directions, whose mean looks right."""
+    samples = variant.document["gnss"]["samples"]
+    samples[2]["latitude_deg"] += 5e-4
+    samples[5]["latitude_deg"] -= 5e-4
+    errors = reconstructed(mrasfm, variant.save().root, variant.scene)
+    assert 0 < errors["metric"]["rmse_m"] < 0.2
+    report = read_report(variant.scene)
+    assert "gnss-jump" in {finding["code"] for finding in report["findings"]}
+    refinement = report["by_stage"]["refinement"]
+    assert refinement["georeferenced"]
+    assert 0 < refinement["gnss"]["residual_rms_m"] < 2.0
+
+
+def test_gnss_that_jumps_for_good(variant: Variant, mrasfm: Run) -> None:
+    """From one sample on, all are 75 m off: no place on the earth is better than the wrong one."""
+    for sample in variant.document["gnss"]["samples"][4:]:
+        sample["longitude_deg"] += 1e-3
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene)
+    assert result.code == 0
+    assert "warning: GNSS jumps at gnss.samples.4" in result.out
+    refinement = read_report(variant.scene)["by_stage"]["refinement"]
+    if refinement["georeferenced"]:  # by the part before the jump or the one after it, never by both
+        assert refinement["gnss"]["units_used"] <= 4
+        assert 0 < refinement["gnss"]["residual_rms_m"] < 2.0
+    else:
+        assert refinement["gnss"]["not_used"]

@@ -1,0 +1,52 @@
+"""A real drive from import to evaluation, as a user does it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mrasfm_engine.cli import main
+from tests.integration.conftest import Ran, Variant, read_report
+
+pytestmark = pytest.mark.real
+Run = Callable[..., Ran]
+
+
+@pytest.fixture(scope="module")
+def kitti02(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    drive = tmp_path_factory.mktemp("real") / "kitti02"
+    assert main(["import", str(shared_data / "kitti02"), "--out", str(drive)]) == 0
+    return drive
+
+
+def test_kitti02_with_gnss(kitti02: Path, mrasfm: Run) -> None:
+    scene = kitti02.parent / "scene"
+    result = mrasfm("reconstruct", kitti02, "--out", scene)
+    assert result.code == 0
+    assert "units registered: 20 of 20" in result.out
+    assert "georeferenced:    yes" in result.out
+    evaluated = mrasfm("evaluate", scene, "--truth", kitti02 / "truth.tum", "--json")
+    errors = json.loads(evaluated.out)
+    assert errors["registered_images"] == errors["total_images"] == 40
+    assert 0 < errors["metric"]["rmse_m"] < 0.15
+    assert 0 < errors["metric"]["rotation_median_deg"] < 0.3
+    assert 0 < errors["similarity"]["rmse_m"] < 0.05
+    poses = (scene / "poses.tum").read_bytes()
+    assert mrasfm("reconstruct", kitti02, "--out", scene).code == 0
+    stages = read_report(scene)["by_stage"]
+    assert [stages[name]["reused"] for name in ("features", "matches", "mapping")] == [True] * 3
+    assert (scene / "poses.tum").read_bytes() == poses
+
+
+def test_latitude_and_longitude_exchanged(kitti02: Path, variant_of: Callable[[Path], Variant], mrasfm: Run) -> None:
+    variant = variant_of(kitti02)
+    for sample in variant.document["gnss"]["samples"]:
+        sample["latitude_deg"], sample["longitude_deg"] = sample["longitude_deg"], sample["latitude_deg"]
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene)
+    if result.code == 0:
+        assert "georeferenced:    no (" in result.out
+    else:
+        assert "latitude" in result.err

@@ -1,0 +1,81 @@
+"""A rendered surround drive from end to end: accuracy, every file, and what a second run does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from tests.integration.conftest import Ran, Variant, leftovers, read_report
+
+Run = Callable[..., Ran]
+UNITS, IMAGES = 8, 32
+
+
+def test_accuracy(surround_drive: Path, surround_scene: Path, mrasfm: Run) -> None:
+    result = mrasfm("evaluate", surround_scene, "--truth", surround_drive / "truth.tum", "--json")
+    assert result.code == 0
+    errors = json.loads(result.out)
+    assert (errors["registered_units"], errors["registered_images"]) == (UNITS, IMAGES)
+    assert 0 < errors["metric"]["rmse_m"] < 0.1
+    assert 0 < errors["metric"]["rotation_median_deg"] < 0.1
+    assert 0 < errors["similarity"]["rmse_m"] < 0.02
+
+
+def test_every_file_is_there_and_readable(surround_scene: Path) -> None:
+    expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration.json", "frame.json", "features.db"}
+    assert {path.name for path in surround_scene.iterdir()} == {*expected, "report.json", ".stages"}
+    assert leftovers(surround_scene.parent) == []
+    points = read_report(surround_scene)["summary"]["points"]
+    assert points > 500
+    for folder in (surround_scene / "model", surround_scene / "model" / "text"):
+        model = pycolmap.Reconstruction(str(folder))
+        assert (model.num_reg_frames(), model.num_reg_images(), model.num_points3D()) == (UNITS, IMAGES, points)
+        assert 0 < model.compute_mean_reprojection_error() < 1.5
+    assert f"element vertex {points}".encode() in (surround_scene / "points.ply").read_bytes()[:1000]
+    calibration = json.loads((surround_scene / "calibration.json").read_text())
+    assert set(calibration["cameras"]) == {"front", "back", "left", "right"}
+    assert len((surround_scene / "poses.tum").read_text().splitlines()) == UNITS + 1
+
+
+def test_features_are_a_colmap_database(surround_scene: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "features.db"  # COLMAP writes into what it opens
+    copy.write_bytes((surround_scene / "features.db").read_bytes())
+    with pycolmap.Database.open(str(copy)) as database:
+        assert (database.num_images(), database.num_frames(), database.num_rigs()) == (IMAGES, UNITS, 1)
+        assert 0 < database.num_verified_image_pairs() <= database.num_matched_image_pairs()
+
+
+def test_georeferenced_frame(surround_drive: Path, surround_scene: Path) -> None:
+    frame = json.loads((surround_scene / "frame.json").read_text())
+    assert frame["georeferenced"] is True
+    origin = json.loads((surround_drive / "drive.json").read_text())["gnss"]["samples"][0]
+    assert abs(frame["origin"]["latitude_deg"] - origin["latitude_deg"]) < 1e-3
+    assert np.array(frame["ecef_from_local"]).shape == (4, 4)
+    poses = json.loads((surround_scene / "poses.json").read_text())
+    assert all("geodetic" in item for item in (*poses["units"], *poses["images"]))
+
+
+def test_second_run_reuses_everything(variant: Variant, mrasfm: Run) -> None:
+    variant.keep(cameras=["front", "left"], units=4).save()
+    assert mrasfm("reconstruct", variant.root, "--out", variant.scene, "--no-gnss").code == 0
+    before = (variant.scene / "poses.tum").read_bytes()
+    first = read_report(variant.scene)["stages"]
+    assert [stage["reused"] for stage in first] == [False] * len(first)
+    assert mrasfm("reconstruct", variant.root, "--out", variant.scene, "--no-gnss").code == 0
+    again = read_report(variant.scene)["by_stage"]
+    assert all(again[name]["reused"] for name in ("features", "matches", "mapping"))
+    assert (variant.scene / "poses.tum").read_bytes() == before
+    _check_not_georeferenced(variant.scene)
+
+
+def _check_not_georeferenced(scene: Path) -> None:
+    """Geodetic fields are absent, not zero or null."""
+    frame = json.loads((scene / "frame.json").read_text())
+    assert frame["georeferenced"] is False
+    assert not {"world_crs", "world_crs_wkt2", "height_datum", "origin", "ecef_from_local"} & set(frame)
+    poses = json.loads((scene / "poses.json").read_text())
+    assert not any("geodetic" in item for item in (*poses["units"], *poses["images"]))

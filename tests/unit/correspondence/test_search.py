@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from simulated_drive import make_simulated_drive
+
+from mrasfm_engine.config import MatchConfig, PairConfig
+from mrasfm_engine.correspondence.matching import NearestNeighbourMatcher
+from mrasfm_engine.correspondence.pairs import pairs_from_window
+from mrasfm_engine.correspondence.search import match_pairs
+from mrasfm_engine.errors import CancelledError
+
+
+def test_matches_are_verified_and_nothing_is_lost_silently() -> None:
+    simulated = make_simulated_drive(units=4, cameras=2, points=600)
+    config, calls = MatchConfig(), []
+    candidates = pairs_from_window(simulated.drive, PairConfig())
+    result = match_pairs(
+        simulated.drive,
+        simulated.features,
+        candidates,
+        NearestNeighbourMatcher(config),
+        config,
+        threads=2,
+        progress=lambda done, total: calls.append((done, total)),
+    )
+    assert len(result.pairs) + result.few_matches + result.few_inliers == len(candidates)
+    assert calls == [(k + 1, len(candidates)) for k in range(len(candidates))]
+    assert len(result.pairs) > 0.9 * len(candidates)
+    right = wrong = missed = 0
+    for pair in result.pairs:
+        assert pair.inliers.sum() >= config.min_matches
+        a = simulated.point_of_keypoint[pair.image_a][pair.matches[:, 0]]
+        b = simulated.point_of_keypoint[pair.image_b][pair.matches[:, 1]]
+        same = (a == b) & (a >= 0)
+        right += int((same & pair.inliers).sum())
+        wrong += int((~same & pair.inliers).sum())
+        missed += int((same & ~pair.inliers).sum())
+    assert wrong <= 0.005 * right
+    assert missed <= 0.05 * right
+    assert right > 1000
+
+
+def test_pairs_of_different_places_are_rejected_and_counted() -> None:
+    simulated = make_simulated_drive(units=3, cameras=2, points=500)
+    other = make_simulated_drive(units=3, cameras=2, points=500, seed=9)
+    features = [simulated.features[0], other.features[1]]
+    config = MatchConfig()
+    result = match_pairs(
+        simulated.drive,
+        [*features, *simulated.features[2:]],
+        np.array([[0, 1]], dtype=np.int64),
+        NearestNeighbourMatcher(config),
+        config,
+        threads=1,
+    )
+    assert not result.pairs
+    assert result.few_matches + result.few_inliers == 1
+
+
+def test_pitfall_5_inside_a_unit_the_calibration_must_agree() -> None:
+    """With a camera turned by far more than the gate, matches inside units go, those over time stay."""
+    config = MatchConfig()
+    results = []
+    for turned_deg in (0.0, 5.0):
+
+        def given(rig_from_cam: np.ndarray, turned_deg: float = turned_deg) -> np.ndarray:
+            c, s = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
+            rig_from_cam[1, :3, :3] = rig_from_cam[1, :3, :3] @ [[1, 0, 0], [0, c, -s], [0, s, c]]
+            return rig_from_cam
+
+        simulated = make_simulated_drive(units=3, cameras=2, points=600, given=given)
+        pairs = pairs_from_window(simulated.drive, PairConfig())
+        found = match_pairs(
+            simulated.drive, simulated.features, pairs, NearestNeighbourMatcher(config), config, threads=1
+        ).pairs
+        unit = [i.unit for i in simulated.drive.images]
+        camera = [i.camera for i in simulated.drive.images]
+        results.append(
+            (
+                sum(int(p.inliers.sum()) for p in found if unit[p.image_a] == unit[p.image_b]),
+                sum(int(p.inliers.sum()) for p in found if camera[p.image_a] == camera[p.image_b]),
+            )
+        )
+    (inside, over_time), (inside_turned, over_time_turned) = results
+    assert inside > 100
+    assert inside_turned < 0.1 * inside
+    assert over_time_turned == pytest.approx(over_time, rel=0.05)
+
+
+def test_cancelling() -> None:
+    simulated = make_simulated_drive(units=3, cameras=1, points=300)
+    config = MatchConfig()
+    with pytest.raises(CancelledError):
+        match_pairs(
+            simulated.drive,
+            simulated.features,
+            pairs_from_window(simulated.drive, PairConfig()),
+            NearestNeighbourMatcher(config),
+            config,
+            threads=1,
+            cancel=lambda: True,
+        )
