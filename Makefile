@@ -1,11 +1,13 @@
 # Everything sets itself up in .venv from requirements.lock (hashes pinned); only Python 3.11+ and make are needed.
+# PYTHON picks the interpreter that makes the environment: make setup PYTHON=python3.12
 PYTHON ?= python3
 BIN := .venv/bin
+ACCEPTANCE ?=
 
 .PHONY: help setup demo test check acceptance lock schema clean
 
 help: ## what there is
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
 
 setup: .venv/.done ## a virtual environment in .venv with the mrasfm command
 
@@ -16,10 +18,12 @@ setup: .venv/.done ## a virtual environment in .venv with the mrasfm command
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-demo: setup ## render a drive, reconstruct it, say where the scene is and how good
+demo: setup ## render a drive of six cameras, reconstruct it, say where the scene is and how good
+	rm -rf demo
 	$(BIN)/mrasfm synth --cameras 6 --units 20 --seed 1 --out demo/drive
 	$(BIN)/mrasfm reconstruct demo/drive --out demo/scene
 	$(BIN)/mrasfm evaluate demo/scene --truth demo/drive/truth.tum
+	@echo "The scene is in demo/scene: points.ply for a viewer, model/ for COLMAP, report.json for the figures."
 
 test: setup ## the fast suite and one real drive
 	$(BIN)/python -m pytest -m "not slow"
@@ -30,8 +34,8 @@ check: setup ## lint, types, import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-acceptance: setup ## every figure that the README claims, printed as a table
-	$(BIN)/python -m tests.benchmarks.acceptance
+acceptance: setup ## every figure that the README claims, as a table (real drives needed; ACCEPTANCE="--only 1,2")
+	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)
 
 lock: setup ## renew requirements.lock from pyproject.toml (needs uv)
 	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \

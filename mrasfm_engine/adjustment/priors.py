@@ -6,7 +6,7 @@ few rows a unit or camera, so plain numpy does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +21,7 @@ Ints = NDArray[np.int64]
 
 # How firmly a gauge is held, relative to the priors: firm enough to hold, soft enough not to hurt the conditioning.
 GAUGE_STIFFNESS = 1e6
+GAUGE_USUAL = 2.0  # cameras farther off than this many usual distances hardly count in the gauge
 
 
 class Term(Protocol):
@@ -39,15 +40,17 @@ class Term(Protocol):
 class CalibrationPrior:
     """Keeps `rig_from_cam` near what was given, and holds the gauge between cameras and units.
 
-    Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes. Moving all
-    cameras by one transform and all units by its inverse changes no image: the weighted mean correction of all cameras
-    is held at zero, where the weights (Cauchy, from the current corrections) keep one bad camera from pulling the rest.
+    Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes, with a
+    Cauchy loss. Moving all cameras by one transform and all units by its inverse changes no image: the weighted mean
+    correction of all cameras is held at zero. The weights stay fixed during a solve, so that the gauge is linear; they
+    are renewed from the corrections between solves, see `robust_gauge_weights`.
     """
 
     rotation: Floats  # (c, 3, 3) given
     position_m: Floats  # (c, 3) given
     sigma_rotation_rad: Floats  # (c,)
     sigma_translation_m: Floats  # (c,)
+    gauge_weights: Floats | None = None  # (c,) equal if None
     loss_scale: float = 3.0  # in sigmas, of one camera's correction as a whole
 
     def corrections(self, state: State) -> Floats:
@@ -55,20 +58,17 @@ class CalibrationPrior:
         turn = se3.log_so3(state.camera_rotation @ np.swapaxes(self.rotation, 1, 2))
         return np.concatenate([turn, state.camera_position_m - self.position_m], axis=1)
 
+    def with_weights(self, state: State) -> CalibrationPrior:
+        """This prior with the gauge's weights renewed from the corrections of a state."""
+        return replace(self, gauge_weights=robust_gauge_weights(self._whitened(state)[0]))
+
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
         sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
         return self.corrections(state) / sigma, sigma
 
-    def weights(self, state: State) -> Floats:
-        """Cauchy weights (c,) of the cameras, from their distance to the median correction."""
-        r, _ = self._whitened(state)
-        d2 = ((r - np.median(r, axis=0)) ** 2).sum(1)
-        result: Floats = 1.0 / (1.0 + d2 / self.loss_scale**2)
-        return result
-
-    def _gauge(self, state: State) -> Floats:
-        w = self.weights(state)
-        result: Floats = (w / w.sum()) * np.sqrt(len(w))
+    def _gauge(self) -> Floats:
+        w = np.ones(len(self.rotation)) if self.gauge_weights is None else self.gauge_weights
+        result: Floats = w / w.sum() * np.sqrt(len(w))
         return result
 
     def cost(self, state: State) -> float:
@@ -76,14 +76,14 @@ class CalibrationPrior:
         r, _ = self._whitened(state)
         s2 = self.loss_scale**2
         own = 0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum()
-        return float(own + 0.5 * (GAUGE_STIFFNESS * (self._gauge(state) @ r) ** 2).sum())
+        return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
         """See `Term`."""
         r, sigma = self._whitened(state)
         cameras = np.flatnonzero(layout.camera_slot >= 0)
         w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
-        gauge = self._gauge(state)
+        gauge = self._gauge()
         mean = gauge @ r
         offsets = layout.camera_offsets(cameras)
         for axis in range(6):
@@ -94,6 +94,21 @@ class CalibrationPrior:
             j = np.sqrt(GAUGE_STIFFNESS) * gauge[cameras] * scaled
             h[np.ix_(rows, rows)] += np.outer(j, j)
             g[rows] += j * np.sqrt(GAUGE_STIFFNESS) * mean[axis]
+
+
+def robust_gauge_weights(whitened: Floats) -> Floats:
+    """Weights (c,) of cameras in the gauge from their corrections in sigmas (c, 6).
+
+    A camera is compared with how far cameras are from their common correction as a rule, not with the prior's sigma:
+    one that is 3 deg off would pass for usual under a prior of 2 deg, and turn the whole vehicle with it. With fewer
+    than three cameras there is no majority, and all weigh the same.
+    """
+    if len(whitened) < 3:
+        return np.ones(len(whitened))
+    distance = np.linalg.norm(whitened - np.median(whitened, axis=0), axis=1)
+    usual = max(float(np.median(distance)), 1e-3)
+    result: Floats = 1.0 / (1.0 + (distance / (GAUGE_USUAL * usual)) ** 2) ** 2
+    return result
 
 
 @dataclass(frozen=True, kw_only=True)

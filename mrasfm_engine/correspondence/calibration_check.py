@@ -10,16 +10,19 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.correspondence.matching import Matcher
-from mrasfm_engine.correspondence.verification import MIN_FORWARD, essential_inliers, in_front_of_both
+from mrasfm_engine.correspondence.verification import MIN_FORWARD, epipolar_errors, essential_inliers, in_front_of_both
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
+from schemas import BodyAxes
 
 Floats = NDArray[np.float64]
 
 MIN_INLIERS = 50
+PAIR_ERROR_PX = 4.0  # from the epipolar line of a calibration that is the right way round
 CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of the inverse, and of what was given, for a verdict
 MIN_EVIDENCE = 2  # unit pairs, or image pairs, that must say so
 
@@ -30,8 +33,9 @@ def require_calibration_direction(
     """Refuse a rig whose inverse explains the images clearly better.
 
     Two signs are looked for. All cameras must find the car moving in one direction of the rig; under the inverse of
-    differently turned cameras they don't. And matches between cameras of one unit must lie in front of both; with the
-    baseline reversed they lie behind.
+    differently turned cameras they don't. And matches between cameras of one unit must lie near their epipolar lines
+    and in front of both cameras; with the baseline reversed they don't. The inverse may have been taken in any axes
+    that a manifest can have, before they became the engine's.
 
     Parameters
     ----------
@@ -49,6 +53,7 @@ def require_calibration_direction(
         unproject_pixels(int(kinds[drive.images[i].camera]), params[drive.images[i].camera], f.xy_px)
         for i, f in zip(images, features, strict=True)
     ]
+    rigs = [drive.rig_from_cam, *_inverses(drive.rig_from_cam)]
     where = {(drive.images[i].unit, drive.images[i].camera): k for k, i in enumerate(images)}
 
     def verified(a: int, b: int) -> tuple[Floats, Floats] | None:
@@ -60,18 +65,18 @@ def require_calibration_direction(
     by_motion = [
         agreement
         for u in sorted({unit for unit, _ in where})
-        if (agreement := _motion_agreement(drive, u, where, verified)) is not None
+        if (agreement := _motion_agreement(rigs, u, where, verified)) is not None
     ]
     by_depth = []
     for (u, ca), a in where.items():
         for cb in range(ca + 1, len(drive.cameras)):
             if (u, cb) in where and (found := verified(a, where[u, cb])) is not None:
-                given = se3.inverse(drive.rig_from_cam[cb]) @ drive.rig_from_cam[ca]
-                wrong = drive.rig_from_cam[cb] @ se3.inverse(drive.rig_from_cam[ca])
-                by_depth.append([float(in_front_of_both(pose, *found).mean()) for pose in (given, wrong)])
+                gate = PAIR_ERROR_PX / float(params[[ca, cb], 0].min())
+                by_depth.append([_explained(rig[ca], rig[cb], *found, gate) for rig in rigs])
     for evidence in (by_motion, by_depth):
         if len(evidence) >= MIN_EVIDENCE:
-            given_ok, inverse_ok = np.median(np.array(evidence), axis=0)
+            given_ok, *inverse = np.median(np.array(evidence), axis=0)
+            inverse_ok = max(inverse)
             if inverse_ok > CLEARLY_BETTER and given_ok < CLEARLY_WORSE:
                 raise InputError(
                     "rig.cameras: rig_from_cam looks like its inverse, cam_from_rig: the first units agree "
@@ -83,14 +88,14 @@ def require_calibration_direction(
 
 
 def _motion_agreement(
-    drive: Drive,
+    rigs: Sequence[Floats],
     unit: int,
     where: dict[tuple[int, int], int],
     verified: Callable[[int, int], tuple[Floats, Floats] | None],
 ) -> list[float] | None:
-    """Length (0..1) of the mean of the cameras' directions of motion in the rig, as given and inverted."""
+    """Length (0..1) of the mean of the cameras' directions of motion in every hypothesis of the rig."""
     directions = []
-    for camera in range(len(drive.cameras)):
+    for camera in range(len(rigs[0])):
         if (unit, camera) not in where or (unit + 1, camera) not in where:
             continue
         found = verified(where[unit, camera], where[unit + 1, camera])
@@ -98,12 +103,22 @@ def _motion_agreement(
             continue
         direction = _direction(*found)
         if direction is not None:
-            rotation = drive.rig_from_cam[camera, :3, :3]
-            directions.append([rotation @ direction, rotation.T @ direction])
+            directions.append([rig[camera, :3, :3] @ direction for rig in rigs])
     if len(directions) < 2:
         return None
-    mean = np.array(directions).mean(0)
-    return [float(np.linalg.norm(mean[0])), float(np.linalg.norm(mean[1]))]
+    return [float(length) for length in np.linalg.norm(np.array(directions).mean(0), axis=1)]
+
+
+def _inverses(rig_from_cam: Floats) -> list[Floats]:
+    """What was meant, if the inverse was given in forward-left-up, right-down-forward or forward-right-down axes."""
+    return [flu @ se3.inverse(se3.inverse(flu) @ rig_from_cam) for flu in map(flu_from_body, BodyAxes)]
+
+
+def _explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: Floats, gate: float) -> float:
+    """Share of matches near their epipolar lines and in front of both cameras."""
+    b_from_a = se3.inverse(rig_from_b) @ rig_from_a
+    near = epipolar_errors(b_from_a, rays_a, rays_b) < gate
+    return float((near & in_front_of_both(b_from_a, rays_a, rays_b)).mean())
 
 
 def _direction(rays_a: Floats, rays_b: Floats) -> Floats | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.config import PairConfig
@@ -17,7 +18,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 ASSUMED_STEP_M = 1.5  # how far a car may have gone from one unit to the next, where nothing else is known
-REVISIT_PATH_M = 20.0  # units whose way apart along the route is longer than this, but which overlap, are a revisit
+REVISIT_PATH_M = 20.0  # units farther apart along the route than this, but near one another, are a revisit;
+REVISIT_DIRECT = 0.5  # near: by less than this share of the way between them
+SMOOTHED_UNITS = 9
 REVISIT_SHARE = 0.4  # of an image's pairs that revisits may take
 
 
@@ -106,11 +109,12 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     tree = cKDTree(centres)
     pairs = tree.query_pairs(config.max_depth_m, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     pairs.sort(axis=1)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(world_from_rig[:, :3, 3], axis=0), axis=1))])
+    way = _way_m(world_from_rig[:, :3, 3])
     gap = np.abs(views.unit[pairs[:, 0]] - views.unit[pairs[:, 1]])
-    revisit = (gap > config.window_units) & (
-        np.abs(way[views.unit[pairs[:, 0]]] - way[views.unit[pairs[:, 1]]]) > REVISIT_PATH_M
-    )
+    way_between = np.abs(way[views.unit[pairs[:, 0]]] - way[views.unit[pairs[:, 1]]])
+    position = world_from_rig[views.unit, :3, 3]
+    apart = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
+    revisit = (gap > config.window_units) & (way_between > REVISIT_PATH_M) & (apart < REVISIT_DIRECT * way_between)
     keep = (gap <= config.window_units) | revisit
     keep &= _axis_angle_ok(pairs, world_from_cam, config.max_view_angle_deg)
     pairs, gap, revisit = pairs[keep], gap[keep], revisit[keep]
@@ -131,6 +135,12 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
         _best_per_image(pairs, np.where(revisit, overlap, 0.0), quota, config.min_overlap),
     ]
     return np.unique(np.concatenate(chosen), axis=0)
+
+
+def _way_m(position_m: Floats) -> Floats:
+    """Way driven up to each unit (units,); smoothed, as a receiver's noise from unit to unit is no way."""
+    smooth = np.stack([uniform_filter1d(position_m[:, k], SMOOTHED_UNITS, mode="nearest") for k in range(3)], axis=1)
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
 
 
 def _next_in_time(views: _Views) -> Ints:

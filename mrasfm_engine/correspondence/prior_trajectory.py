@@ -17,6 +17,8 @@ from mrasfm_engine.scene.scene import Georeference
 
 Floats = NDArray[np.float64]
 
+MARGIN_US = 10_000_000  # of samples before and after the drive that are looked at
+
 
 @dataclass(frozen=True, kw_only=True)
 class PriorTrajectory:
@@ -64,6 +66,9 @@ def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
     gnss = drive.manifest.gnss
     if gnss is None or not gnss.samples:
         raise InputError("gnss.samples is empty", remedy="Give samples, leave gnss out, or use --no-gnss.")
+    first, last = int(drive.timestamps_us[0]) - MARGIN_US, int(drive.timestamps_us[-1]) + MARGIN_US
+    near = [s for s in gnss.samples if first <= s.timestamp_us <= last]
+    gnss = gnss.model_copy(update={"samples": near or gnss.samples})
     geodetic = np.array([(s.latitude_deg, s.longitude_deg, 0.0) for s in gnss.samples])
     geodetic[:, 2] = ellipsoidal_heights(gnss)
     origin = np.median(geodetic, axis=0)

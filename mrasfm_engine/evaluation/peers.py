@@ -193,12 +193,10 @@ def _global_options(mapper: Mapper, threads: int) -> Any:
 def _incremental_options(mapper: Mapper, threads: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
-    options.random_seed = options.mapper.random_seed = 0
     options.extract_colors = False
     if mapper is Mapper.INCREMENTAL_FIXED_CALIBRATION:
         options.ba_refine_sensor_from_rig = False
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     return options
 
 

@@ -61,8 +61,8 @@ def register_unit(model: Model, unit: int) -> Registration:
     return register_seen(model, unit, _points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
 
 
-def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int) -> Registration:
-    """Find the pose of a unit from given correspondences."""
+def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_vote: bool = True) -> Registration:
+    """Find the pose of a unit from given correspondences; `by_vote` also by the cameras' own poses."""
     needed = min_inliers
     if len(seen.camera) < needed:
         return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {needed} are needed")
@@ -74,12 +74,12 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int) -> R
     disagreeing = _disagreeing(model, seen, inlier)
     method = "joint"
     voted_out: tuple[str, ...] = ()
-    if pose is None or disagreeing or inlier.mean() < model.config.mapping.min_pnp_inlier_ratio:
+    if by_vote and (pose is None or disagreeing or inlier.mean() < model.config.mapping.min_pnp_inlier_ratio):
         vote, out = _vote(model, sample)
         if vote is not None:
-            by_vote = _errors_px(model, vote, seen) < MAX_ERROR_PX
-            if by_vote.sum() >= inlier.sum() * 0.9:
-                pose, inlier, method, voted_out = vote, by_vote, "vote", out
+            agreeing = _errors_px(model, vote, seen) < MAX_ERROR_PX
+            if agreeing.sum() >= inlier.sum() * 0.9:
+                pose, inlier, method, voted_out = vote, agreeing, "vote", out
         if method == "joint" and disagreeing:
             voted_out = disagreeing
     count = int(inlier.sum())
@@ -144,6 +144,7 @@ def _ransac(model: Model) -> pycolmap.RANSACOptions:
     options = pycolmap.RANSACOptions()
     options.max_error = MAX_ERROR_PX
     options.min_num_trials, options.max_num_trials = 50, 10000
+    options.min_inlier_ratio = model.config.mapping.min_pnp_inlier_ratio  # no longer search for less
     options.random_seed = model.config.seed
     return options
 

@@ -8,10 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.registration.calibration import (
+    calibration_is_free,
+    calibration_prior,
+    scale_of_baselines,
+    scale_with_baselines,
+)
 from mrasfm_engine.registration.camera_set import Registration, register_unit
 from mrasfm_engine.registration.initialise import Initialisation, initialise
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
@@ -168,34 +173,6 @@ def _adjust_locally(model: Model, unit: int) -> None:
     )
 
 
-def calibration_prior(model: Model) -> CalibrationPrior:
-    """The prior of `rig_from_cam` from the manifest's sigmas, or the default ones."""
-    settings, cameras = model.config.adjustment, model.drive.cameras
-    given = model.drive.rig_from_cam
-    return CalibrationPrior(
-        rotation=given[:, :3, :3],
-        position_m=given[:, :3, 3],
-        sigma_rotation_rad=np.radians([c.sigma_rotation_deg or settings.sigma_rotation_deg for c in cameras]),
-        sigma_translation_m=np.array([c.sigma_translation_m or settings.sigma_translation_m for c in cameras]),
-    )
-
-
-def heading_change_deg(model: Model) -> float:
-    """By how much the registered units' forward directions spread, degrees."""
-    forward = model.state.unit_rotation[model.registered][:, :, 0]
-    mean = forward.mean(0) / max(float(np.linalg.norm(forward.mean(0))), 1e-9)
-    angles = np.degrees(np.arccos(np.clip(forward @ mean, -1, 1)))
-    return float(2 * angles.max())
-
-
-def calibration_is_free(model: Model, *, georeferenced: bool) -> bool:
-    """Whether `rig_from_cam` may vary: on a straight way without GNSS it is not observed, and freeing it does harm."""
-    settings = model.config.adjustment
-    if not settings.refine_calibration or len(model.drive.cameras) < 2:
-        return False
-    return georeferenced or heading_change_deg(model) >= settings.min_heading_change_deg
-
-
 def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | None) -> None:
     """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter."""
     free_units = model.registered.copy()
@@ -216,5 +193,8 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
             cancel=cancel,
         )
         log.global_adjustments.append(report)
+        if free:
+            # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
+            scale_with_baselines(model, scale_of_baselines(model)[0])
         model.complete()
         model.filter(error_px)

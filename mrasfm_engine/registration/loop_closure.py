@@ -87,7 +87,7 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
         points_m=model.state.points_m[track],
         camera=model.keypoints.camera[rows],
     )
-    registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS)
+    registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS, by_vote=False)
     if registration.world_from_rig is None:
         return None
     current = model.state.world_from_rig[later]

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.adjustment.solver import Report
-from mrasfm_engine.registration.incremental import MappingLog, heading_change_deg
+from mrasfm_engine.registration.calibration import heading_change_deg
+from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
 

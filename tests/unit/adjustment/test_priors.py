@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,24 +176,9 @@ def test_calibration_prior_without_its_gauge(monkeypatch: pytest.MonkeyPatch) ->
     assert prior.cost(case.truth) == 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class EqualWeights(CalibrationPrior):
-    """The gauge with weights that do not depend on the state, so that it can be differentiated."""
-
-    def weights(self, state: State) -> np.ndarray:
-        """All the same."""
-        return np.ones(len(self.position_m))
-
-
 def test_calibration_priors_gauge() -> None:
     case, state = free_case()
-    plain = calibration_prior(case.truth)
-    prior = EqualWeights(
-        rotation=plain.rotation,
-        position_m=plain.position_m,
-        sigma_rotation_rad=plain.sigma_rotation_rad,
-        sigma_translation_m=plain.sigma_translation_m,
-    )
+    prior = calibration_prior(case.truth)
     # The rotation vector of a correction of 0.3 deg turns by as much under a step: that much is neglected.
     h = check_gradient(prior, case, state, rtol=0.01)
     together = np.zeros(case.problem.layout.size)
@@ -208,7 +193,8 @@ def test_calibration_weights_single_out_the_bad_camera() -> None:
     case, _ = free_case()
     turned = case.truth.camera_rotation.copy()
     turned[2] = se3.exp_so3(np.radians([0.0, 0.0, 30.0])) @ turned[2]
-    weights = calibration_prior(case.truth).weights(replace(case.truth, camera_rotation=turned))
+    weights = calibration_prior(case.truth).with_weights(replace(case.truth, camera_rotation=turned)).gauge_weights
+    assert weights is not None
     assert weights[2] < 0.1
     assert (np.delete(weights, 2) > 0.9).all()
 
@@ -256,8 +242,7 @@ def test_pitfall_9_moving_all_cameras_together_changes_no_image_and_is_held() ->
     solution, report = solve(replace(bare, terms=[prior]))
     assert report.final_cost < report.initial_cost
     corrections = prior.corrections(solution)
-    weights = prior.weights(solution)
-    mean = (weights[:, None] * corrections).sum(0) / weights.sum()
+    mean = corrections.mean(0)
     assert np.abs(corrections[:, :3]).max() > 1e-6  # cameras did move, one by one
     assert np.degrees(np.abs(mean[:3]).max()) < 1e-3
     assert np.abs(mean[3:]).max() < 1e-4
@@ -270,7 +255,11 @@ def solve_with_bad_camera(axis: int, error_deg: float) -> tuple[Case, Calibratio
     given[3] = se3.exp_so3(np.radians(error_deg) * np.eye(3)[axis]) @ given[3]
     prior = replace(calibration_prior(case.truth), rotation=given)
     problem = replace(case.problem, state=replace(case.truth, camera_rotation=given), terms=[prior])
-    return case, prior, *solve(problem)
+    solution, report = solve(problem)
+    for _ in range(2):  # as the engine does: the gauge's weights are renewed between solves
+        prior = prior.with_weights(solution)
+        solution, report = solve(replace(problem, state=solution, terms=[prior]))
+    return case, prior, solution, report
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -284,7 +273,6 @@ def test_pitfall_9_one_bad_camera_is_found_and_the_others_keep_their_places_to_e
     assert np.delete(corrections, 3).max() < 0.6
 
 
-@pytest.mark.xfail(strict=True, reason="the gauge's weights compare with the prior's sigma: 3 deg pull all by 0.41")
 @pytest.mark.parametrize("axis", range(3))
 def test_pitfall_9_one_bad_camera_does_not_pull_the_others(axis: int) -> None:
     case, _, solution, _ = solve_with_bad_camera(axis, 3.0)
@@ -292,7 +280,6 @@ def test_pitfall_9_one_bad_camera_does_not_pull_the_others(axis: int) -> None:
     assert 1e-4 < errors.max() < 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="the gauge's weights change within a step: 100 iterations and no end")
 def test_a_very_bad_camera_does_not_keep_the_solver_from_converging() -> None:
     case, _, solution, report = solve_with_bad_camera(2, 10.0)
     assert report.termination is Termination.CONVERGED

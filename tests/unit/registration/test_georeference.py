@@ -88,9 +88,6 @@ def test_pitfall_2_the_transform_is_rigid_and_scale_only_told() -> None:
     assert found.scale == pytest.approx(1.02, abs=0.006)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="consensus knows only the receiver's sigma: the better it is, the sooner it is refused"
-)
 @pytest.mark.parametrize(
     ("sigma_m", "way_m", "scale"), [(0.02, 300.0, 1.005), (0.05, 300.0, 1.007), (0.3, 1000.0, 1.01)]
 )

@@ -157,7 +157,8 @@ def test_pitfall_7_alike_places_are_not_believed() -> None:
             inliers=p.inliers,
         )
         for p in far
+        if model.image_unit[p.image_a] < 2 and model.image_unit[p.image_b] < 11
     ]
     revisits, tried = find_revisits(model, wrong)
-    assert tried > 5
+    assert 4 <= tried <= 6
     assert revisits == []

@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.correspondence.features import SiftExtractor, extract_features
+from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.scene.drive import Drive
+from schemas import Camera, DriveManifest, Frame, FrameImage, Pose, Rig
+
+WIDTH, HEIGHT = 800, 600
+
+
+def blobs(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """An image of round blobs and their centres, where the centre of the top left pixel is at (0.5, 0.5)."""
+    yy, xx = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    image, centres = np.full((HEIGHT, WIDTH), 60.0), []
+    for gy in range(40, HEIGHT - 40, 40):
+        for gx in range(40, WIDTH - 40, 40):
+            x, y = gx + rng.uniform(-5, 5), gy + rng.uniform(-5, 5)
+            s = rng.uniform(1.2, 4.0)
+            image += 120 * np.exp(-((xx - x) ** 2 + (yy - y) ** 2) / (2 * s * s))
+            centres.append((x, y))
+    return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, axis=2), np.array(centres)
+
+
+def offsets(xy_px: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    d = xy_px[:, None] - centres[None]
+    nearest = d[np.arange(len(xy_px)), np.abs(d).sum(2).argmin(1)]
+    return nearest[np.linalg.norm(nearest, axis=1) < 2.0]
+
+
+@pytest.mark.parametrize("max_side_px", [1600, 600])
+def test_keypoints_lie_at_the_centres_of_blobs_without_bias(max_side_px: int) -> None:
+    # A quarter of a pixel, which OpenCV's default is off, turns cameras against one another by 0.02 deg.
+    image, centres = blobs(np.random.default_rng(0))
+    features = SiftExtractor(FeatureConfig(max_side_px=max_side_px)).extract(image, None)
+    off = offsets(features.xy_px, centres)
+    assert len(off) > 200
+    assert (np.abs(np.median(off, axis=0)) < 0.02).all()
+    assert 0.0 < float(np.abs(off).mean()) < 0.2
+
+
+def test_descriptors_are_root_sift_times_512() -> None:
+    image, _ = blobs(np.random.default_rng(1))
+    features = SiftExtractor(FeatureConfig(max_keypoints=100)).extract(image, None)
+    lengths = np.linalg.norm(features.descriptors.astype(float), axis=1)
+    assert len(lengths) == 100
+    assert (np.abs(lengths - 512) < 20).mean() > 0.95
+
+
+def test_nothing_is_extracted_where_the_mask_says_so() -> None:
+    image, _ = blobs(np.random.default_rng(2))
+    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    mask[:, : WIDTH // 2] = False
+    features = SiftExtractor(FeatureConfig()).extract(image, mask)
+    assert len(features.xy_px) > 50
+    assert features.xy_px[:, 0].min() > WIDTH // 2 - 1
+
+
+def test_an_empty_image_has_no_keypoints() -> None:
+    features = SiftExtractor(FeatureConfig()).extract(np.full((HEIGHT, WIDTH, 3), 90, np.uint8), None)
+    assert features.xy_px.shape == (0, 2)
+    assert features.descriptors.shape == (0, 128)
+
+
+def make_drive(folder: Path, width: int = WIDTH) -> Drive:
+    image, _ = blobs(np.random.default_rng(3))
+    frames = []
+    for i in range(3):
+        cv2.imwrite(str(folder / f"{i}.png"), image)
+        frames.append(Frame(timestamp_us=i * 100_000, source_frame=i, images={"cam": FrameImage(file=f"{i}.png")}))
+    camera = Camera(
+        name="cam",
+        model="SIMPLE_PINHOLE",
+        width=width,
+        height=HEIGHT,
+        params=[700.0, width / 2, HEIGHT / 2],
+        rig_from_cam=Pose(rotation_xyzw=[0, 0, 0, 1], translation_m=[0, 0, 0]),
+    )
+    return Drive(folder, DriveManifest(name="blobs", rig=Rig(cameras=[camera]), frames=frames))
+
+
+def test_all_images_are_extracted_in_order_with_progress(tmp_path: Path) -> None:
+    steps: list[tuple[int, int]] = []
+    drive = make_drive(tmp_path)
+    found = extract_features(
+        drive, SiftExtractor(FeatureConfig()), threads=2, progress=lambda done, total: steps.append((done, total))
+    )
+    assert steps == [(1, 3), (2, 3), (3, 3)]
+    assert (found[0].xy_px == found[2].xy_px).all()
+
+
+def test_an_image_of_another_size_than_its_camera_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"0\.png has 800x600 pixels, its camera cam 820x600"):
+        extract_features(make_drive(tmp_path, width=820), SiftExtractor(FeatureConfig()), threads=1)
+
+
+def test_cancelling_stops_the_extraction(tmp_path: Path) -> None:
+    with pytest.raises(CancelledError):
+        extract_features(make_drive(tmp_path), SiftExtractor(FeatureConfig()), threads=1, cancel=lambda: True)
