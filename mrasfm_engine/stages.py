@@ -25,7 +25,7 @@ from mrasfm_engine.correspondence.search import match_pairs
 from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.io.findings import as_json
 from mrasfm_engine.io.preflight import check_drive, require_sound
-from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
+from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
 from mrasfm_engine.registration import incremental, mapping_report
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import refine
@@ -63,7 +63,7 @@ class Run:
         """
         if self.cancel():
             raise CancelledError
-        self._key = fingerprint(self._key or drive_fingerprint(self.drive), name, settings, __version__)
+        self._key = fingerprint(self._key or drive_fingerprint(self.drive), name, settings, code_version())
         started = time.perf_counter()
         found = self.store.load(name, self._key)
         reused = found is not None
@@ -112,7 +112,7 @@ def probe(run: Run) -> None:
 
 def _features_key(run: Run) -> str:
     settings = run.config.features.model_dump()
-    return fingerprint(drive_fingerprint(run.drive), "features", settings, __version__)
+    return fingerprint(drive_fingerprint(run.drive), "features", settings, code_version())
 
 
 def features(run: Run) -> list[ImageFeatures]:

@@ -7,14 +7,18 @@ import json
 import os
 import secrets
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import mrasfm_engine
 from mrasfm_engine.io.drive_bundle import storage_error
 from mrasfm_engine.scene.drive import Drive
+
+NOT_IN_STAGES = ("commands", "evaluation", "synthetic")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -32,6 +36,17 @@ def drive_fingerprint(drive: Drive) -> str:
         status = (drive.root / image.file).stat()
         files.append((image.file, status.st_size, status.st_mtime_ns))
     return fingerprint(drive.manifest.model_dump(mode="json"), files)
+
+
+@cache
+def code_version() -> str:
+    """Of the code that stages run: a stage that was finished by other code is done again."""
+    package = Path(mrasfm_engine.__file__).parent
+    digest = hashlib.sha256(mrasfm_engine.__version__.encode())
+    for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] not in NOT_IN_STAGES:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 class StageStore:

@@ -114,7 +114,10 @@ def _why_not(
     wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, (1e-4, 1e4))
     if fitting.mean() >= 2 * MIN_CONSENSUS:
         factor = float(np.cbrt(np.linalg.det(wide[:3, :3])))
-        return f"the receiver's way is {factor:.3g} times as long as the rig's (are the baselines in metres?)"
+        return (
+            f"the receiver's way is {factor:.3g} times as long as the rig's (are latitude and longitude swapped, or "
+            "are the baselines not in metres?)"
+        )
     return (
         f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and longitude "
         "swapped, or the receiver's clock off?)"

@@ -9,6 +9,7 @@ import numpy as np
 
 from mrasfm_engine.adjustment.solver import Report
 from mrasfm_engine.registration.calibration import heading_change_deg
+from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES
 from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
@@ -34,6 +35,7 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "units_not_registered": missing,
         "registered_by": dict(Counter(r.method for r in log.registrations)),
         "cameras_voted_out": dict(voted_out),
+        "images_posed_by_their_unit_alone": _poorly_seen(model),
         "tracks": len(model.tracks),
         "points": int(model.solved.sum()),
         "observations": int(model.kept.sum()),
@@ -82,6 +84,14 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     elif placement is not None:
         result["gnss"] = {"not_used": placement.reason}
     return result
+
+
+def _poorly_seen(model: Model) -> list[str]:
+    """Images that observe too little to be registered alone: occluded, dark, or without texture."""
+    images = model.drive.images
+    counts = np.bincount(model.keypoints.image[model.kept], minlength=len(images))
+    poor = np.flatnonzero(model.registered[model.image_unit] & (counts < MIN_CAMERA_MATCHES))
+    return [images[i].file for i in poor]
 
 
 def _why_calibration(model: Model, refinement: Refinement) -> str:

@@ -21,7 +21,8 @@ Ints = NDArray[np.int64]
 
 MIN_CLOCK_OFFSET_S = 0.05
 CLOCK_OFFSET_SIGMAS = 5.0
-MAX_SCALE_DISAGREEMENT = 0.05
+MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receiver's scale:
+SCALE_DISAGREEMENT_SIGMAS = 3.0
 SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
 
@@ -57,9 +58,12 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     _move(model, alignment.world_from_model)
     good = units[alignment.inlier]
     correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
-    findings = [] if single else _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m)
-    if not single and model.config.adjustment.refine_calibration:
-        _share_scale(model, alignment, alignment.sigma_scale * np.sqrt(correlated))
+    sigma_scale = alignment.sigma_scale * float(np.sqrt(correlated))
+    findings = []
+    if not single:
+        findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, sigma_scale)
+        if model.config.adjustment.refine_calibration:
+            _share_scale(model, alignment, sigma_scale)
     prior = PositionPrior(
         unit=good,
         position_m=measured[good],
@@ -139,6 +143,7 @@ def _findings(
     sigma_m: Floats,
     units: Ints,
     antenna_in_rig_m: Floats,
+    sigma_scale_gnss: float,
 ) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
     findings = []
@@ -156,7 +161,9 @@ def _findings(
                 "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
             )
         )
-    if abs(alignment.scale - 1.0) > MAX_SCALE_DISAGREEMENT:
+    _, sigma_rig = scale_of_baselines(model)
+    sigma = float(np.hypot(sigma_rig, sigma_scale_gnss))
+    if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
         findings.append(
             warning(
                 "scale-disagreement",
