@@ -71,6 +71,7 @@ class AdjustmentConfig(_Section):
     refine_calibration: bool = True  # rig_from_cam, where motion or GNSS make it observable
     refine_focal: bool = False  # one factor for fx and fy a camera, with its prior
     min_heading_change_deg: Positive = 15.0  # without GNSS, calibration is held on straighter drives
+    max_scale_sigma: Positive = 0.1  # calibration is held where freeing it would leave scale more uncertain than this
 
 
 class GnssConfig(_Section):

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from mrasfm_engine.adjustment.priors import CalibrationPrior
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.observability import covariances
+from mrasfm_engine.adjustment.priors import CalibrationPrior, Term
+from mrasfm_engine.adjustment.solver import SolverOptions
 from mrasfm_engine.registration.model import Model
+
+Bools = NDArray[np.bool_]
+
+MAX_UNKNOWNS_FOR_COVARIANCE = 12_000  # of units and cameras; above, the inverse would take gigabytes
 
 
 def calibration_prior(model: Model) -> CalibrationPrior:
@@ -29,12 +39,47 @@ def heading_change_deg(model: Model) -> float:
     return float(2 * angles.max())
 
 
-def calibration_is_free(model: Model, *, georeferenced: bool) -> bool:
-    """Whether `rig_from_cam` may vary: on a straight way without GNSS it is not observed, and freeing it does harm."""
+@dataclass(frozen=True)
+class CalibrationVerdict:
+    """Whether `rig_from_cam` may vary, and why."""
+
+    free: bool
+    reason: str
+
+
+def judge_calibration(
+    model: Model, *, free_units: Bools, terms: Sequence[Term], georeferenced: bool, options: SolverOptions
+) -> CalibrationVerdict:
+    """Whether the drive observes the calibration: freeing what it does not observe makes everything worse.
+
+    A straight way without GNSS never does. Else it is asked what freeing would cost: the images, the priors and the
+    positions must still know the scale.
+
+    Parameters
+    ----------
+    free_units, terms, options
+        Of the adjustment that would follow; the calibration's own prior is added.
+    """
     settings = model.config.adjustment
-    if not settings.refine_calibration or len(model.drive.cameras) < 2:
-        return False
-    return georeferenced or heading_change_deg(model) >= settings.min_heading_change_deg
+    if not settings.refine_calibration:
+        return CalibrationVerdict(False, "held by the settings")
+    if len(model.drive.cameras) < 2:
+        return CalibrationVerdict(False, "a single camera has no calibration to others")
+    if not georeferenced and heading_change_deg(model) < settings.min_heading_change_deg:
+        return CalibrationVerdict(False, "held as given: without GNSS a drive this straight does not observe it")
+    problem, _ = model.problem(
+        free_units,
+        free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
+        terms=[calibration_prior(model), *terms],
+        options=options,
+    )
+    if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
+        sigma = covariances(problem, problem.state).sigma_scale
+        if not sigma <= settings.max_scale_sigma:
+            return CalibrationVerdict(False, f"held as given: freed, it would leave scale unknown to {sigma:.0%}")
+    return CalibrationVerdict(
+        True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"
+    )
 
 
 def scale_of_baselines(model: Model) -> tuple[float, float]:

@@ -96,14 +96,24 @@ def align_with_gnss(
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
     rotation, weight = similarity[:3, :3] / scale, 1.0 / (sigma_m[inlier] ** 2).mean(1)
     centre = np.average(antenna_m[inlier], axis=0, weights=weight)
-    spread = ((antenna_m[inlier] - centre) ** 2 / (factor * sigma_m[inlier]) ** 2).sum()
+    spread = float(((antenna_m[inlier] - centre) ** 2 / (factor * sigma_m[inlier]) ** 2).sum())
+    sigma_scale = 1.0 / np.sqrt(max(spread, 1e-12)) / scale
+    if not SCALE_RANGE[0] - 3 * sigma_scale <= scale <= SCALE_RANGE[1] + 3 * sigma_scale:
+        return _scale_is_off(scale)
     return GnssAlignment(
         world_from_model=se3.transform(rotation, _apply(similarity, centre[None])[0] - rotation @ centre),
         inlier=inlier,
         residual_m=np.linalg.norm(off_m, axis=1),
         scale=scale,
-        sigma_scale=float(1.0 / np.sqrt(max(float(spread), 1e-12))) / scale,
+        sigma_scale=float(sigma_scale),
         noise_factor=factor,
+    )
+
+
+def _scale_is_off(scale: float) -> str:
+    return (
+        f"the receiver's way is {scale:.3g} times as long as the rig's (are latitude and longitude swapped, or are the "
+        "baselines not in metres?)"
     )
 
 
@@ -113,11 +123,7 @@ def _why_not(
     """What is wrong with positions that do not fit: perhaps only the rig's units."""
     wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, (1e-4, 1e4))
     if fitting.mean() >= 2 * MIN_CONSENSUS:
-        factor = float(np.cbrt(np.linalg.det(wide[:3, :3])))
-        return (
-            f"the receiver's way is {factor:.3g} times as long as the rig's (are latitude and longitude swapped, or "
-            "are the baselines not in metres?)"
-        )
+        return _scale_is_off(float(np.cbrt(np.linalg.det(wide[:3, :3]))))
     return (
         f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and longitude "
         "swapped, or the receiver's clock off?)"

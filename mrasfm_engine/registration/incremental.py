@@ -12,8 +12,8 @@ from mrasfm_engine.adjustment.solver import Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.registration.calibration import (
-    calibration_is_free,
     calibration_prior,
+    judge_calibration,
     scale_of_baselines,
     scale_with_baselines,
 )
@@ -40,6 +40,7 @@ class MappingLog:
     initialisation: Initialisation | None = None
     registrations: list[Registration] = field(default_factory=list)
     failures: dict[int, Registration] = field(default_factory=dict)  # by unit, the last attempt
+    calibration_free: bool = False  # whether global adjustments vary rig_from_cam
     local_adjustments: int = 0
     global_adjustments: list[Report] = field(default_factory=list)
     revisits_tried: int = 0  # pairs of units across a gap that were compared
@@ -177,19 +178,24 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
     """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter."""
     free_units = model.registered.copy()
     free_units[np.flatnonzero(model.registered)[0]] = False
-    settings = model.config.adjustment
-    free = calibration_is_free(model, georeferenced=False)
+    options = SolverOptions(
+        max_iterations=20,
+        function_tolerance=GLOBAL_TOLERANCE,
+        loss_scale=model.config.adjustment.loss_scale,
+        threads=model.config.threads,
+    )
+    # Once a part of the drive observes the calibration, more of it does so all the more.
+    log.calibration_free = (
+        log.calibration_free
+        or judge_calibration(model, free_units=free_units, terms=(), georeferenced=False, options=options).free
+    )
+    free = log.calibration_free
     for error_px in (model.config.mapping.max_error_px, model.config.mapping.filter_error_px):
         report = model.adjust(
             free_units,
             free_cameras=np.full(len(model.camera_kind), free),
             terms=[calibration_prior(model)] if free else (),
-            options=SolverOptions(
-                max_iterations=20,
-                function_tolerance=GLOBAL_TOLERANCE,
-                loss_scale=settings.loss_scale,
-                threads=model.config.threads,
-            ),
+            options=options,
             cancel=cancel,
         )
         log.global_adjustments.append(report)

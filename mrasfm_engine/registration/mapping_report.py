@@ -53,7 +53,6 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     """Alignment, adjustments and certainty of the last stage."""
     placement, certainty = refinement.placement, refinement.certainty
     alignment = None if placement is None else placement.alignment
-    free = refinement.calibration_free
     result: dict[str, Any] = {
         "points": int(model.solved.sum()),
         "observations": int(model.kept.sum()),
@@ -61,8 +60,8 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
         "sigma_observation_px": refinement.sigma_px,
         "adjustments": [_adjustment(r) for r in refinement.adjustments],
         "calibration": {
-            "adjusted": free,
-            "reason": _why_calibration(model, refinement),
+            "adjusted": refinement.calibration.free,
+            "reason": refinement.calibration.reason,
             "heading_change_deg": heading_change_deg(model),
         },
         "georeferenced": refinement.georeferenced,
@@ -92,16 +91,6 @@ def _poorly_seen(model: Model) -> list[str]:
     counts = np.bincount(model.keypoints.image[model.kept], minlength=len(images))
     poor = np.flatnonzero(model.registered[model.image_unit] & (counts < MIN_CAMERA_MATCHES))
     return [images[i].file for i in poor]
-
-
-def _why_calibration(model: Model, refinement: Refinement) -> str:
-    if refinement.calibration_free:
-        return "GNSS makes it observable" if refinement.georeferenced else "the drive turns enough to observe it"
-    if not model.config.adjustment.refine_calibration:
-        return "held by the settings"
-    if len(model.drive.cameras) < 2:
-        return "a single camera has no calibration to others"
-    return "held as given: without GNSS a drive this straight does not observe it"
 
 
 def _adjustment(report: Report) -> dict[str, Any]:

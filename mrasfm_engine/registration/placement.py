@@ -34,6 +34,7 @@ class Placement:
     reason: str = ""
     alignment: GnssAlignment | None = None
     units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that took part in aligning
+    sigma_scale: float = float("nan")  # of the alignment's scale, with errors that change slowly taken into account
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
 
@@ -62,15 +63,13 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     findings = []
     if not single:
         findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, sigma_scale)
-        if model.config.adjustment.refine_calibration:
-            _share_scale(model, alignment, sigma_scale)
     prior = PositionPrior(
         unit=good,
         position_m=measured[good],
         sigma_m=sigma[good] * alignment.noise_factor * np.sqrt(correlated),
         lever_arm_m=np.asarray(antenna_in_rig_m),
     )
-    return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
+    return Placement(prior=prior, alignment=alignment, units=units, sigma_scale=sigma_scale, findings=findings)
 
 
 def _align(model: Model, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats) -> GnssAlignment | str:
@@ -124,14 +123,17 @@ def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> 
     return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
 
 
-def _share_scale(model: Model, alignment: GnssAlignment, sigma_scale_gnss: float) -> None:
+def share_scale(model: Model, placement: Placement) -> None:
     """Scale the scene and the rig's baselines to where their prior and the receiver meet.
 
     Adjustment would get there as well, but along a direction in which the cost hardly changes, and only after many
     steps.
     """
+    alignment = placement.alignment
+    if alignment is None or len(model.drive.cameras) < 2:
+        return
     rig, sigma_rig = scale_of_baselines(model)
-    information_rig, information_gnss = 1.0 / sigma_rig**2, 1.0 / max(sigma_scale_gnss, 1e-9) ** 2
+    information_rig, information_gnss = 1.0 / sigma_rig**2, 1.0 / max(placement.sigma_scale, 1e-9) ** 2
     factor = (information_rig * rig + information_gnss * alignment.scale) / (information_rig + information_gnss)
     scale_with_baselines(model, factor)
 

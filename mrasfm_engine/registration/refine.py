@@ -12,10 +12,15 @@ from mrasfm_engine.adjustment.observability import Covariances, covariances
 from mrasfm_engine.adjustment.priors import FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
 from mrasfm_engine.geometry.gnss_track import GnssTrack
-from mrasfm_engine.registration.calibration import calibration_is_free, calibration_prior
+from mrasfm_engine.registration.calibration import (
+    MAX_UNKNOWNS_FOR_COVARIANCE,
+    CalibrationVerdict,
+    calibration_prior,
+    judge_calibration,
+)
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses
+from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,7 +30,6 @@ ROUNDS = 2  # of adjusting, triangulating anew and filtering
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 1e-6  # scale is a weak direction: it must arrive as well
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
-MAX_RANK_FOR_COVARIANCE = 12_000  # unknowns; above, the inverse would take gigabytes
 
 
 @dataclass(kw_only=True)
@@ -34,7 +38,7 @@ class Refinement:
 
     sigma_px: float = 1.0
     placement: Placement | None = None  # by GNSS, where it was to be used
-    calibration_free: bool = False
+    calibration: CalibrationVerdict = field(default_factory=lambda: CalibrationVerdict(False, ""))
     focal_free: bool = False
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
@@ -72,15 +76,25 @@ def refine(
         positions = result.placement.prior
     if positions is None and rough_world_from_rig is not None:
         place_by_rough_poses(model, rough_world_from_rig)
-    result.calibration_free = calibration_is_free(model, georeferenced=positions is not None)
-    result.focal_free = model.config.adjustment.refine_focal and result.calibration_free
+    free_units = _free_units(model, georeferenced=positions is not None)
+    result.sigma_px = _observation_sigma(model)
+    result.calibration = judge_calibration(
+        model,
+        free_units=free_units,
+        terms=_terms(model, positions, result),
+        georeferenced=positions is not None,
+        options=_options(model, result.sigma_px, iterations=1),
+    )
+    result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
+    if result.calibration.free and result.placement is not None:
+        share_scale(model, result.placement)
     for done in range(ROUNDS):
         result.sigma_px = _observation_sigma(model)
         terms = _terms(model, positions, result)
         result.adjustments.append(
             model.adjust(
-                _free_units(model, georeferenced=positions is not None),
-                free_cameras=np.full(len(model.camera_kind), result.calibration_free),
+                free_units,
+                free_cameras=np.full(len(model.camera_kind), result.calibration.free),
                 free_focal=result.focal_free,
                 terms=terms,
                 options=_options(model, result.sigma_px, iterations=40 if done == ROUNDS - 1 else 15),
@@ -131,7 +145,7 @@ def _observation_sigma(model: Model) -> float:
 
 def _terms(model: Model, positions: PositionPrior | None, result: Refinement) -> list[Term]:
     terms: list[Term] = []
-    if result.calibration_free:
+    if result.calibration.free:
         terms.append(calibration_prior(model))
     if result.focal_free:
         terms.append(_focal_prior(model))
@@ -157,7 +171,7 @@ def _certainty(model: Model, positions: PositionPrior | None, result: Refinement
     """Covariances with the calibration free under its prior, also where it was held: its error is there as well."""
     several = len(model.drive.cameras) > 1
     terms = _terms(model, positions, result)
-    if several and not result.calibration_free:
+    if several and not result.calibration.free:
         terms.append(calibration_prior(model))
     problem, _ = model.problem(
         _free_units(model, georeferenced=positions is not None),
@@ -166,6 +180,6 @@ def _certainty(model: Model, positions: PositionPrior | None, result: Refinement
         terms=terms,
         options=_options(model, result.sigma_px, iterations=1),
     )
-    if problem.layout.size > MAX_RANK_FOR_COVARIANCE:
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return None
     return covariances(problem, problem.state)
