@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.io.images import read_image_rgb
+from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.scene.semantics import usable_pixels
+from schemas import LabelMap
 
 DESCRIPTOR_SCALE = 512.0  # COLMAP stores unit-length descriptors times 512 in bytes
 SMALLEST_KEYPOINT_PX = 1e-3
@@ -83,6 +85,8 @@ def extract_features(
 ) -> list[ImageFeatures]:
     """Features of every image of the drive, in the order of `drive.images`.
 
+    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car.
+
     Raises
     ------
     InputError
@@ -103,8 +107,12 @@ def extract_features(
                 f"{camera.width}x{camera.height}",
                 remedy="Give the calibration of images of this size, or images of the calibration's size.",
             )
-        return extractor.extract(rgb, None)
+        usable = None
+        if image.mask is not None:
+            usable = usable_pixels(read_mask(drive.root / image.mask, drive.manifest.label_map), label_map)
+        return extractor.extract(rgb, usable)
 
+    label_map = drive.manifest.label_map or LabelMap.cityscapes()
     cv2.setNumThreads(1)
     result: list[ImageFeatures] = []
     with ThreadPoolExecutor(threads) as pool:

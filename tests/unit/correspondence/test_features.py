@@ -103,3 +103,17 @@ def test_an_image_of_another_size_than_its_camera_is_refused_by_name(tmp_path: P
 def test_cancelling_stops_the_extraction(tmp_path: Path) -> None:
     with pytest.raises(CancelledError):
         extract_features(make_drive(tmp_path), SiftExtractor(FeatureConfig()), threads=1, cancel=lambda: True)
+
+
+def test_the_drives_masks_keep_keypoints_off_moving_things(tmp_path: Path) -> None:
+    drive = make_drive(tmp_path)
+    mask = np.full((HEIGHT, WIDTH), 2, np.uint8)  # Cityscapes: building
+    mask[:, WIDTH // 2 :] = 13  # car
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    first = drive.manifest.frames[0]
+    masked = first.model_copy(update={"images": {"cam": FrameImage(file="0.png", mask="mask.png")}})
+    manifest = drive.manifest.model_copy(update={"frames": [masked, *drive.manifest.frames[1:]]})
+    found = extract_features(Drive(tmp_path, manifest), SiftExtractor(FeatureConfig()), threads=1)
+    assert 50 < len(found[0].xy_px) < len(found[1].xy_px)
+    assert found[0].xy_px[:, 0].max() < WIDTH // 2 + 1
+    assert found[1].xy_px[:, 0].max() > WIDTH // 2 + 100
