@@ -177,7 +177,8 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),
         }
 
-    settings = (run.config.pairs.model_dump(), run.config.matching.model_dump(), run.config.use_gnss)
+    settings = [section.model_dump() for section in (run.config.pairs, run.config.matching, run.config.gnss)]
+    settings.append({"use_gnss": run.config.use_gnss})
     arrays, report = run.stage("matches", settings, work)
     if not report["verified_pairs"]:
         raise ReconstructionError(
