@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from importlib.metadata import entry_points, version
 
@@ -19,9 +18,6 @@ def main(argv: list[str] | None = None) -> int:
     Subcommands are modules of the entry-point group `mrasfm.commands` with a function
     `register(subparsers)` that adds a parser whose default `run` takes the parsed arguments.
     """
-    # Our own threads do the parallel work; BLAS threads inside them would fight for the same cores.
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, str(os.cpu_count() or 1))
     parser = argparse.ArgumentParser(prog="mrasfm", description="Multi-camera drives to metric maps.")
     parser.add_argument("--version", action="version", version=version("mrasfm"))
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mrasfm_engine.errors import InputError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
 
@@ -35,14 +36,14 @@ class PairConfig(_Section):
     pairs_per_image: Count = 16  # with a prior: best pairs by overlap an image
     max_depth_m: Positive = 50.0  # viewing frustums end here
     max_view_angle_deg: Positive = 75.0  # between optical axes
-    min_overlap: Positive = 0.08  # fraction of one image's frustum samples seen by the other
+    min_overlap: Share = 0.08  # fraction of one image's frustum samples seen by the other
     revisit_pairs_per_unit: Annotated[int, Field(ge=0)] = 3  # without a prior: similar units outside the window
 
 
 class MatchConfig(_Section):
     """Nearest neighbours and their verification."""
 
-    ratio: Positive = 0.8  # of the distances to the best and second best descriptor
+    ratio: Share = 0.8  # of the distances to the best and second best descriptor
     min_matches: Count = 15  # pairs with fewer matches or inliers are dropped
     max_error_px: Positive = 2.0  # epipolar distance of an inlier
     calibration_error_px: Positive = 8.0  # the same between cameras of one unit, where calibration gives the geometry
@@ -55,7 +56,7 @@ class MappingConfig(_Section):
     filter_error_px: Positive = 3.0  # and in the final scene
     min_angle_deg: Positive = 1.0  # of a point's rays; below it depth is mostly noise
     min_pnp_inliers: Count = 20  # of a unit over all its cameras
-    min_pnp_inlier_ratio: Positive = 0.2
+    min_pnp_inlier_ratio: Share = 0.2
     local_units: Count = 6  # units that vary in local adjustment
     local_every: Count = 2  # registered units between local adjustments
     global_growth: Positive = 0.4  # global adjustment when this fraction of units was registered since the last
@@ -69,7 +70,7 @@ class AdjustmentConfig(_Section):
     sigma_translation_m: Positive = 0.05
     sigma_focal: Positive = 0.002  # prior of a focal length relative to itself, where focal lengths vary
     refine_calibration: bool = True  # rig_from_cam, where motion or GNSS make it observable
-    refine_focal: bool = False  # one factor for fx and fy a camera, with its prior
+    refine_focal: bool = False  # one factor for fx and fy a camera, with its prior, where rig_from_cam varies too
     min_heading_change_deg: Positive = 15.0  # without GNSS, calibration is held on straighter drives
     max_scale_sigma: Positive = 0.1  # calibration is held where freeing it would leave scale more uncertain than this
 
@@ -78,7 +79,6 @@ class GnssConfig(_Section):
     """Use of the receiver's positions."""
 
     correlation_time_s: Positive = 1.0  # samples closer than this share most of their error
-    max_speed_mps: Positive = 70.0  # faster steps between samples are jumps
     outlier_sigmas: Positive = 4.0  # residuals over this many sigmas after alignment are rejected
     max_time_gap_s: Positive = 2.0  # no interpolation across larger gaps
 
@@ -93,8 +93,8 @@ class EngineConfig(_Section):
     adjustment: AdjustmentConfig = AdjustmentConfig()
     gnss: GnssConfig = GnssConfig()
     use_gnss: bool = True
-    seed: int = 0
-    threads: Count = os.cpu_count() or 1
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    threads: Count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def read_config(path: Path | None, **overrides: Any) -> EngineConfig:

@@ -139,6 +139,12 @@ def features(run: Run) -> list[ImageFeatures]:
         )
 
     arrays, _ = run.stage("features", run.config.features.model_dump(), work)
+    if not arrays["counts"].sum():
+        raise ReconstructionError(
+            "no image of the drive has a keypoint",
+            remedy="Check that the images are not empty, and that masks do not cover everything.",
+            code="no-features",
+        )
     ends = np.cumsum(arrays["counts"])
     return [
         ImageFeatures(

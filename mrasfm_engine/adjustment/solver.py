@@ -90,7 +90,8 @@ class Problem:
         """The reduced system at a state."""
         o, layout, options = self.observations, self.layout, self.options
         n, p = layout.size, o.num_points
-        parts = min(options.threads, max(1, p // 256))
+        # Every thread has a system of its own: not more of them than fit into a gigabyte.
+        parts = min(options.threads, max(1, p // 256), max(1, int(1e9 // (8 * n * n + 1))))
         s, diagonal, g = np.zeros((parts, n, n)), np.zeros((parts, n)), np.zeros((parts, n))
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
         _in_ranges(
@@ -216,7 +217,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        decrement = -float(step @ reduced.gradient) if step is not None else np.inf
+        decrement = -float(step @ reduced.gradient)
         if cost - trial_cost <= options.function_tolerance * cost or (
             len(free) and decrement <= options.decrement_tolerance * len(free)
         ):

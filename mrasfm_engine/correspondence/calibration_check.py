@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.correspondence.matching import Matcher
-from mrasfm_engine.correspondence.verification import MIN_FORWARD, epipolar_errors, essential_inliers, in_front_of_both
+from mrasfm_engine.correspondence.verification import (
+    MIN_FORWARD,
+    epipolar_errors,
+    essential_inliers,
+    in_front_of_both,
+    parallax_rad,
+)
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
@@ -22,6 +28,7 @@ from schemas import BodyAxes
 Floats = NDArray[np.float64]
 
 MIN_INLIERS = 50
+MIN_PARALLAX_RAD = np.radians(0.3)  # about 3 px at a focal length of 600 px
 PAIR_ERROR_PX = 4.0  # from the epipolar line of a calibration that is the right way round
 CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of the inverse, and of what was given, for a verdict
 MIN_EVIDENCE = 2  # unit pairs, or image pairs, that must say so
@@ -99,8 +106,8 @@ def _motion_agreement(
         if (unit, camera) not in where or (unit + 1, camera) not in where:
             continue
         found = verified(where[unit, camera], where[unit + 1, camera])
-        if found is None:
-            continue
+        if found is None or parallax_rad(*found) < MIN_PARALLAX_RAD:
+            continue  # a standing car moves in any direction
         direction = _direction(*found)
         if direction is not None:
             directions.append([rig[camera, :3, :3] @ direction for rig in rigs])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Protocol
 
 import cv2
@@ -19,7 +20,7 @@ from mrasfm_engine.scene.semantics import usable_pixels
 from schemas import LabelMap
 
 DESCRIPTOR_SCALE = 512.0  # COLMAP stores unit-length descriptors times 512 in bytes
-SMALLEST_KEYPOINT_PX = 1e-3
+SMALLEST_DESCRIPTOR_SUM = 1e-3
 
 
 class Extractor(Protocol):
@@ -42,16 +43,18 @@ class SiftExtractor:
         scale = min(1.0, self._config.max_side_px / max(gray.shape))
         if scale < 1.0:
             gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small_mask, wanted = None, self._config.max_keypoints
+        if mask is not None:
+            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            # OpenCV masks only after it has chosen the strongest: the rest of the image must not use up the number.
+            wanted = round(wanted / max(float(small_mask.mean()), 0.05))
         # A detector an image: OpenCV's objects must not be shared between threads. Without precise upscaling all its
         # keypoints are 0.25 px too far right and down, which turns cameras by 0.02 deg against one another.
         sift = cv2.SIFT.create(
-            nfeatures=self._config.max_keypoints,
+            nfeatures=wanted,
             contrastThreshold=self._config.contrast_threshold,
             enable_precise_upscale=True,
         )
-        small_mask = None
-        if mask is not None:
-            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
         keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
         if not keypoints:
             return ImageFeatures(
@@ -65,7 +68,9 @@ class SiftExtractor:
             gray.shape[1] / rgb.shape[1],
             gray.shape[0] / rgb.shape[0],
         )
-        root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_KEYPOINT_PX))
+        root = np.sqrt(
+            descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM)
+        )
         column = np.clip(xy[:, 0].astype(int), 0, rgb.shape[1] - 1)
         row = np.clip(xy[:, 1].astype(int), 0, rgb.shape[0] - 1)
         return ImageFeatures(
@@ -73,6 +78,17 @@ class SiftExtractor:
             descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
             colors=np.ascontiguousarray(rgb[row, column]),
         )
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """OpenCV works in our threads instead of its own."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def extract_features(
@@ -113,9 +129,8 @@ def extract_features(
         return extractor.extract(rgb, usable)
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()
-    cv2.setNumThreads(1)
     result: list[ImageFeatures] = []
-    with ThreadPoolExecutor(threads) as pool:
+    with one_opencv_thread(), ThreadPoolExecutor(threads) as pool:
         futures = [pool.submit(one, index) for index in range(len(drive.images))]
         try:
             for future in futures:

@@ -102,6 +102,9 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     An image keeps its best pairs by overlap; neighbours in time and cameras of the same unit come first, and images of
     a part of the route that is driven again have a share of their own, so that many neighbours don't crowd them out.
     """
+    known = np.isfinite(world_from_rig[:, 0, 3])
+    if not known.all():
+        return _pairs_where_known(drive, world_from_rig, known, config)
     views = _Views.of(drive)
     world_from_cam = world_from_rig[views.unit] @ drive.rig_from_cam[views.camera]
     # Frustums meet half way at the latest; poses far apart need no look.
@@ -135,6 +138,18 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
         _best_per_image(pairs, np.where(revisit, overlap, 0.0), quota, config.min_overlap),
     ]
     return np.unique(np.concatenate(chosen), axis=0)
+
+
+def _pairs_where_known(drive: Drive, world_from_rig: Floats, known: NDArray[np.bool_], config: PairConfig) -> Ints:
+    """Pairs by overlap among units with a prior, and by window where one of the units has none."""
+    units = np.flatnonzero(known)
+    nearest = units[np.abs(np.arange(len(known))[:, None] - units[None]).argmin(1)]
+    by_overlap = pairs_from_poses(drive, world_from_rig[nearest], config)
+    by_window = pairs_from_window(drive, config)
+    unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+    both = known[unit[by_overlap]].all(axis=1)
+    one = ~known[unit[by_window]].all(axis=1)
+    return np.unique(np.concatenate([by_overlap[both], by_window[one]]), axis=0)
 
 
 def _way_m(position_m: Floats) -> Floats:

@@ -17,15 +17,16 @@ from mrasfm_engine.scene.scene import Georeference
 
 Floats = NDArray[np.float64]
 
+SLACK_US = 100_000  # by which units may lie before or after the poses
 MARGIN_US = 10_000_000  # of samples before and after the drive that are looked at
 
 
 @dataclass(frozen=True, kw_only=True)
 class PriorTrajectory:
-    """What is known of the way before reconstruction. All poses are in one local frame.
+    """What is known of the way before reconstruction; NaN for units of which nothing is known.
 
-    With GNSS the local frame is east-north-up at the track's middle; with rough poses alone it is their world, moved to
-    begin near zero.
+    GNSS is in an east-north-up frame at the track's middle, rough poses are in their own world, moved to begin near
+    zero. `world_from_rig` is in the frame of its source.
     """
 
     source: str  # "rough poses", "GNSS" or "none"
@@ -49,7 +50,9 @@ def prior_trajectory(drive: Drive, config: GnssConfig, *, use_gnss: bool) -> Pri
         rough, rough_world_from_local = _rough(drive)
     antenna = None if gnss is None else np.array(gnss.antenna_in_rig_m)
     poses, source = rough, "rough poses"
-    if rough is None and track is not None and antenna is not None:
+    if poses is not None and np.isnan(poses[:, 0, 3]).mean() > 0.5:
+        poses = None  # too few to choose pairs by
+    if poses is None and track is not None and antenna is not None:
         poses, source = rough_trajectory(track, drive.timestamps_us, antenna), "GNSS"
     return PriorTrajectory(
         source="none" if poses is None else source,
@@ -71,7 +74,7 @@ def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
     gnss = gnss.model_copy(update={"samples": near or gnss.samples})
     geodetic = np.array([(s.latitude_deg, s.longitude_deg, 0.0) for s in gnss.samples])
     geodetic[:, 2] = ellipsoidal_heights(gnss)
-    origin = np.median(geodetic, axis=0)
+    origin = geodetic[len(geodetic) // 2]  # not the median, which 180 degrees of longitude would tear apart
     ecef_from_local = geodesy.ecef_from_local(origin)
     position = geodesy.local_from_geodetic(geodetic, ecef_from_local)
     sigma = np.array([(s.sigma_horizontal_m, s.sigma_horizontal_m, s.sigma_vertical_m) for s in gnss.samples])
@@ -102,11 +105,13 @@ def _rough(drive: Drive) -> tuple[Floats, Floats]:
     shift = np.round(poses[0, :3, 3])
     poses[:, :3, 3] -= shift
     at = drive.timestamps_us
-    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1)) if len(times) > 1 else None
-    if after is None:
-        return np.repeat(poses, len(at), axis=0), se3.transform(np.eye(3), shift)
-    fraction = np.clip((at - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
-    a, b = poses[after - 1], poses[after]
+    after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    step = np.maximum(times[after] - times[before], 1)
+    fraction = np.clip((at - times[before]) / step, 0.0, 1.0)
+    a, b = poses[before], poses[after]
     rotation = se3.slerp(a[:, :3, :3], b[:, :3, :3], fraction)
     position = a[:, :3, 3] + fraction[:, None] * (b[:, :3, 3] - a[:, :3, 3])
-    return se3.transform(rotation, position), se3.transform(np.eye(3), shift)
+    result = se3.transform(rotation, position)
+    result[(at < times[0] - SLACK_US) | (at > times[-1] + SLACK_US)] = np.nan
+    return result, se3.transform(np.eye(3), shift)

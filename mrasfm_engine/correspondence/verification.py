@@ -47,6 +47,14 @@ def epipolar_errors(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Floats:
     return result
 
 
+def parallax_rad(rays_a: Floats, rays_b: Floats) -> float:
+    """Median angle between matching rays (n, 3) after the rotation that aligns them best: what only motion explains."""
+    u, _, vt = np.linalg.svd(rays_b.T @ rays_a)
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    cosine = np.clip(((rays_a @ rotation.T) * rays_b).sum(1), -1.0, 1.0)
+    return float(np.median(np.arccos(cosine)))
+
+
 def in_front_of_both(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Bools:
     """Which pairs of rays (n,) meet in front of both cameras under a known pose, or are parallel to within rounding."""
     ra = rays_a @ b_from_a[:3, :3].T

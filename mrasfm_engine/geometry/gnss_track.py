@@ -13,6 +13,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+MAX_BEYOND_S = 0.5  # before the first and after the last sample nothing is known
 NEIGHBOURS = 5  # samples on each side that a sample is compared with
 NEIGHBOUR_SPAN_S = 3.0
 MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
@@ -86,8 +87,8 @@ def _line_at(dt: Floats, position: Floats) -> Floats:
 def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Floats) -> Floats | None:
     """Poses `world_from_rig` (m, 4, 4) from positions alone: heading along the track, level, lever arm applied.
 
-    Where the car stands, it keeps the heading it came with (or leaves with). None where the track shows no direction at
-    all, or does not cover most of the times.
+    Where the car stands, it keeps the heading it came with (or leaves with). NaN for times that the track does not
+    cover; None where it shows no direction at all, or does not cover most of the times.
     """
     t, p = track.timestamps_us[track.good] / 1e6, track.position_m[track.good]
     if len(t) < 3:
@@ -115,7 +116,12 @@ def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Fl
     nearest = known[np.abs(times[:, None] - times[None, known]).argmin(1)]
     heading = heading[nearest]
     rotation = se3.exp_so3(np.stack([np.zeros_like(heading), np.zeros_like(heading), heading], -1))
-    return se3.transform(rotation, position - rotation @ antenna_in_rig_m)
+    poses = se3.transform(rotation, position - rotation @ antenna_in_rig_m)
+    beyond = np.abs(times - timestamps_us / 1e6) > MAX_BEYOND_S
+    if beyond.mean() > 0.5:
+        return None
+    poses[beyond] = np.nan
+    return poses
 
 
 def _fit_motion(dt: Floats, position: Floats) -> tuple[Floats, Floats]:

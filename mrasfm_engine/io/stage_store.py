@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mrasfm_engine
+import schemas
 from mrasfm_engine.io.drive_bundle import storage_error
 from mrasfm_engine.scene.drive import Drive
 
@@ -30,22 +31,25 @@ def fingerprint(*parts: object) -> str:
 
 
 def drive_fingerprint(drive: Drive) -> str:
-    """Of the manifest and of size and modification time of every image."""
+    """Of the manifest and of size and modification time of every image and mask."""
     files = []
     for image in drive.images:
-        status = (drive.root / image.file).stat()
-        files.append((image.file, status.st_size, status.st_mtime_ns))
+        for name in (image.file, image.mask):
+            if name is not None:
+                status = (drive.root / name).stat()
+                files.append((name, status.st_size, status.st_mtime_ns))
     return fingerprint(drive.manifest.model_dump(mode="json"), files)
 
 
 @cache
 def code_version() -> str:
     """Of the code that stages run: a stage that was finished by other code is done again."""
-    package = Path(mrasfm_engine.__file__).parent
     digest = hashlib.sha256(mrasfm_engine.__version__.encode())
-    for path in sorted(package.rglob("*.py")):
-        if path.relative_to(package).parts[0] not in NOT_IN_STAGES:
-            digest.update(path.read_bytes())
+    for package in (Path(mrasfm_engine.__file__).parent, Path(schemas.__file__).parent):
+        for path in sorted(package.rglob("*.py")):
+            name = path.relative_to(package)
+            if name.parts[0] not in NOT_IN_STAGES:
+                digest.update(str(name).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -69,6 +73,8 @@ class StageStore:
                     return None
                 # By name: a damaged directory can hide arrays.
                 return {name: archive[name] for name in header["arrays"]}, header["report"]
+        except MemoryError:
+            raise
         except Exception:
             # On a damaged file zipfile and numpy raise a dozen kinds.
             return None

@@ -15,6 +15,7 @@ from mrasfm_engine.registration.model import Model
 
 Bools = NDArray[np.bool_]
 
+MIN_BASELINES_M2 = 1e-6
 MAX_UNKNOWNS_FOR_COVARIANCE = 12_000  # of units and cameras; above, the inverse would take gigabytes
 
 
@@ -63,7 +64,7 @@ def judge_calibration(
     settings = model.config.adjustment
     if not settings.refine_calibration:
         return CalibrationVerdict(False, "held by the settings")
-    if len(model.drive.cameras) < 2:
+    if model.drive.has_single_camera:
         return CalibrationVerdict(False, "a single camera has no calibration to others")
     if not georeferenced and heading_change_deg(model) < settings.min_heading_change_deg:
         return CalibrationVerdict(False, "held as given: without GNSS a drive this straight does not observe it")
@@ -75,8 +76,10 @@ def judge_calibration(
     )
     if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
         sigma = covariances(problem, problem.state).sigma_scale
-        if not sigma <= settings.max_scale_sigma:
-            return CalibrationVerdict(False, f"held as given: freed, it would leave scale unknown to {sigma:.0%}")
+        if np.isnan(sigma):
+            return CalibrationVerdict(False, "held as given: too few units to tell what freeing it would do")
+        if sigma > settings.max_scale_sigma:
+            return CalibrationVerdict(False, f"held as given: freed, it would leave scale uncertain by {sigma:.0%}")
     return CalibrationVerdict(
         True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"
     )
@@ -88,8 +91,9 @@ def scale_of_baselines(model: Model) -> tuple[float, float]:
     given = prior.position_m - prior.position_m.mean(0)
     current = model.state.camera_position_m - model.state.camera_position_m.mean(0)
     information = float(((given**2).sum(1) / prior.sigma_translation_m**2).sum())
-    factor = float((given * current).sum() / max(float((current**2).sum()), 1e-12))
-    return factor, 1.0 / float(np.sqrt(max(information, 1e-12)))
+    if min(float((current**2).sum()), float((given**2).sum())) < MIN_BASELINES_M2:
+        return 1.0, np.inf  # cameras in one place have no scale
+    return float((given * current).sum() / (current**2).sum()), 1.0 / float(np.sqrt(information))
 
 
 def scale_with_baselines(model: Model, factor: float) -> None:

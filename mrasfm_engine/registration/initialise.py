@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.solver import SolverOptions
+from mrasfm_engine.correspondence.verification import parallax_rad
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.registration.camera_set import cameras_of, matrix_of, register_unit, rigid3d
@@ -23,6 +24,7 @@ CANDIDATES = 4  # pairs of units that are tried
 MAX_RELATIVE_MATCHES = 1200
 RELATIVE_ERROR_PX = 4.0
 ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
+FULL_PARALLAX_RAD = np.radians(0.5)
 MIN_POINTS = 30
 GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
 INSIDE = "points inside the first unit"
@@ -38,7 +40,7 @@ class Initialisation:
 
 
 def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.float64], dict[tuple[int, int], int]]:
-    """Verified matches inside every unit (units,) and between units (by pair, smaller unit first)."""
+    """Verified matches inside every unit (units,), and those that show motion between units, smaller unit first."""
     inside = np.zeros(len(model.registered))
     between: dict[tuple[int, int], int] = {}
     for pair in pairs:
@@ -47,8 +49,15 @@ def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.
         if u == v:
             inside[u] += count
         else:
-            between[u, v] = between.get((u, v), 0) + count
+            between[u, v] = between.get((u, v), 0) + round(count * _share_that_moves(model, pair))
     return inside, between
+
+
+def _share_that_moves(model: Model, pair: PairMatches) -> float:
+    """How far the matches show motion, 0 to 1: units at which the car stands match best, but give no points."""
+    a = model.keypoints.rays[model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]]
+    b = model.keypoints.rays[model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]]
+    return min(1.0, parallax_rad(a, b) / float(FULL_PARALLAX_RAD))
 
 
 def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig: Floats | None) -> Initialisation:
@@ -63,12 +72,14 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
     ReconstructionError
         Where no pair of units gives points.
     """
+    prior = prior_world_from_rig
+    known = np.isfinite(prior[:, 0, 3]) if prior is not None else np.zeros(len(model.registered), dtype=np.bool_)
     inside, between = unit_scores(model, pairs)
     ranked = sorted(between, key=lambda uv: -(between[uv] + inside[uv[0]] + inside[uv[1]]))
     best: tuple[int, Initialisation, Floats, Floats] | None = None
     for u, v in _varied(ranked):
-        anchor = np.eye(4) if prior_world_from_rig is None else prior_world_from_rig[u]
-        for method, pose in _proposals(model, pairs, u, v, anchor, prior_world_from_rig):
+        anchor = np.eye(4) if prior is None or not known[u] else prior[u]
+        for method, pose in _proposals(model, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
             points = _evaluate(model, u, v, anchor, pose)
             if best is None or points > best[0]:
                 best = (
@@ -122,7 +133,7 @@ def _proposals(
             yield INSIDE, registration.world_from_rig
     relative = (
         _single_camera_relative_pose(model, pairs, u, v, prior_world_from_rig)
-        if len(model.drive.cameras) == 1
+        if model.drive.has_single_camera
         else _generalised_relative_pose(model, pairs, u, v)
     )
     if relative is not None:
@@ -156,7 +167,8 @@ def _single_camera_relative_pose(
     a, b = _matches_between(model, pairs, u, v)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
-    camera = cameras_of(model)[0]
+    index = int(model.image_camera[0])
+    camera = cameras_of(model)[index]
     result = pycolmap.estimate_essential_matrix(
         model.keypoints.xy_px[a], model.keypoints.xy_px[b], camera, camera, estimation_options=options
     )
@@ -167,7 +179,7 @@ def _single_camera_relative_pose(
         length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
     u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))
     u_from_v[:3, 3] *= length_m / max(float(np.linalg.norm(u_from_v[:3, 3])), 1e-9)
-    rig_from_cam = model.state.rig_from_cam[0]
+    rig_from_cam = model.state.rig_from_cam[index]
     result_pose: Floats = rig_from_cam @ u_from_v @ se3.inverse(rig_from_cam)
     return result_pose
 

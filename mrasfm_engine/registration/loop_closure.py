@@ -41,7 +41,6 @@ class Revisit:
     later: int
     world_from_rig: Floats  # pose of the later unit from points that the earlier one sees
     drift: Floats  # (4, 4) that moves the later unit's current pose there: world_from_rig @ inverse(current)
-    inliers: int
 
 
 def split_pairs(
@@ -64,7 +63,9 @@ def find_revisits(model: Model, far_pairs: Sequence[PairMatches]) -> tuple[list[
         if model.registered[units].all():
             by_units.setdefault((units[0], units[1]), []).append(pair)
     found = [r for (i, j), own in sorted(by_units.items()) if (r := _try(model, i, j, own)) is not None]
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(model.state.unit_position_m, axis=0), axis=1))])
+    known = np.flatnonzero(model.registered)
+    steps = np.linalg.norm(np.diff(model.state.unit_position_m[known], axis=0), axis=1)
+    way = dict(zip(known.tolist(), np.concatenate([[0.0], np.cumsum(steps)]), strict=True))
     plausible = [r for r in found if _plausible(r, model, float(way[r.later] - way[r.earlier]))]
     believed = [r for r in plausible if sum(_agree(r, other, model) for other in plausible) >= MIN_SUPPORT]
     return believed, len(by_units)
@@ -96,7 +97,6 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
         later=later,
         world_from_rig=registration.world_from_rig,
         drift=registration.world_from_rig @ se3.inverse(current),
-        inliers=registration.inliers,
     )
 
 

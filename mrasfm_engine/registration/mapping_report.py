@@ -56,7 +56,11 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     result: dict[str, Any] = {
         "points": int(model.solved.sum()),
         "observations": int(model.kept.sum()),
-        "rejected": {"observations": refinement.observations_dropped, "points": refinement.points_dropped},
+        "rejected": {
+            "observations": refinement.observations_dropped,
+            "points": refinement.points_dropped,
+            "units": refinement.units_dropped,
+        },
         "sigma_observation_px": refinement.sigma_px,
         "adjustments": [_adjustment(r) for r in refinement.adjustments],
         "calibration": {
@@ -69,7 +73,7 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     if certainty is not None and np.isfinite(certainty.sigma_scale):
         result["scale"] = {
             "sigma_relative": certainty.sigma_scale,
-            "from": "baselines of the rig and GNSS" if alignment is not None else "baselines of the rig",
+            "from": _scale_source(model, refinement),
         }
     if placement is not None and alignment is not None:
         times = model.drive.timestamps_us[placement.units[~alignment.inlier]]
@@ -91,6 +95,12 @@ def _poorly_seen(model: Model) -> list[str]:
     counts = np.bincount(model.keypoints.image[model.kept], minlength=len(images))
     poor = np.flatnonzero(model.registered[model.image_unit] & (counts < MIN_CAMERA_MATCHES))
     return [images[i].file for i in poor]
+
+
+def _scale_source(model: Model, refinement: Refinement) -> str:
+    if model.drive.has_single_camera:
+        return "GNSS" if refinement.georeferenced else "rough poses"
+    return "baselines of the rig and GNSS" if refinement.georeferenced else "baselines of the rig"
 
 
 def _adjustment(report: Report) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import Layout, Observations
 from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solve
 from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.state import State
@@ -75,6 +76,14 @@ class Model:
         self.state.unit_rotation[unit] = world_from_rig[:3, :3]
         self.state.unit_position_m[unit] = world_from_rig[:3, 3]
         self.registered[unit] = True
+
+    def drop_unsupported(self, min_observations: int) -> Ints:
+        """Take the poses of units back that hardly observe a point any more; which ones."""
+        counts = np.bincount(self.keypoints.unit[self.kept], minlength=len(self.registered))
+        lost = np.flatnonzero(self.registered & (counts < min_observations))
+        self.registered[lost] = False
+        self.kept[np.isin(self.keypoints.unit, lost)] = False
+        return lost
 
     def clear(self) -> None:
         """Forget all poses and points."""
@@ -204,6 +213,8 @@ class Model:
             free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
         )
         solution, report = solve(problem, cancel=cancel)
+        if cancel is not None and cancel():
+            raise CancelledError  # else a half-solved model would pass for a finished one
         points = self.state.points_m
         points[tracks] = solution.points_m
         self.state = replace(solution, points_m=points)

@@ -23,6 +23,8 @@ MIN_CLOCK_OFFSET_S = 0.05
 CLOCK_OFFSET_SIGMAS = 5.0
 MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receiver's scale:
 SCALE_DISAGREEMENT_SIGMAS = 3.0
+MIN_ROUGH_POSES = 2
+MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
 
@@ -46,13 +48,13 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     settings, times = model.config.gnss, model.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
     units = np.flatnonzero(model.registered & np.isfinite(measured[:, 0]))
-    single = len(model.drive.cameras) == 1
+    single = model.drive.has_single_camera
     if single and len(units) > 1:
-        _scale(model, _extent(measured[units]) / _extent(model.state.unit_position_m[units]))
+        scale_with_baselines(model, _extent(measured[units]) / _extent(model.state.unit_position_m[units]))
     alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
     for _ in range(SCALE_ROUNDS if single else 0):
         if isinstance(alignment, GnssAlignment):
-            _scale(model, alignment.scale)
+            scale_with_baselines(model, alignment.scale)
             alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
     if isinstance(alignment, str):
         return Placement(reason=alignment)
@@ -85,15 +87,23 @@ def _align(model: Model, units: Ints, antenna_in_rig_m: Floats, measured: Floats
     )
 
 
-def place_by_rough_poses(model: Model, rough_world_from_rig: Floats) -> None:
-    """Move the model into the frame of the rough poses (units, 4, 4), by the units' own rotations."""
-    units = np.flatnonzero(model.registered)
-    rough, own = rough_world_from_rig[units], model.state.world_from_rig[units]
-    if len(model.drive.cameras) == 1 and len(units) > 1:
-        _scale(model, _extent(rough[:, :3, 3]) / _extent(own[:, :3, 3]))
-        own = model.state.world_from_rig[units]
+def place_by_rough_poses(model: Model, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
+    """Move the model into the frame of the rough poses (units, 4, 4; NaN where unknown), by the units' own rotations.
+
+    One camera also gets its scale there. Returns whether there were poses enough.
+    """
+    units = np.flatnonzero(model.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
+    if len(units) < MIN_ROUGH_POSES:
+        return False
+    rough = rough_world_from_rig[units]
+    if model.drive.has_single_camera:
+        if _extent(rough[:, :3, 3]) < MIN_EXTENT_SIGMAS * sigma_translation_m:
+            return False
+        scale_with_baselines(model, _extent(rough[:, :3, 3]) / _extent(model.state.unit_position_m[units]))
+    own = model.state.world_from_rig[units]
     rotation = robust_mean_rotation(rough[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
     _move(model, se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T)))
+    return True
 
 
 def _extent(position_m: Floats) -> float:
@@ -106,14 +116,6 @@ def _move(model: Model, world_from_model: Floats) -> None:
     state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
     state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)
     state.points_m[:] = se3.apply(world_from_model, state.points_m)
-
-
-def _scale(model: Model, factor: float) -> None:
-    """Scale a model whose only camera leaves the images unchanged by it, if the camera sits at the rig's origin or the
-    lever arm is small; adjustment settles the rest.
-    """
-    model.state.unit_position_m[:] *= factor
-    model.state.points_m[:] *= factor
 
 
 def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> float:
@@ -130,7 +132,7 @@ def share_scale(model: Model, placement: Placement) -> None:
     steps.
     """
     alignment = placement.alignment
-    if alignment is None or len(model.drive.cameras) < 2:
+    if alignment is None or model.drive.has_single_camera:
         return
     rig, sigma_rig = scale_of_baselines(model)
     information_rig, information_gnss = 1.0 / sigma_rig**2, 1.0 / max(placement.sigma_scale, 1e-9) ** 2
@@ -152,14 +154,17 @@ def _findings(
     antenna = model.state.unit_position_m[units] + model.state.unit_rotation[units] @ antenna_in_rig_m
     centre = antenna.mean(0)
     fitted = centre + alignment.scale * (antenna - centre)
-    offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, model.drive.timestamps_us[units])
-    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
+    times = model.drive.timestamps_us[units]
+    offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, times)
+    # The receiver's errors change slowly, so its samples know less of the clock than independent ones would.
+    correlated = np.sqrt(_samples_per_correlation_time(times, model.config.gnss.correlation_time_s))
+    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * correlated * offset[1]):
         direction = "ahead of" if offset[0] > 0 else "behind"
         findings.append(
             warning(
                 "gnss-clock-offset",
                 f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
-                f"(sigma {offset[1]:.2f} s)",
+                f"(sigma {correlated * offset[1]:.2f} s)",
                 "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
             )
         )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.adjustment.observability import Covariances, covariances
 from mrasfm_engine.adjustment.priors import FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
+from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.registration.calibration import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
@@ -43,6 +44,7 @@ class Refinement:
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
     points_dropped: int = 0
+    units_dropped: list[int] = field(default_factory=list)
     certainty: Covariances | None = None
 
     @property
@@ -74,8 +76,17 @@ def refine(
     if gnss is not None and antenna_in_rig_m is not None:
         result.placement = place_by_gnss(model, gnss, antenna_in_rig_m)
         positions = result.placement.prior
-    if positions is None and rough_world_from_rig is not None:
-        place_by_rough_poses(model, rough_world_from_rig)
+    rough = model.drive.manifest.rough_poses
+    placed = positions is not None
+    if not placed and rough_world_from_rig is not None and rough is not None:
+        placed = place_by_rough_poses(model, rough_world_from_rig, rough.sigma_translation_m)
+    if not placed and model.drive.has_single_camera:
+        raise ReconstructionError(
+            "one camera tells no scale, and neither GNSS nor rough poses could: "
+            + (result.placement.reason if result.placement is not None else "the drive has none that are usable"),
+            remedy="Give a second camera with its baseline, or positions that follow the car's way.",
+            code="no-metric-scale",
+        )
     free_units = _free_units(model, georeferenced=positions is not None)
     result.sigma_px = _observation_sigma(model)
     result.calibration = judge_calibration(
@@ -93,7 +104,7 @@ def refine(
         terms = _terms(model, positions, result)
         result.adjustments.append(
             model.adjust(
-                free_units,
+                free_units & model.registered,
                 free_cameras=np.full(len(model.camera_kind), result.calibration.free),
                 free_focal=result.focal_free,
                 terms=terms,
@@ -104,10 +115,12 @@ def refine(
         if done < ROUNDS - 1:
             model.complete()
         observations, points = model.filter(model.config.mapping.filter_error_px)
+        result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points
         if progress is not None:
             progress(done + 1, ROUNDS)
+    result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _certainty(model, positions, result)
     return result
 
@@ -134,6 +147,12 @@ def _free_units(model: Model, *, georeferenced: bool) -> Bools:
 def _observation_sigma(model: Model) -> float:
     """Standard deviation of an image coordinate, from the median error and the redundancy of the points."""
     rows = np.flatnonzero(model.kept)
+    if not len(rows):
+        raise ReconstructionError(
+            "no point of the scene is left after filtering",
+            remedy="Check the cameras' intrinsics, and that the images belong to them.",
+            code="nothing-left",
+        )
     tracks = model.tracks.of_keypoint[rows]
     errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, tracks)
     points = len(np.unique(tracks))
@@ -169,7 +188,7 @@ def _focal_prior(model: Model) -> FocalPrior:
 
 def _certainty(model: Model, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
     """Covariances with the calibration free under its prior, also where it was held: its error is there as well."""
-    several = len(model.drive.cameras) > 1
+    several = not model.drive.has_single_camera
     terms = _terms(model, positions, result)
     if several and not result.calibration.free:
         terms.append(calibration_prior(model))

@@ -66,7 +66,7 @@ def build_scene(
 def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibration]:
     prior: CalibrationPrior = calibration_prior(model)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    focal = np.array([c.sigma_focal_px or 0.0 for c in model.drive.cameras])
+    focal = np.array([c.sigma_focal_px or np.nan for c in model.drive.cameras])
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
         sigma = refinement.certainty.sigma_camera[:, :6]

@@ -71,6 +71,11 @@ class Drive:
         ]
 
     @cached_property
+    def has_single_camera(self) -> bool:
+        """Whether all images are of one camera, however many the rig has: then it knows no scale."""
+        return len({image.camera for image in self.images}) == 1
+
+    @cached_property
     def timestamps_us(self) -> NDArray[np.int64]:
         """The units' timestamps (units,)."""
         return np.array([frame.timestamp_us for frame in self.manifest.frames], dtype=np.int64)

@@ -56,7 +56,8 @@ def test_opposite_gnss_outliers(variant: Variant, mrasfm: Run) -> None:
     samples[2]["latitude_deg"] += 5e-4
     samples[5]["latitude_deg"] -= 5e-4
     errors = reconstructed(mrasfm, variant.save().root, variant.scene)
-    assert 0 < errors["metric"]["rmse_m"] < 0.2
+    assert 0 < errors["similarity"]["rmse_m"] < 0.02
+    assert 0 < errors["metric"]["rmse_m"] < 0.5  # scale is known to a tenth on so short a way; an outlier counts metres
     report = read_report(variant.scene)
     assert "gnss-jump" in {finding["code"] for finding in report["findings"]}
     refinement = report["by_stage"]["refinement"]

@@ -20,9 +20,12 @@ def test_accuracy(surround_drive: Path, surround_scene: Path, mrasfm: Run) -> No
     assert result.code == 0
     errors = json.loads(result.out)
     assert (errors["registered_units"], errors["registered_images"]) == (UNITS, IMAGES)
-    assert 0 < errors["metric"]["rmse_m"] < 0.1
     assert 0 < errors["metric"]["rotation_median_deg"] < 0.1
     assert 0 < errors["similarity"]["rmse_m"] < 0.02
+    # On 8 m of way, cameras that share little of their views know scale to some percent: the report says how well.
+    sigma = read_report(surround_scene)["by_stage"]["refinement"]["scale"]["sigma_relative"]
+    assert 0 < sigma < 0.15
+    assert 0 < abs(errors["similarity"]["scale"] - 1.0) < 3 * sigma
 
 
 def test_every_file_is_there_and_readable(surround_scene: Path) -> None:
