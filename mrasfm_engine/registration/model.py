@@ -141,7 +141,10 @@ class Model:
         self.filter(self.triangulator.max_error_px)
 
     def filter(self, max_error_px: float) -> tuple[int, int]:
-        """Drop observations with larger errors, and points left with fewer than two; how many of both."""
+        """Drop observations with larger errors, and points left with fewer than two or without an angle.
+
+        Returns how many of both.
+        """
         rows = np.flatnonzero(self.kept)
         tracks = self.tracks.of_keypoint[rows]
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, tracks)
@@ -149,6 +152,8 @@ class Model:
         self.kept[rows[bad]] = False
         left = np.bincount(tracks[~bad], minlength=len(self.tracks))
         lost = self.solved & (left < 2)
+        reduced = np.unique(tracks[bad])
+        lost[reduced[~self.triangulator.has_angle(self.state, self.tracks, self.kept, reduced)]] = True
         self.solved[lost] = False
         alone = np.flatnonzero(self.kept)
         self.kept[alone[lost[self.tracks.of_keypoint[alone]]]] = False

@@ -241,6 +241,38 @@ def _errors(
         out[n] = _error2(cfw_r[image[k]], cfw_t[image[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _has_angle(
+    which: Any,
+    first: Any,
+    track_keypoints: Any,
+    kept: Any,
+    image: Any,
+    rays: Any,
+    cfw_r: Any,
+    cos_limit: float,
+    out: Any,
+) -> None:
+    """Whether two observations of a point are seen under at least the limit's angle."""
+    direction = np.empty((MAX_OBSERVATIONS, 3))
+    for n in range(len(which)):
+        count = 0
+        out[n] = False
+        for s in range(first[which[n]], first[which[n] + 1]):
+            k = track_keypoints[s]
+            if kept[k] and count < MAX_OBSERVATIONS and not out[n]:
+                r = cfw_r[image[k]]
+                for i in range(3):
+                    direction[count, i] = r[0, i] * rays[k, 0] + r[1, i] * rays[k, 1] + r[2, i] * rays[k, 2]
+                for m in range(count):
+                    c = 0.0
+                    for i in range(3):
+                        c += direction[count, i] * direction[m, i]
+                    if c < cos_limit:
+                        out[n] = True
+                count += 1
+
+
 def cam_from_world(state: State, keypoint_units: Ints, keypoint_cameras: Ints) -> tuple[Floats, Floats]:
     """Rotations (n, 3, 3) and translations (n, 3) of images of the given units and cameras."""
     world_from_cam = state.unit_rotation[keypoint_units] @ state.camera_rotation[keypoint_cameras]
@@ -292,6 +324,16 @@ class Triangulator:
             self._keypoints.rays, registered_units[self._image_unit], r, t, self._kind, state.camera_params,
             self.max_error_px**2, self._min_angle, points_m, solved, kept,
         )  # fmt: skip
+
+    def has_angle(self, state: State, tracks: Tracks, kept: Bools, which: Ints) -> Bools:
+        """Which of the tracks `which` are still seen under an angle that gives depth by their kept observations."""
+        r, _ = cam_from_world(state, self._image_unit, self._image_camera)
+        out = np.empty(len(which), dtype=np.bool_)
+        _has_angle(
+            which, tracks.first, tracks.keypoints, kept, self._keypoints.image, self._keypoints.rays, r,
+            math.cos(self._min_angle), out,
+        )  # fmt: skip
+        return out
 
     def errors_px(self, state: State, rows: Ints, points_m: Floats, point: Ints) -> Floats:
         """Reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) of points_m; 1e6 behind."""

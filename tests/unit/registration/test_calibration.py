@@ -116,3 +116,25 @@ def test_one_cameras_scale_comes_from_rough_poses_that_reach_far_enough() -> Non
     assert place_by_rough_poses(model, rough, 0.1)
     off = np.linalg.norm(model.state.unit_position_m - rough[:, :3, 3], axis=1)
     assert 0.0 < off.max() < 0.5
+
+
+def test_points_without_an_angle_are_told_from_those_with_one() -> None:
+    model = true_model()
+    solved = np.flatnonzero(model.solved)
+    expected = []
+    for track in solved:
+        keypoints = model.tracks.keypoints[model.tracks.first[track] : model.tracks.first[track + 1]]
+        keypoints = keypoints[model.kept[keypoints]]
+        turn = model.state.unit_rotation[model.keypoints.unit[keypoints]]
+        camera = model.state.camera_rotation[model.keypoints.camera[keypoints]]
+        rays = (turn @ camera @ model.keypoints.rays[keypoints][..., None])[..., 0]
+        expected.append(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1).min())))
+    expected = np.array(expected)
+    clear = np.abs(expected - 1.0) > 1e-6
+    found = model.triangulator.has_angle(model.state, model.tracks, model.kept, solved)
+    np.testing.assert_array_equal(found[clear], expected[clear] > 1.0)
+    # Every point has one; with fewer observations some have not.
+    assert found.all()
+    model.kept[model.keypoints.unit > 1] = False
+    fewer = model.triangulator.has_angle(model.state, model.tracks, model.kept, solved)
+    assert 0 < fewer.sum() < len(fewer)
