@@ -8,6 +8,7 @@ from typing import Any
 
 from mrasfm_engine import stages
 from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.export_scene import write_scene
 
@@ -54,5 +55,7 @@ def reconstruct(
     matches = stages.matches(run, features, prior)
     model = stages.mapping(run, features, matches, prior)
     scene = stages.scene(run, model, features, matches, prior)
+    if cancel():
+        raise CancelledError
     write_scene(scene, out, run.report)
     return run.report
