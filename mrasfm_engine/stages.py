@@ -36,6 +36,9 @@ from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
+STATE_ARRAYS = (
+    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m"
+)  # fmt: skip
 
 
 @dataclass
@@ -54,6 +57,10 @@ class Run:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
 
+    def next_key(self, name: str, settings: object) -> str:
+        """The fingerprint of a stage that follows those done so far."""
+        return fingerprint(self._key or drive_fingerprint(self.drive), name, settings, code_version())
+
     def stage(
         self, name: str, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]
     ) -> tuple[Arrays, dict[str, Any]]:
@@ -63,7 +70,7 @@ class Run:
         """
         if self.cancel():
             raise CancelledError
-        self._key = fingerprint(self._key or drive_fingerprint(self.drive), name, settings, code_version())
+        self._key = self.next_key(name, settings)
         started = time.perf_counter()
         found = self.store.load(name, self._key)
         reused = found is not None
@@ -99,7 +106,8 @@ def prior(run: Run) -> PriorTrajectory:
 def probe(run: Run) -> None:
     """On the first units: is the calibration the right way round?"""
     images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
-    if len(run.drive.cameras) < 2 or run.store.load("features", _features_key(run)) is not None:
+    known = run.store.has("features", run.next_key("features", run.config.features.model_dump()))
+    if len(run.drive.cameras) < 2 or known:
         return
     first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
     features = extract_features(
@@ -108,11 +116,6 @@ def probe(run: Run) -> None:
     require_calibration_direction(
         run.drive, images, features, NearestNeighbourMatcher(run.config.matching), run.config.matching
     )
-
-
-def _features_key(run: Run) -> str:
-    settings = run.config.features.model_dump()
-    return fingerprint(drive_fingerprint(run.drive), "features", settings, code_version())
 
 
 def features(run: Run) -> list[ImageFeatures]:
@@ -245,11 +248,6 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     model.registered, model.solved, model.kept = arrays["registered"], arrays["solved"], arrays["kept"]
     model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
     return model
-
-
-STATE_ARRAYS = (
-    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m"
-)  # fmt: skip
 
 
 def scene(

@@ -28,7 +28,6 @@ from schemas import Camera
 Floats = NDArray[np.float64]
 
 PERSPECTIVE, RADIAL, FISHEYE = 0, 1, 2
-MIN_DEPTH_M = 1e-3
 
 
 def pack_camera(model: str, params: ArrayLike) -> tuple[int, Floats]:

@@ -62,8 +62,15 @@ class StageStore:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
+    def has(self, name: str, key: str) -> bool:
+        """Whether a stage has been finished with this fingerprint, without reading its arrays."""
+        return self._read(name, key, arrays=False) is not None
+
     def load(self, name: str, key: str) -> tuple[Arrays, dict[str, Any]] | None:
         """Arrays and report of a stage, or None where it has not been finished with this fingerprint."""
+        return self._read(name, key, arrays=True)
+
+    def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
         path = self._folder / f"{name}.npz"
         try:
             # Opened here: np.load leaves a file open that turns out not to be an archive.
@@ -72,7 +79,8 @@ class StageStore:
                 if header["key"] != key:
                     return None
                 # By name: a damaged directory can hide arrays.
-                return {name: archive[name] for name in header["arrays"]}, header["report"]
+                wanted = header["arrays"] if arrays else ()
+                return {name: archive[name] for name in wanted}, header["report"]
         except MemoryError:
             raise
         except Exception:

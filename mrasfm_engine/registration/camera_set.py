@@ -63,9 +63,8 @@ def register_unit(model: Model, unit: int) -> Registration:
 
 def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_vote: bool = True) -> Registration:
     """Find the pose of a unit from given correspondences; `by_vote` also by the cameras' own poses."""
-    needed = min_inliers
-    if len(seen.camera) < needed:
-        return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {needed} are needed")
+    if len(seen.camera) < min_inliers:
+        return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {min_inliers} are needed")
     sample = seen.of(_spread(len(seen.camera), MAX_CORRESPONDENCES))
     pose = _joint_pose(model, sample)
     inlier = np.zeros(len(seen.camera), dtype=np.bool_)
@@ -83,7 +82,7 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_v
         if method == "joint" and disagreeing:
             voted_out = disagreeing
     count = int(inlier.sum())
-    if pose is None or count < needed or count < model.config.mapping.min_pnp_inlier_ratio * len(inlier):
+    if pose is None or count < min_inliers or count < model.config.mapping.min_pnp_inlier_ratio * len(inlier):
         return _failed(unit, seen, count, f"only {count} of {len(inlier)} points agree with one pose")
     return Registration(
         unit=unit,

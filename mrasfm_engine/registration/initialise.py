@@ -190,10 +190,7 @@ def _matches_between(model: Model, pairs: Sequence[PairMatches], u: int, v: int)
     for pair in pairs:
         if {int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])} != {u, v}:
             continue
-        a = model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]
-        b = model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]
-        if model.image_unit[pair.image_a] != u:
-            a, b = b, a
+        a, b = model.matched_keypoints(pair, u)
         rows_u.append(a)
         rows_v.append(b)
     a, b = np.concatenate(rows_u), np.concatenate(rows_v)

@@ -75,10 +75,7 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
     """Register the later unit against points that the earlier one observes."""
     rows_later, tracks = [], []
     for pair in pairs:
-        a = model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
-        b = model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
-        if model.image_unit[pair.image_a] != earlier:
-            a, b = b, a
+        a, b = model.matched_keypoints(pair, earlier)
         observed = model.kept[a]
         rows_later.append(b[observed])
         tracks.append(model.tracks.of_keypoint[a[observed]])

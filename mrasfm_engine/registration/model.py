@@ -16,6 +16,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.triangulation.triangulate import Triangulator
@@ -95,6 +96,12 @@ class Model:
         """Tracks seen by any of the units, ascending."""
         rows = [self.rows_of_unit[int(u)] for u in units]
         return np.unique(self.tracks.of_keypoint[np.concatenate(rows)]) if rows else np.zeros(0, dtype=np.int64)
+
+    def matched_keypoints(self, pair: PairMatches, unit: int) -> tuple[Ints, Ints]:
+        """Keypoints of a pair's verified matches: those in an image of `unit` first, then those of the other unit."""
+        a = self.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
+        b = self.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
+        return (a, b) if self.image_unit[pair.image_a] == unit else (b, a)
 
     def visible_counts(self) -> Ints:
         """How many keypoints with a point every unit has (units,)."""
