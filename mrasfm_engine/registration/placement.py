@@ -64,7 +64,7 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     sigma_scale = alignment.sigma_scale * float(np.sqrt(correlated))
     findings = []
     if not single:
-        findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, sigma_scale)
+        findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
     prior = PositionPrior(
         unit=good,
         position_m=measured[good],
@@ -147,7 +147,7 @@ def _findings(
     sigma_m: Floats,
     units: Ints,
     antenna_in_rig_m: Floats,
-    sigma_scale_gnss: float,
+    correlated: float,
 ) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
     findings = []
@@ -157,19 +157,19 @@ def _findings(
     times = model.drive.timestamps_us[units]
     offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, times)
     # The receiver's errors change slowly, so its samples know less of the clock than independent ones would.
-    correlated = np.sqrt(_samples_per_correlation_time(times, model.config.gnss.correlation_time_s))
-    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * correlated * offset[1]):
+    inflation = float(np.sqrt(correlated))
+    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * inflation * offset[1]):
         direction = "ahead of" if offset[0] > 0 else "behind"
         findings.append(
             warning(
                 "gnss-clock-offset",
                 f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
-                f"(sigma {correlated * offset[1]:.2f} s)",
+                f"(sigma {inflation * offset[1]:.2f} s)",
                 "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
             )
         )
     _, sigma_rig = scale_of_baselines(model)
-    sigma = float(np.hypot(sigma_rig, sigma_scale_gnss))
+    sigma = float(np.hypot(sigma_rig, inflation * alignment.sigma_scale))
     if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
         findings.append(
             warning(
