@@ -11,7 +11,18 @@ from enum import StrEnum
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    FailFast,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+# Long lists end at their first bad item (FailFast): a million bad ones would take gigabytes to describe.
 
 # COLMAP's models that describe the cameras cars carry, with their parameters in COLMAP's order.
 CAMERA_MODELS: dict[str, tuple[str, ...]] = {
@@ -205,7 +216,7 @@ class Gnss(_Model):
         description="what height_m counts from: 'ellipsoidal' (WGS84), or the EPSG code of a vertical datum",
     )
     antenna_in_rig_m: Vector3 = Field(description="position of the antenna in the rig frame (lever arm)")
-    samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES)]
+    samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES), FailFast()]
 
     @field_validator("antenna_in_rig_m")
     @classmethod
@@ -225,7 +236,7 @@ class RoughPose(_Model):
 class RoughTrajectory(_Model):
     """A rough trajectory in any metric, gravity aligned (z up) world frame."""
 
-    poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES)]
+    poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES), FailFast()]
     sigma_translation_m: Positive = 0.5
     sigma_rotation_deg: Positive = 2.0
 
@@ -250,7 +261,7 @@ class DriveManifest(_Model):
     version: Literal[1] = Field(1, description="of this contract")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     rig: Rig
-    frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES)]
+    frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()]
     gnss: Gnss | None = None
     rough_poses: RoughTrajectory | None = None
     label_map: LabelMap | None = None

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.drive import DriveManifest
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
+MAX_CONTAINERS = 4_000_000  # objects and lists; 100,000 frames of 8 cameras and a million GNSS samples have 3 million
 MAX_PROBLEMS_SHOWN = 5
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -74,6 +75,12 @@ def parse_document(
     if len(raw) > max_bytes:
         raise DocumentError([FieldProblem("", f"has {len(raw)} bytes, over the bound of {max_bytes}")])
     raw = raw.removeprefix(b"\xef\xbb\xbf")
+    # An empty object is two bytes on the wire and a hundred in memory.
+    containers = raw.count(b"{") + raw.count(b"[")
+    if containers > MAX_CONTAINERS:
+        raise DocumentError(
+            [FieldProblem("", f"has {containers} objects and lists, over the bound of {MAX_CONTAINERS}")]
+        )
     if strict:
         parse_json(raw)
     try:

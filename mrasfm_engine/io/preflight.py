@@ -2,18 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.axes import manifest_in_flu
 from mrasfm_engine.io.findings import Finding, Severity, error, listed, warning
 from mrasfm_engine.io.preflight_gnss import check_gnss
 from mrasfm_engine.io.preflight_images import Progress, check_images
 from mrasfm_engine.scene.drive import Drive
+from schemas import DriveManifest
 
 MAX_UNSYNCHRONISED_US = 60_000  # nuScenes' cameras are up to 50 ms apart
 MIN_FRAME_INTERVAL_US = 1_000
 MAX_FRAME_INTERVAL_US = 20_000_000
 MAX_CAMERA_ROLL_DEG = 60.0
+
+
+class UnsoundDriveError(InputError):
+    """The check of a drive found errors: says the first, and how many more there are.
+
+    Parameters
+    ----------
+    findings
+        All that the check found, errors first.
+    """
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        errors = [finding for finding in findings if finding.severity is Severity.ERROR]
+        more = f" ({len(errors) - 1} more errors)" if len(errors) > 1 else ""
+        super().__init__(errors[0].what + more, remedy=errors[0].remedy, code=errors[0].code)
+        self.findings = tuple(findings)
+
+
+def check_manifest(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Finding]:
+    """What is wrong or odd about a drive as far as its manifest shows it; no file is looked at.
+
+    Parameters
+    ----------
+    manifest
+        In any body axes.
+    use_gnss
+        Whether the reconstruction will use the drive's GNSS.
+
+    Returns
+    -------
+    list of Finding
+        Errors first. With any error the drive cannot be reconstructed.
+    """
+    return _errors_first(_findings_of_manifest(Drive(Path(), manifest_in_flu(manifest)), use_gnss=use_gnss))
 
 
 def check_drive(drive: Drive, *, use_gnss: bool = True, progress: Progress | None = None) -> list[Finding]:
@@ -31,16 +70,12 @@ def check_drive(drive: Drive, *, use_gnss: bool = True, progress: Progress | Non
     list of Finding
         Errors first. With any error the drive cannot be reconstructed.
     """
-    findings = [
-        *_check_frames(drive),
-        *_check_times(drive),
-        *_check_rig(drive),
-        *_check_scale(drive, use_gnss=use_gnss),
-        *_check_rough_poses(drive),
-        *(check_gnss(drive) if use_gnss else []),
-        *check_images(drive, progress),
-    ]
-    return sorted(findings, key=lambda finding: finding.severity is not Severity.ERROR)
+    return _errors_first([*_findings_of_manifest(drive, use_gnss=use_gnss), *check_images(drive, progress)])
+
+
+def is_sound(findings: Sequence[Finding]) -> bool:
+    """Whether no finding is an error."""
+    return all(finding.severity is not Severity.ERROR for finding in findings)
 
 
 def require_sound(findings: list[Finding]) -> None:
@@ -48,13 +83,26 @@ def require_sound(findings: list[Finding]) -> None:
 
     Raises
     ------
-    InputError
+    UnsoundDriveError
         If any finding is an error.
     """
-    errors = [finding for finding in findings if finding.severity is Severity.ERROR]
-    if errors:
-        more = f" ({len(errors) - 1} more errors)" if len(errors) > 1 else ""
-        raise InputError(errors[0].what + more, remedy=errors[0].remedy, code=errors[0].code)
+    if not is_sound(findings):
+        raise UnsoundDriveError(findings)
+
+
+def _findings_of_manifest(drive: Drive, *, use_gnss: bool) -> list[Finding]:
+    return [
+        *_check_frames(drive),
+        *_check_times(drive),
+        *_check_rig(drive),
+        *_check_scale(drive, use_gnss=use_gnss),
+        *_check_rough_poses(drive),
+        *(check_gnss(drive) if use_gnss else []),
+    ]
+
+
+def _errors_first(findings: list[Finding]) -> list[Finding]:
+    return sorted(findings, key=lambda finding: finding.severity is not Severity.ERROR)
 
 
 def _check_frames(drive: Drive) -> list[Finding]:

@@ -1,0 +1,1 @@
+"""What crosses the HTTP API, as pydantic models with examples."""

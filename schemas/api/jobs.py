@@ -1,0 +1,144 @@
+"""Jobs: what is asked, how far it is, and what became of it."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, StringConstraints
+
+from schemas.api.common import RequestBody, Resource, Times
+from schemas.api.problems import Problem
+
+DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
+
+
+class ReconstructionSettings(RequestBody):
+    """What of the engine a request may set; null leaves the engine's default."""
+
+    use_gnss: bool = Field(True, description="false ignores GNSS everywhere")
+    max_keypoints: Annotated[int, Field(ge=128, le=16384)] | None = Field(None, description="an image")
+    max_side_px: Annotated[int, Field(ge=320, le=8192)] | None = Field(
+        None, description="larger images are extracted at reduced size"
+    )
+    refine_calibration: bool | None = Field(None, description="rig_from_cam, where the drive makes it observable")
+    refine_focal: bool | None = Field(None, description="focal lengths, where rig_from_cam varies too")
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
+
+
+class ReconstructionRequest(RequestBody):
+    """One drive to one scene."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"drive_id": "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c", "settings": {"use_gnss": True}}]
+        }
+    )
+
+    drive_id: DriveId
+    settings: ReconstructionSettings = ReconstructionSettings()
+
+
+class JobKind(StrEnum):
+    """What a job does."""
+
+    PREFLIGHT = "PREFLIGHT"
+    RECONSTRUCTION = "RECONSTRUCTION"
+
+
+class JobState(StrEnum):
+    """Where a job is. SUCCEEDED, FAILED and CANCELLED never change again."""
+
+    QUEUED = "QUEUED"
+    RUNNING = "RUNNING"
+    STALLED = "STALLED"
+    SUCCEEDED = "SUCCEEDED"
+    FAILED = "FAILED"
+    CANCELLED = "CANCELLED"
+
+
+class JobProgress(Resource):
+    """How far the current attempt is."""
+
+    stage: str | None = Field(None, examples=["matches"])
+    done: int | None = None
+    total: int | None = None
+    unit: str | None = Field(None, description="what done and total count", examples=["pairs"])
+    percent: float = Field(description="of the whole job; never falls within an attempt", ge=0, le=100)
+    eta_low_s: float | None = Field(None, description="seconds to the end, likely at least")
+    eta_high_s: float | None = Field(None, description="seconds to the end, likely at most")
+    reused_stages: list[str] = Field(default_factory=list, description="finished before, not done again")
+
+
+class JobAttempt(Resource):
+    """One try at a job."""
+
+    attempt: int
+    worker: str
+    started_at: datetime
+    finished_at: datetime | None = None
+    outcome: str | None = Field(None, description="succeeded, cancelled, released, or the code of a problem")
+    problem: Problem | None = None
+
+
+class JobResource(Times):
+    """A job as the API shows it."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "job_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
+                    "kind": "RECONSTRUCTION",
+                    "drive_id": "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
+                    "state": "RUNNING",
+                    "settings": {"use_gnss": True},
+                    "progress": {
+                        "stage": "matches",
+                        "done": 410,
+                        "total": 1902,
+                        "unit": "pairs",
+                        "percent": 33.5,
+                        "eta_low_s": 120.0,
+                        "eta_high_s": 260.0,
+                        "reused_stages": [],
+                    },
+                    "attempts": [
+                        {
+                            "attempt": 1,
+                            "worker": "reconstructions@host",
+                            "started_at": "2026-05-04T09:31:02Z",
+                            "finished_at": None,
+                            "outcome": None,
+                            "problem": None,
+                        }
+                    ],
+                    "cancel_requested": False,
+                    "heartbeat_at": "2026-05-04T09:33:40Z",
+                    "problem": None,
+                    "scene_id": None,
+                    "retry_of": None,
+                    "created_at": "2026-05-04T09:31:00Z",
+                    "started_at": "2026-05-04T09:31:02Z",
+                    "finished_at": None,
+                    "expires_at": None,
+                }
+            ]
+        }
+    )
+
+    id: str
+    kind: JobKind
+    drive_id: str
+    state: JobState = Field(description="STALLED is RUNNING without a recent heartbeat: another worker will take over")
+    settings: dict[str, Any] = Field(description="as asked")
+    progress: JobProgress
+    attempts: list[JobAttempt]
+    cancel_requested: bool
+    heartbeat_at: datetime | None = None
+    problem: Problem | None = Field(None, description="why it failed")
+    scene_id: str | None = Field(None, description="what it made")
+    retry_of: str | None = Field(None, description="the job that this one repeats")
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
