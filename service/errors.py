@@ -1,0 +1,67 @@
+"""What can go wrong in the service: one exception that carries the problem details it is answered with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
+
+
+class ServiceError(Exception):
+    """A request that is refused, or cannot be served now.
+
+    Parameters
+    ----------
+    status
+        Of the HTTP answer.
+    code
+        Stable identifier in lower case with dashes; the problem's type is made of it.
+    title
+        The same for every problem of the code.
+    detail
+        One sentence that names the file, field or resource and what is wrong with it.
+    remedy
+        One sentence that says what to do.
+    errors, findings
+        All defects where there are several.
+    headers
+        Of the HTTP answer, for example Retry-After.
+    """
+
+    def __init__(
+        self,
+        status: int,
+        code: str,
+        title: str,
+        detail: str,
+        *,
+        remedy: str,
+        errors: Sequence[ProblemItem] = (),
+        findings: Sequence[Mapping[str, Any]] = (),
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(f"{detail} {remedy}")
+        self.status = status
+        self.code = code
+        self.headers = dict(headers or {})
+        self.problem = Problem(
+            type=PROBLEM_TYPE + code,
+            title=title,
+            status=status,
+            detail=detail,
+            remedy=remedy,
+            errors=list(errors),
+            findings=[dict(finding) for finding in findings],
+        )
+
+
+def not_found(what: str, name: str) -> ServiceError:
+    """404, the same for what never was, what was deleted and what belongs to another project."""
+    return ServiceError(
+        404,
+        "not-found",
+        "Not found",
+        f"there is no {what} {name!r} in this project",
+        remedy="Check the id, and that the API key is of the right project.",
+    )

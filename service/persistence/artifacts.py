@@ -1,0 +1,217 @@
+"""The artifact store: bytes under keys, in a folder or in S3, GCS or Azure.
+
+A stored object never changes. In a folder, objects come and go by rename and hard link, so that a drive of many
+gigabytes is neither copied when it is accepted nor when a stage starts on it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import AsyncIterator, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.store import from_url
+
+from service.settings import Settings
+
+_CHUNK_BYTES = 1 << 20
+_DELETE_BATCH = 500
+
+
+@dataclass(frozen=True)
+class StoredObject:
+    """An object as the store lists it; `changed_us` is when it came."""
+
+    key: str
+    changed_us: int
+
+
+def content_mtime_ns(sha256: str) -> int:
+    """A modification time that depends on a file's content alone.
+
+    The engine tells inputs apart by size and modification time; with this one, the same content is the same input on
+    every machine and in every attempt, and finished stages are found again.
+    """
+    return int(sha256[:8], 16) * 1_000_000_000
+
+
+class ArtifactStore:
+    """Objects in a folder or in the cloud.
+
+    Keys are made by us: relative, with forward slashes. All methods but `stream` block.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        url = settings.resolved_artifacts_url
+        self._root: Path | None = None
+        self._store: Any = None
+        if url.startswith("file://"):
+            self._root = Path(unquote(urlsplit(url).path))
+            self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        else:
+            self._store = from_url(url, **_options(url, settings))
+
+    @property
+    def folder(self) -> Path | None:
+        """Where the objects lie on this machine, or None where they lie elsewhere."""
+        return self._root
+
+    def adopt(self, path: Path, key: str, sha256: str) -> None:
+        """Make the file `path` the object `key`; the file is gone afterwards.
+
+        When this returns, the object survives a power cut.
+        """
+        if self._root is None:
+            obstore.put(self._store, key, path)
+            path.unlink()
+            return
+        os.chmod(path, 0o440)
+        os.utime(path, ns=(content_mtime_ns(sha256),) * 2)
+        target = self._root / key
+        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            _sync(path)
+            path.replace(target)
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise
+            partial = target.with_name(f".{secrets.token_hex(8)}.partial")
+            try:
+                shutil.copy2(path, partial)
+                _sync(partial)
+                partial.replace(target)
+            finally:
+                partial.unlink(missing_ok=True)
+            path.unlink()
+        _sync(target.parent)
+
+    def fetch(self, key: str, target: Path, sha256: str) -> None:
+        """Put the object's bytes at `target`, read-only; without copying where the file system allows.
+
+        Raises
+        ------
+        FileNotFoundError
+            Where the store has no such object.
+        """
+        if self._root is not None:
+            try:
+                os.link(self._root / key, target)
+            except OSError as error:
+                if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP):
+                    raise
+                shutil.copy2(self._root / key, target)
+            return
+        with target.open("xb") as file:
+            for chunk in obstore.get(self._store, key).stream(min_chunk_size=_CHUNK_BYTES):
+                file.write(chunk)
+        os.chmod(target, 0o440)
+        os.utime(target, ns=(content_mtime_ns(sha256),) * 2)
+
+    def read(self, key: str) -> bytes:
+        """The whole object, for small ones.
+
+        Raises
+        ------
+        FileNotFoundError
+            Where the store has no such object.
+        """
+        if self._root is not None:
+            return (self._root / key).read_bytes()
+        return bytes(obstore.get(self._store, key).bytes())
+
+    async def stream(self, key: str, *, start: int, stop: int) -> AsyncIterator[bytes]:
+        """Bytes `start` up to, not including, `stop`, piece by piece.
+
+        Raises
+        ------
+        FileNotFoundError
+            Where the store has no such object; at the first piece.
+        """
+        if self._root is not None:
+            file = await asyncio.to_thread((self._root / key).open, "rb")
+            try:
+                await asyncio.to_thread(file.seek, start)
+                while start < stop:
+                    piece = await asyncio.to_thread(file.read, min(_CHUNK_BYTES, stop - start))
+                    if not piece:
+                        return
+                    start += len(piece)
+                    yield piece
+            finally:
+                file.close()
+        else:
+            while start < stop:
+                end = min(start + 8 * _CHUNK_BYTES, stop)
+                yield bytes(await obstore.get_range_async(self._store, key, start=start, end=end))
+                start = end
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Remove objects; what is not there is no error."""
+        wanted = list(keys)
+        if self._root is not None:
+            for key in wanted:
+                (self._root / key).unlink(missing_ok=True)
+            return
+        for i in range(0, len(wanted), _DELETE_BATCH):
+            with contextlib.suppress(FileNotFoundError):
+                obstore.delete(self._store, wanted[i : i + _DELETE_BATCH])
+
+    def objects(self) -> Iterator[StoredObject]:
+        """All objects, in no order."""
+        if self._root is not None:
+            for path in self._root.rglob("*"):
+                with contextlib.suppress(FileNotFoundError):
+                    status = path.stat()
+                    if path.is_file():  # its mtime is made of its content, its ctime is not
+                        yield StoredObject(path.relative_to(self._root).as_posix(), status.st_ctime_ns // 1000)
+            return
+        for batch in obstore.list(self._store):
+            for item in batch:
+                yield StoredObject(item["path"], int(item["last_modified"].timestamp() * 1e6))
+
+    def require_writable(self) -> None:
+        """Write, read and remove a small object.
+
+        Raises
+        ------
+        Exception
+            Whatever the store raised; in a folder OSError.
+        """
+        key = f"probe/{secrets.token_hex(8)}"
+        if self._root is not None:
+            path = self._root / key
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            try:
+                path.write_bytes(b"probe")
+            finally:
+                path.unlink(missing_ok=True)
+        else:
+            obstore.put(self._store, key, b"probe")
+            obstore.delete(self._store, key)
+
+
+def _options(url: str, settings: Settings) -> dict[str, Any]:
+    if not url.startswith("s3"):
+        return {}
+    options: dict[str, Any] = {"region": settings.s3_region}
+    if settings.s3_endpoint:
+        options["endpoint"] = settings.s3_endpoint
+        options["client_options"] = {"allow_http": settings.s3_endpoint.startswith("http://")}
+    return options
+
+
+def _sync(path: Path) -> None:
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

@@ -1,0 +1,108 @@
+"""Which bytes are in the artifact store, whose they are, and what still needs them."""
+
+from __future__ import annotations
+
+import secrets
+
+from sqlalchemy import ColumnElement, delete, exists, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import Session
+
+from service.errors import ServiceError
+from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Project, SceneFile, new_id, now_us
+
+
+def new_key(project_id: str, sha256: str) -> str:
+    """Where a content that is not stored yet goes in the artifact store."""
+    return f"blobs/{project_id}/{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+
+
+def find(session: Session, project_id: str, sha256: str) -> Blob | None:
+    """The project's blob of this content, kept from being collected for a while."""
+    blob = session.scalar(select(Blob).where(Blob.project_id == project_id, Blob.sha256 == sha256))
+    if blob is not None:
+        session.execute(update(Blob).where(Blob.id == blob.id).values(touched_us=now_us()))
+    return blob
+
+
+def record(
+    session: Session, *, project_id: str, sha256: str, size_bytes: int, key: str, within_quota: bool = True
+) -> Blob:
+    """The project's blob of a content that was just stored under `key`.
+
+    Where the content was there already the older blob is returned, whose key differs: the caller deletes what it
+    stored.
+
+    Parameters
+    ----------
+    within_quota
+        Whether the quota may refuse it. Results may exceed it: hours of work are not thrown away for it.
+
+    Raises
+    ------
+    ServiceError
+        413 where the project's quota would be exceeded.
+    """
+    insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
+    values = {"id": new_id("blb"), "project_id": project_id, "sha256": sha256, "size_bytes": size_bytes, "key": key}
+    statement = insert(Blob).values(**values, touched_us=now_us()).on_conflict_do_nothing()
+    if session.execute(statement.returning(Blob.id)).first() is not None:
+        _take_space(session, project_id, size_bytes, within_quota=within_quota)
+    blob = find(session, project_id, sha256)
+    assert blob is not None
+    return blob
+
+
+def _take_space(session: Session, project_id: str, size_bytes: int, *, within_quota: bool) -> None:
+    statement = update(Project).where(Project.id == project_id)
+    if within_quota:
+        statement = statement.where(Project.used_bytes + size_bytes <= Project.max_bytes)
+    if session.execute(statement.values(used_bytes=Project.used_bytes + size_bytes)).rowcount:  # type: ignore[attr-defined]
+        return
+    project = session.get_one(Project, project_id)
+    raise quota_full(project, size_bytes)
+
+
+def quota_full(project: Project, size_bytes: int) -> ServiceError:
+    """413: what is to be stored does not fit the project's quota."""
+    return ServiceError(
+        413,
+        "quota-full",
+        "The project's storage quota is full",
+        f"{size_bytes} bytes do not fit: {project.used_bytes} of {project.max_bytes} bytes are used",
+        remedy="Delete drives or scenes that are not needed any more, or ask the operator for a larger quota.",
+    )
+
+
+def unused() -> ColumnElement[bool]:
+    """The condition that nothing refers to a blob."""
+    return ~(
+        exists().where(Drive.manifest_blob_id == Blob.id)
+        | exists().where(DriveFile.blob_id == Blob.id)
+        | exists().where(SceneFile.blob_id == Blob.id)
+        | exists().where(Checkpoint.blob_id == Blob.id)
+    )
+
+
+def forget_unused(session: Session, *, untouched_since_us: int, limit: int = 500) -> list[str]:
+    """Drop blobs that nothing refers to, and give their space back to their projects.
+
+    Returns
+    -------
+    list of str
+        Keys of objects to delete from the artifact store once this is committed.
+    """
+    ripe = unused() & (Blob.touched_us < untouched_since_us)
+    keys = []
+    for blob in session.scalars(select(Blob).where(ripe).limit(limit)).all():
+        # Asked again: another transaction may have begun to use it.
+        if session.execute(delete(Blob).where(Blob.id == blob.id, ripe)).rowcount:  # type: ignore[attr-defined]
+            freed = Project.used_bytes - blob.size_bytes
+            session.execute(update(Project).where(Project.id == blob.project_id).values(used_bytes=freed))
+            keys.append(blob.key)
+    return keys
+
+
+def known_keys(session: Session, keys: list[str]) -> set[str]:
+    """Those of the keys that belong to a blob."""
+    return set(session.scalars(select(Blob.key).where(Blob.key.in_(keys))))

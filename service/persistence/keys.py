@@ -1,0 +1,82 @@
+"""Projects and their API keys."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.persistence.database import Database
+from service.persistence.tables import ApiKey, Project, now_us
+from service.settings import Settings
+
+FIRST_PROJECT = "default"
+_PREFIX = "mrasfm_"  # lets secret scanners recognise a key that was pushed somewhere
+
+
+def secret_sha256(secret: str) -> str:
+    """What is kept of a key. A plain hash suffices: the secret has 256 random bits and cannot be guessed."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def create_project(session: Session, name: str, settings: Settings) -> Project:
+    """A new project with the settings' quotas."""
+    project = Project(
+        name=name,
+        max_bytes=settings.project_max_bytes,
+        max_active_jobs=settings.project_max_active_jobs,
+        max_drives=settings.project_max_drives,
+    )
+    session.add(project)
+    session.flush()
+    return project
+
+
+def find_project(session: Session, name: str) -> Project | None:
+    """The project of this name."""
+    return session.scalar(select(Project).where(Project.name == name))
+
+
+def create_key(session: Session, project: Project, name: str) -> tuple[ApiKey, str]:
+    """A new key of a project, and its secret, which is not kept."""
+    secret = _PREFIX + secrets.token_urlsafe(32)
+    key = ApiKey(project_id=project.id, name=name, secret_sha256=secret_sha256(secret))
+    session.add(key)
+    session.flush()
+    return key, secret
+
+
+def revoke_key(session: Session, key_id: str) -> bool:
+    """End a key; False where there is none of this id."""
+    key = session.get(ApiKey, key_id)
+    if key is None:
+        return False
+    key.revoked_us = key.revoked_us or now_us()
+    return True
+
+
+def project_of(session: Session, secret: str) -> str | None:
+    """The id of the project that a key opens; None where it opens none."""
+    valid = (ApiKey.secret_sha256 == secret_sha256(secret)) & ApiKey.revoked_us.is_(None)
+    return session.scalar(select(ApiKey.project_id).where(valid))
+
+
+def ensure_first_key(settings: Settings) -> str | None:
+    """Make the first project and key where there is none yet.
+
+    Returns
+    -------
+    str or None
+        The key's secret, which cannot be shown again; None where keys were made before.
+    """
+    database = Database.of(settings)
+    try:
+        with database.write() as session:
+            if session.scalar(select(ApiKey.id).limit(1)) is not None:
+                return None
+            project = find_project(session, FIRST_PROJECT) or create_project(session, FIRST_PROJECT, settings)
+            return create_key(session, project, "first")[1]
+    finally:
+        database.close()

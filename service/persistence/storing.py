@@ -1,0 +1,115 @@
+"""From a file on this machine to an object in the artifact store and a blob in the database."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.persistence import blobs
+from service.persistence.artifacts import ArtifactStore
+from service.persistence.database import Database
+
+_CHUNK_BYTES = 1 << 20
+_BATCH = 500
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredFile:
+    """An object that is in the artifact store, and not necessarily in the database yet."""
+
+    sha256: str
+    size_bytes: int
+    key: str
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Arguments of `blobs.record`."""
+        return {"sha256": self.sha256, "size_bytes": self.size_bytes, "key": self.key}
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def store_file(
+    database: Database,
+    artifacts: ArtifactStore,
+    *,
+    project_id: str,
+    path: Path,
+    sha256: str,
+    size_bytes: int,
+    started: Callable[[str], None] = lambda key: None,
+) -> StoredFile:
+    """Put a file into the artifact store, unless the project has its content already; the file is gone afterwards.
+
+    The caller records the blob together with what refers to it, in one transaction, within the hour: what nothing
+    refers to is collected then.
+
+    Parameters
+    ----------
+    started
+        Told the key of a new object before its bytes are there.
+    """
+    with database.write() as session:
+        known = blobs.find(session, project_id, sha256)
+    if known is not None:
+        path.unlink()
+        return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key)
+    key = blobs.new_key(project_id, sha256)
+    started(key)
+    artifacts.adopt(path, key, sha256)
+    return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key)
+
+
+@contextlib.contextmanager
+def storing(database: Database, artifacts: ArtifactStore, *, project_id: str) -> Iterator[Storing]:
+    """Store files that are recorded within the block, and take back what was not recorded at its end.
+
+    A request that is refused after its bytes were stored, for a quota or a conflict, leaves nothing behind.
+    """
+    store = Storing(database, artifacts, project_id)
+    try:
+        yield store
+    finally:
+        with contextlib.suppress(Exception):  # else the reconciler collects them
+            store.take_back()
+
+
+class Storing:
+    """Stores files for one request."""
+
+    def __init__(self, database: Database, artifacts: ArtifactStore, project_id: str) -> None:
+        self._database = database
+        self._artifacts = artifacts
+        self._project_id = project_id
+        self._new: list[str] = []
+
+    def __call__(self, path: Path, *, sha256: str, size_bytes: int) -> StoredFile:
+        """Store a file as `store_file` does."""
+        return store_file(
+            self._database,
+            self._artifacts,
+            project_id=self._project_id,
+            path=path,
+            sha256=sha256,
+            size_bytes=size_bytes,
+            started=self._new.append,
+        )
+
+    def take_back(self) -> None:
+        """Remove the objects that no blob names: nobody else knows their keys."""
+        for i in range(0, len(self._new), _BATCH):
+            keys = self._new[i : i + _BATCH]
+            with self._database.read() as session:
+                known = blobs.known_keys(session, keys)
+            self._artifacts.delete(set(keys) - known)

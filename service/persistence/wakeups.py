@@ -1,0 +1,148 @@
+"""Messages to the workers, over the broker.
+
+A message only says that a job is waiting. It may be lost, and it may arrive twice: what counts is the job's row.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import redis
+from celery import Celery
+from redis.backoff import NoBackoff
+from redis.retry import Retry
+
+from schemas.api.jobs import JobKind
+from service.persistence.tables import Job
+from service.settings import Settings
+
+TASK = "mrasfm.run_job"
+QUEUES = {JobKind.PREFLIGHT: "checks", JobKind.RECONSTRUCTION: "reconstructions"}
+_ANSWER_WITHIN_S = 2
+
+
+def celery_options(settings: Settings) -> dict[str, Any]:
+    """Celery's configuration, of senders and workers alike."""
+    url = None if settings.redis_url is None else settings.redis_url.get_secret_value()
+    return {
+        "broker_url": url,
+        "result_backend": None,
+        "task_ignore_result": True,
+        "task_default_queue": QUEUES[JobKind.RECONSTRUCTION],
+        "task_acks_late": True,
+        "task_reject_on_worker_lost": True,
+        "worker_prefetch_multiplier": 1,
+        "broker_connection_retry_on_startup": True,
+        "broker_connection_max_retries": None,
+        # The stage goes on while the broker is away: the job's lease is in the database.
+        "worker_cancel_long_running_tasks_on_connection_loss": False,
+        "broker_transport_options": {
+            "visibility_timeout": settings.visibility_timeout_seconds,
+            # Messages of a worker that died are looked for this often, not every 100 s as by default; and a sweeper
+            # that was killed holds the others up for no longer than that.
+            "unacked_restore_interval": min(5.0, settings.visibility_timeout_seconds / 3),
+            "unacked_restore_throttle": 1,
+            "unacked_mutex_expire": 10,
+            "socket_connect_timeout": _ANSWER_WITHIN_S,
+            "socket_keepalive": True,
+            "health_check_interval": 10,
+        },
+    }
+
+
+class Wakeups:
+    """Sends messages, and sees which are waiting.
+
+    Every method raises `BrokerError` within seconds where the broker does not answer.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._celery = Celery("mrasfm", set_as_current=False)
+        self._celery.conf.update(celery_options(settings))
+        self._celery.conf.broker_transport_options |= {
+            "socket_timeout": _ANSWER_WITHIN_S,
+            "retry_on_timeout": False,
+            "max_retries": 0,
+        }
+        self._url = self._celery.conf.broker_url
+
+    def send(self, jobs: list[Job]) -> None:
+        """Wake a worker up for each of the jobs."""
+        try:
+            with self._celery.connection_for_write() as connection:
+                connection.ensure_connection(max_retries=1, timeout=_ANSWER_WITHIN_S, interval_start=0)
+                with self._celery.amqp.Producer(connection) as producer:
+                    for job in jobs:
+                        self._celery.send_task(
+                            TASK,
+                            args=[job.id],
+                            task_id=task_id(job),
+                            queue=QUEUES[JobKind(job.kind)],
+                            producer=producer,
+                            retry=False,
+                        )
+        except Exception as error:  # kombu lets errors of redis, sockets and its own through
+            raise BrokerError(str(error)) from error
+
+    def waiting(self) -> set[str]:
+        """Task ids of all messages that are queued, or delivered and not acknowledged.
+
+        Reads kombu's keys: lists named as the queues, and the hash `unacked`.
+        """
+        try:
+            with self._client() as client:
+                queued = [item for queue in QUEUES.values() for item in client.lrange(queue, 0, -1)]
+                delivered = client.hvals("unacked")
+        except redis.RedisError as error:
+            raise BrokerError(str(error)) from error
+        return set(_ids(queued, delivered))
+
+    def require_broker(self) -> None:
+        """Ask whether the broker answers."""
+        try:
+            with self._client() as client:
+                client.ping()
+        except redis.RedisError as error:
+            raise BrokerError(str(error)) from error
+
+    def _client(self) -> redis.Redis:
+        if not self._url:
+            raise BrokerError("no broker is configured")
+        url = self._url.replace("redis+socket://", "unix://").replace("virtual_host=", "db=")
+        return redis.Redis.from_url(
+            url,
+            socket_timeout=_ANSWER_WITHIN_S,
+            socket_connect_timeout=_ANSWER_WITHIN_S,
+            retry=Retry(NoBackoff(), 0),
+        )
+
+
+class BrokerError(Exception):
+    """The broker does not answer."""
+
+
+def task_id(job: Job) -> str:
+    """Names the message for a job's next attempt; the same message sent twice has one name."""
+    return f"{job.id}.{job.fence + 1}"
+
+
+def _ids(queued: list[bytes], delivered: list[bytes]) -> Iterator[str]:
+    for raw in queued:
+        yield from _id(raw)
+    for raw in delivered:
+        try:
+            message = json.loads(raw)[0]
+        except (ValueError, LookupError, TypeError):
+            continue
+        yield from _id(message)
+
+
+def _id(message: Any) -> Iterator[str]:
+    """The message's task id; nothing where it is not one of ours."""
+    try:
+        content = json.loads(message) if isinstance(message, bytes | str) else message
+        yield str(content["headers"]["id"])
+    except (ValueError, LookupError, TypeError):
+        return

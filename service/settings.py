@@ -1,0 +1,93 @@
+"""Settings of API, workers and reconciler: environment variables that begin with `MRASFM_`.
+
+Everything has a default that suits one machine; production sets `MRASFM_DATABASE_URL`, `MRASFM_ARTIFACTS_URL` and
+`MRASFM_REDIS_URL`. No setting has a default secret.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import quote
+
+from pydantic import Field, SecretStr
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+Bytes = Annotated[int, Field(ge=1)]
+Seconds = Annotated[float, Field(gt=0, le=7 * 86400, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=10_000_000)]
+
+
+class Settings(BaseSettings):
+    """One comment a field. Sizes in bytes, times in seconds."""
+
+    model_config = SettingsConfigDict(env_prefix="MRASFM_", frozen=True, extra="ignore")
+
+    # Where things are
+    data_dir: Path = Path("mrasfm-data")  # state of this machine: spool, scratch, and the embedded database and store
+    database_url: SecretStr | None = None  # SQLAlchemy's; default: SQLite in data_dir
+    artifacts_url: str | None = (
+        None  # obstore's: file:///..., s3://bucket/prefix, gs://..., az://...; default: data_dir
+    )
+    redis_url: SecretStr | None = None  # redis://..., rediss://... or redis+socket:///...; standalone starts its own
+    s3_endpoint: str | None = None  # of an S3-compatible store; credentials come from AWS_ACCESS_KEY_ID and so on
+    s3_region: str = "us-east-1"
+
+    # API
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    max_manifest_bytes: Bytes = 64_000_000
+    max_json_bytes: Bytes = 8_000_000  # of every other JSON body
+    max_file_bytes: Bytes = 256_000_000  # one image or mask
+    max_archive_bytes: Bytes = 50_000_000_000  # one zip or tar, and what it unpacks to
+    max_compression_ratio: Annotated[float, Field(gt=1)] = 200.0  # of one archive entry; images hardly compress
+    min_free_disk_bytes: Annotated[int, Field(ge=0)] = 1_000_000_000  # below, uploads are refused (507)
+    max_concurrent_writes: Count = 8  # uploads that write to disk at one time; the others wait their turn
+    poll_seconds: Seconds = 1.0  # how often an event stream looks for news
+
+    # Quotas of a new project
+    project_max_bytes: Bytes = 1_000_000_000_000
+    project_max_active_jobs: Count = 1_000
+    project_max_drives: Count = 100_000
+
+    # Jobs
+    heartbeat_seconds: Seconds = 5.0  # how often a running job reports
+    lease_seconds: Seconds = 45.0  # without a heartbeat for this long, a job is given to another worker
+    stalled_seconds: Seconds = 20.0  # without a heartbeat for this long, a job is shown as STALLED
+    visibility_timeout_seconds: Seconds = 60.0  # the broker delivers a message again after this, unless renewed
+    visibility_renew_seconds: Seconds = 15.0
+    reconcile_seconds: Seconds = 5.0  # between two passes of the reconciler
+    max_attempts: Annotated[int, Field(ge=1, le=10)] = 3  # the first and two retries
+    retry_delay_seconds: Seconds = 2.0
+    job_timeout_seconds: Seconds = 24 * 3600.0  # of one attempt
+    terminate_after_seconds: Seconds = 10.0  # from a cancel to SIGTERM
+    kill_after_seconds: Seconds = 30.0  # from a cancel to SIGKILL
+    engine_threads: Annotated[int, Field(ge=0, le=1024)] = 0  # of one reconstruction; 0: all cores
+
+    # Retention; None keeps for ever
+    drive_retention_days: Annotated[float, Field(gt=0)] | None = None
+    scene_retention_days: Annotated[float, Field(gt=0)] | None = None
+    job_retention_days: Annotated[float, Field(gt=0)] | None = None
+    idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
+
+    @property
+    def resolved_database_url(self) -> str:
+        """The database's URL, with the embedded one in its place where none is set."""
+        if self.database_url is not None:
+            return self.database_url.get_secret_value()
+        return f"sqlite:///{self.data_dir.resolve() / 'mrasfm.sqlite3'}"
+
+    @property
+    def resolved_artifacts_url(self) -> str:
+        """The artifact store's URL."""
+        return self.artifacts_url or "file://" + quote(str(self.data_dir.resolve() / "artifacts"))
+
+    @property
+    def spool_dir(self) -> Path:
+        """Where bytes from outside wait until they are checked."""
+        return self.data_dir.resolve() / "spool"
+
+    @property
+    def scratch_dir(self) -> Path:
+        """Where stages work."""
+        return self.data_dir.resolve() / "scratch"
