@@ -1,0 +1,1 @@
+"""Bytes from outside: received, checked and stored whole or not at all."""

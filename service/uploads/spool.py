@@ -1,0 +1,307 @@
+"""Writes bytes from outside to files of ours, hashed and bounded: the whole file is there, or nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import hashlib
+import os
+import re
+import secrets
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+import anyio
+
+from service.errors import ServiceError
+
+Result = TypeVar("Result")
+DiskLimiter = asyncio.Semaphore | anyio.CapacityLimiter
+
+BATCH_BYTES = 1 << 20  # written and hashed at a time: large enough that the switch to a thread costs nothing
+
+_SUFFIX = ".part"
+_OURS = re.compile(r"[0-9a-f]{32}\.part")
+# EFBIG is a file system's or a resource limit's bound on one file: to the client it is the same.
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+@dataclass(frozen=True)
+class Spooled:
+    """A file that was received whole and is on the disk. As a context manager it removes the file at the end.
+
+    Parameters
+    ----------
+    path
+        Of a name of ours. Who wants to keep the file moves it away.
+    sha256
+        Hexadecimal, in lower case.
+    """
+
+    path: Path
+    size_bytes: int
+    sha256: str
+
+    def discard(self) -> None:
+        """Remove the file, if it was not moved away."""
+        self.path.unlink(missing_ok=True)
+
+    def __enter__(self) -> Spooled:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.discard()
+
+
+class SpoolWriter:
+    """One file being written. Its methods block; they may be called from several threads, one after the other.
+
+    Parameters
+    ----------
+    folder
+        Made, for us alone, where it is missing.
+    min_free_bytes
+        How much of the disk must stay free.
+
+    Raises
+    ------
+    ServiceError
+        507 `disk-full`, here or while writing.
+    """
+
+    def __init__(self, folder: Path, *, min_free_bytes: int) -> None:
+        self._folder = folder
+        self._min_free_bytes = min_free_bytes
+        self._hash = hashlib.sha256()
+        self._size_bytes = 0
+        # An upload that is cancelled leaves its thread writing: discard() has to wait for it, else it would write to
+        # whatever file is opened next under the same descriptor.
+        self._lock = threading.Lock()
+        self.path = folder / (secrets.token_hex(16) + _SUFFIX)
+        with _full_disk_is_507():
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+            self._descriptor: int | None = os.open(self.path, flags, 0o600)
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Append; nothing happens after `discard`."""
+        with self._lock, _full_disk_is_507():
+            if self._descriptor is None:
+                return
+            require_space(self._folder, len(data), min_free_bytes=self._min_free_bytes)
+            rest = memoryview(data)
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+            self._hash.update(data)
+            self._size_bytes += len(data)
+
+    def finish(self, data: bytes | bytearray = b"") -> Spooled:
+        """Append the last bytes and put the file on the disk for good."""
+        self.write(data)
+        with self._lock, _full_disk_is_507():
+            if self._descriptor is not None:
+                os.fsync(self._descriptor)
+                self._close()
+        return Spooled(self.path, self._size_bytes, self._hash.hexdigest())
+
+    def discard(self) -> None:
+        """Close and remove the file, finished or not."""
+        with self._lock:
+            self._close()
+            self.path.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
+            os.close(descriptor)
+
+
+async def receive(
+    stream: AsyncIterator[bytes],
+    folder: Path,
+    *,
+    max_bytes: int,
+    expected_bytes: int | None,
+    expected_sha256: str | None,
+    min_free_bytes: int,
+    on_disk: DiskLimiter,
+) -> Spooled:
+    """Write a request's body to a file of the spool folder, in constant memory and off the event loop.
+
+    Whatever goes wrong, also a client that goes away and a cancelled task, nothing stays behind.
+
+    Parameters
+    ----------
+    stream
+        The body's chunks.
+    expected_bytes, expected_sha256
+        What the client announced, if it did; the digest is hexadecimal.
+    on_disk
+        Bounds how many uploads write at one time. It is held for each batch, not for the whole upload: slow clients
+        hold nobody up.
+
+    Raises
+    ------
+    ServiceError
+        413 `too-large`, 400 `wrong-length`, 422 `wrong-digest` or 507 `disk-full`.
+    """
+    if expected_bytes is not None:
+        if expected_bytes > max_bytes:
+            raise _too_large(f"{expected_bytes}", max_bytes)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        require_space(folder, expected_bytes, min_free_bytes=min_free_bytes)
+    writer = _BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
+    try:
+        received_bytes, batch = 0, bytearray()
+        async for chunk in stream:
+            received_bytes += len(chunk)
+            if expected_bytes is not None and received_bytes > expected_bytes:
+                raise _wrong_length("more than", expected_bytes)
+            if received_bytes > max_bytes:
+                raise _too_large(f"over {max_bytes}", max_bytes)
+            batch += chunk
+            if len(batch) >= BATCH_BYTES:
+                await writer.write(batch)
+                batch = bytearray()
+        if expected_bytes is not None and received_bytes < expected_bytes:
+            raise _wrong_length(f"{received_bytes} of", expected_bytes)
+        spooled = await writer.finish(batch)
+        _check_digest(spooled.sha256, expected_sha256)
+        return spooled
+    except BaseException:
+        with anyio.CancelScope(shield=True):
+            await writer.discard()
+        raise
+
+
+def sweep(folder: Path, *, older_than_s: float) -> int:
+    """Remove what a killed process left in the spool folder.
+
+    Parameters
+    ----------
+    older_than_s
+        Since the last write. Longer than any upload is worked on after its last byte, an archive's unpacking included.
+
+    Returns
+    -------
+    int
+        How many files were removed.
+    """
+    removed, now_s = 0, time.time()
+    if not folder.is_dir():
+        return removed
+    for entry in os.scandir(folder):
+        if not _OURS.fullmatch(entry.name):
+            continue
+        try:
+            if now_s - entry.stat(follow_symlinks=False).st_mtime > older_than_s:
+                os.unlink(entry.path)
+                removed += 1
+        except FileNotFoundError:  # its upload ended at this moment
+            continue
+    return removed
+
+
+def require_space(folder: Path, size_bytes: int, *, min_free_bytes: int) -> None:
+    """Refuse bytes for which the disk has no room.
+
+    Raises
+    ------
+    ServiceError
+        507 `disk-full`, if fewer than `min_free_bytes` would stay free.
+    """
+    disk = os.statvfs(folder)
+    free_bytes = disk.f_bavail * disk.f_frsize
+    if free_bytes - size_bytes < min_free_bytes:
+        raise _disk_full(f"{free_bytes} bytes are free, {min_free_bytes} must stay free")
+
+
+class _BatchWriter:
+    """Writes one batch in a thread while the next one is being received."""
+
+    def __init__(self, writer: SpoolWriter, on_disk: DiskLimiter) -> None:
+        self._writer = writer
+        self._on_disk = on_disk
+        self._writing: asyncio.Task[None] | None = None
+
+    async def write(self, batch: bytearray) -> None:
+        await self._written()
+        self._writing = asyncio.create_task(self._off_the_loop(self._writer.write, batch))
+
+    async def finish(self, batch: bytearray) -> Spooled:
+        await self._written()
+        return await self._off_the_loop(self._writer.finish, batch)
+
+    async def discard(self) -> None:
+        if self._writing is not None:
+            self._writing.cancel()
+            await asyncio.gather(self._writing, return_exceptions=True)
+        await asyncio.to_thread(self._writer.discard)
+
+    async def _written(self) -> None:
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            await writing
+
+    async def _off_the_loop(self, function: Callable[[bytearray], Result], batch: bytearray) -> Result:
+        async with self._on_disk:
+            return await asyncio.to_thread(function, batch)
+
+
+@contextmanager
+def _full_disk_is_507() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise _disk_full(os.strerror(error.errno)) from error
+        raise
+
+
+def _check_digest(found: str, expected: str | None) -> None:
+    if expected is not None and found != expected.lower():
+        raise ServiceError(
+            422,
+            "wrong-digest",
+            "Wrong digest",
+            f"the bytes received have the SHA-256 {found}, announced is {expected.lower()}",
+            remedy="Send the file again; if it was changed since the digest was taken, take it anew.",
+        )
+
+
+def _too_large(size: str, max_bytes: int) -> ServiceError:
+    return ServiceError(
+        413,
+        "too-large",
+        "Too large",
+        f"the body has {size} bytes, the bound is {max_bytes}",
+        remedy="Send a smaller file, or several.",
+    )
+
+
+def _wrong_length(received: str, expected_bytes: int) -> ServiceError:
+    return ServiceError(
+        400,
+        "wrong-length",
+        "Wrong length",
+        f"{received} the {expected_bytes} bytes announced were received",
+        remedy="Send the whole file again, with its size as it is now.",
+    )
+
+
+def _disk_full(why: str) -> ServiceError:
+    return ServiceError(
+        507,
+        "disk-full",
+        "Disk full",
+        f"the service has no room for these bytes: {why}",
+        remedy="Try again later; who runs the service has to free space on the disk of its data folder.",
+    )
