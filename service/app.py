@@ -1,0 +1,171 @@
+"""The API: `create_app` puts routes, errors, logs and metrics together."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from schemas.api.problems import MEDIA_TYPE, Problem, ProblemItem
+from service.context import Context
+from service.errors import ServiceError
+from service.metrics import Metrics
+from service.request_log import RequestLog
+from service.routes import drives, files, jobs, operations, reconstructions, scenes
+from service.routes.bodies import documented
+from service.settings import Settings
+from service.uploads.spool import sweep
+
+log = logging.getLogger("mrasfm.api")
+
+_SPOOL_KEPT_S = 24 * 3600
+_SWEEP_EVERY_S = 3600
+_DATABASE_FULL = ("database or disk is full", "No space left on device")
+_ABOUT = """
+Send a drive (images of a vehicle's cameras, GNSS, calibration), get a metric scene.
+
+1. `POST /v1/drives` with the manifest, `drive.json`
+2. `PUT /v1/drives/{id}/files/{path}` for each file, or one `PUT /v1/drives/{id}/archive`
+3. `POST /v1/drives/{id}:commit`
+4. `POST /v1/reconstructions`, then poll `/v1/jobs/{id}` or read its events
+5. `GET /v1/scenes/{id}` and its files
+
+`mrasfm upload` does all of it. Every error is an RFC 9457 problem whose `remedy` says what to do.
+"""
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The API as an ASGI application, with the settings of the environment by default."""
+    settings = settings or Settings()
+    context = Context.open(settings)
+    metrics = Metrics(context.database)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        sweeping = asyncio.create_task(_sweep_for_ever(settings))
+        yield
+        sweeping.cancel()
+        await asyncio.gather(sweeping, return_exceptions=True)
+        context.database.close()
+
+    app = FastAPI(title="MRASfM", version=version("mrasfm"), description=_ABOUT, lifespan=lifespan)
+    app.state.context = context
+    for module in (drives, files, reconstructions, jobs, scenes, operations):
+        app.include_router(module.router)
+    app.include_router(operations.metrics_route(metrics))
+    _answer_errors(app)
+    app.add_middleware(RequestLog, metrics=metrics, failed=_failed)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+async def _sweep_for_ever(settings: Settings) -> None:
+    """Remove what killed processes left in the spool, once it is old enough to be nobody's."""
+    while True:
+        try:
+            await asyncio.to_thread(sweep, settings.spool_dir, older_than_s=_SPOOL_KEPT_S)
+        except OSError:
+            log.exception("the spool could not be swept")
+        await asyncio.sleep(_SWEEP_EVERY_S)
+
+
+def _answer_errors(app: FastAPI) -> None:
+    @app.exception_handler(ServiceError)
+    async def refused(request: Request, error: ServiceError) -> Response:
+        return problem_response(error)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> Response:
+        items = [
+            ProblemItem(field=".".join(str(part) for part in detail["loc"]), detail=str(detail["msg"]))
+            for detail in error.errors()
+        ]
+        what = "; ".join(f"{item.field}: {item.detail}" for item in items[:3])
+        remedy = "Correct the parameters that are named; /docs describes them."
+        title = "The request is not valid"
+        return problem_response(ServiceError(422, "invalid-request", title, what, remedy=remedy, errors=items))
+
+    @app.exception_handler(HTTPException)
+    async def http(request: Request, error: HTTPException) -> Response:
+        code = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http-error")
+        detail = f"{request.method} {request.url.path}: {error.detail}"
+        remedy = "See /docs for what there is."
+        headers = dict(error.headers or {})
+        return problem_response(
+            ServiceError(error.status_code, code, str(error.detail), detail, remedy=remedy, headers=headers)
+        )
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(request: Request, error: ClientDisconnect) -> Response:
+        return Response(status_code=400)  # nobody reads it
+
+    @app.exception_handler(OSError)
+    async def disk(request: Request, error: OSError) -> Response:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return problem_response(_disk_full())
+        raise error
+
+    @app.exception_handler(PoolTimeout)
+    @app.exception_handler(InterfaceError)
+    @app.exception_handler(OperationalError)
+    async def database(request: Request, error: SQLAlchemyError) -> Response:
+        if any(words in str(error) for words in _DATABASE_FULL):
+            return problem_response(_disk_full())
+        log.error("the database does not answer", exc_info=error)
+        title, detail = "The database does not answer", "the request could not be recorded, and had no effect"
+        remedy, headers = "Repeat it in some seconds.", {"Retry-After": "5"}
+        return problem_response(
+            ServiceError(503, "database-unavailable", title, detail, remedy=remedy, headers=headers)
+        )
+
+
+def _failed() -> Response:
+    title, detail = "The service failed", "an error of the service itself; it is in the service's log"
+    remedy = "Repeat the request; if it fails again, tell the operator the header X-Request-Id."
+    return problem_response(ServiceError(500, "internal-error", title, detail, remedy=remedy))
+
+
+def _disk_full() -> ServiceError:
+    return ServiceError(
+        507,
+        "disk-full",
+        "Disk full",
+        "the service has no space left to store this",
+        remedy="Nothing was stored. The operator has to free space; then repeat the request.",
+    )
+
+
+def problem_response(error: ServiceError) -> JSONResponse:
+    """An error as RFC 9457 has it."""
+    body = error.problem.model_dump(mode="json", exclude_defaults=True)
+    return JSONResponse(body, status_code=error.status, headers=error.headers, media_type=MEDIA_TYPE)
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """FastAPI's page, and the models of bodies that we read ourselves."""
+    if app.openapi_schema is None:
+        page = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        models: list[type[BaseModel]] = [*documented.values(), Problem]
+        _, extra = models_json_schema(
+            [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"
+        )
+        page["components"]["schemas"] |= extra["$defs"]
+        for unused in ("HTTPValidationError", "ValidationError"):
+            page["components"]["schemas"].pop(unused, None)
+        app.openapi_schema = page
+    return app.openapi_schema

@@ -1,0 +1,288 @@
+"""The service's resources as methods."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import httpx
+from pydantic import BaseModel, ValidationError
+
+from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource
+from schemas.api.jobs import JobResource, ReconstructionSettings
+from schemas.api.scenes import SceneResource
+from schemas.api.status import ServiceStatus
+from service.client.drive_folder import LocalFile
+from service.client.transport import CHECK_TIMEOUT_S, IO_TIMEOUT_S, Body, Patience, Transport, TroubleError, unexpected
+from service.uploads.digests import format_digest
+
+Model = TypeVar("Model", bound=BaseModel)
+PATIENCE_S = 300.0  # a service that is being restarted, or moved
+FIRST_PATIENCE_S = 6.0
+_SILENCE_S = 40.0  # an event stream says something every 15 s
+
+
+@dataclass(frozen=True)
+class JobEvent:
+    """An event of a job: `state`, `progress`, or `keep-alive`, which only says that the connection is well."""
+
+    id: int | None
+    kind: str
+    data: dict[str, Any]
+
+
+class Client:
+    """A service, under one API key.
+
+    Every request is tried again while trouble may pass: no connection, a broken one, 5xx, 429. May be used by many
+    threads.
+
+    Parameters
+    ----------
+    url
+        Of the service, for example `https://maps.example.org`.
+    key
+        An API key.
+    connections
+        At one time.
+    patience_s
+        For how long one request is tried again.
+    first_patience_s
+        The same, as long as nothing has ever answered under this URL.
+
+    Raises
+    ------
+    ClientError
+        Here, where URL or key cannot be one. Methods raise `ApiError` and `UnreachableError`.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        key: str,
+        *,
+        connections: int = 8,
+        patience_s: float = PATIENCE_S,
+        first_patience_s: float = FIRST_PATIENCE_S,
+    ) -> None:
+        self._transport = Transport(
+            url, key, connections=connections, patience_s=patience_s, first_patience_s=first_patience_s
+        )
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def url(self) -> str:
+        """Of the service, without a slash at its end."""
+        return self._transport.url
+
+    def close(self) -> None:
+        """End what waits, and close all connections."""
+        self._transport.close()
+
+    def stop(self) -> None:
+        """End what waits or sends in other threads, soon."""
+        self._transport.closing.set()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` or `close` was called."""
+        return self._transport.closing.is_set()
+
+    def pause(self, seconds: float) -> None:
+        """Sleep, unless the client is closed."""
+        self._transport.closing.wait(seconds)
+
+    def patience(self) -> Patience:
+        """For a series of tries of one thing."""
+        return self._transport.patience()
+
+    def status(self) -> ServiceStatus:
+        """How the service is."""
+        return self._get("/v1/status", ServiceStatus)
+
+    def create_drive(self, manifest: bytes, *, idempotency_key: str | None = None) -> DriveResource:
+        """A new drive from the bytes of a `drive.json`."""
+        return self._post("/v1/drives", DriveResource, content=manifest, key=idempotency_key)
+
+    def drive(self, drive_id: str) -> DriveResource:
+        """One drive."""
+        return self._get(f"/v1/drives/{_part(drive_id)}", DriveResource)
+
+    def declare(self, drive_id: str, files: Sequence[LocalFile]) -> DeclaredFiles:
+        """Say which files there are, and learn which must be sent."""
+        stated = [{"path": file.path, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files]
+        content = json.dumps({"files": stated}).encode()
+        return self._post(f"/v1/drives/{_part(drive_id)}/files:declare", DeclaredFiles, content=content)
+
+    def put_file(
+        self, drive_id: str, file: LocalFile, *, body: Body | None = None, replace: bool = False
+    ) -> DriveFileResource:
+        """Send one file.
+
+        Parameters
+        ----------
+        body
+            Gives the file's bytes anew for every try; by default they are read from the file.
+        replace
+            Whether other bytes that are stored under this name give way.
+        """
+        headers = {
+            "Content-Length": str(file.size_bytes),
+            "Content-Type": "application/octet-stream",
+            "Content-Digest": format_digest(file.sha256),
+        }
+        path = f"/v1/drives/{_part(drive_id)}/files/{quote(file.path)}{'?replace=true' if replace else ''}"
+        response = self._transport.request("PUT", path, headers=headers, body=body or file.pieces)
+        return _parsed(response, DriveFileResource)
+
+    def commit(self, drive_id: str, *, idempotency_key: str | None = None) -> DriveResource:
+        """Freeze a drive whose files are all there."""
+        path = f"/v1/drives/{_part(drive_id)}:commit"
+        return self._post(path, DriveResource, key=idempotency_key, timeout_s=CHECK_TIMEOUT_S)
+
+    def preflight(self, drive_id: str) -> PreflightResource:
+        """What the check of a drive found."""
+        return self._get(f"/v1/drives/{_part(drive_id)}/preflight", PreflightResource)
+
+    def reconstruct(
+        self, drive_id: str, settings: ReconstructionSettings | None = None, *, idempotency_key: str | None = None
+    ) -> JobResource:
+        """Ask for a committed drive's reconstruction."""
+        asked = (settings or ReconstructionSettings()).model_dump(mode="json", exclude_none=True)
+        content = json.dumps({"drive_id": drive_id, "settings": asked}).encode()
+        return self._post("/v1/reconstructions", JobResource, content=content, key=idempotency_key)
+
+    def job(self, job_id: str) -> JobResource:
+        """One job."""
+        return self._get(f"/v1/jobs/{_part(job_id)}", JobResource)
+
+    def poll_job(self, job_id: str, etag: str | None) -> tuple[JobResource | None, str | None, float]:
+        """A job, if it has changed since it had this ETag.
+
+        Returns
+        -------
+        job, etag, retry_after_s
+            The job is None where nothing has changed; `retry_after_s` says when to ask again.
+        """
+        headers = {} if etag is None else {"If-None-Match": etag}
+        response = self._transport.request("GET", f"/v1/jobs/{_part(job_id)}", headers=headers)
+        retry_after = response.headers.get("retry-after", "")
+        retry_after_s = float(retry_after) if retry_after.isdecimal() else 2.0
+        job = None if response.status_code == httpx.codes.NOT_MODIFIED else _parsed(response, JobResource)
+        return job, response.headers.get("etag"), retry_after_s
+
+    def cancel_job(self, job_id: str) -> JobResource:
+        """Ask for a job's end."""
+        return self._post(f"/v1/jobs/{_part(job_id)}:cancel", JobResource)
+
+    def events(self, job_id: str, *, after: int | None = None) -> Iterator[JobEvent]:
+        """A job's events after the one with this id, as they come, until the job or the connection ends.
+
+        A connection that breaks ends the iteration: call again with the last id that was seen.
+        """
+        headers = {"Accept": "text/event-stream"} | ({} if after is None else {"Last-Event-ID": str(after)})
+        path = f"/v1/jobs/{_part(job_id)}/events"
+        try:
+            with self._transport.open("GET", path, headers=headers, read_timeout_s=_SILENCE_S) as response:
+                yield from _events(_lines(response.iter_bytes()))
+        except TroubleError:
+            return
+
+    def scene(self, scene_id: str) -> SceneResource:
+        """One scene and its files."""
+        return self._get(f"/v1/scenes/{_part(scene_id)}", SceneResource)
+
+    @contextmanager
+    def open_scene_file(
+        self, scene_id: str, path: str, *, sha256: str, start: int = 0
+    ) -> Iterator[tuple[int, Iterator[bytes]]]:
+        """A file of a scene, from byte `start` on where it still is the one with this SHA-256. One try.
+
+        Yields
+        ------
+        start, pieces
+            Where the pieces begin: 0 where the service sends the file from its beginning.
+        """
+        headers = {} if start == 0 else {"Range": f"bytes={start}-", "If-Range": f'"{sha256}"'}
+        url = f"/v1/scenes/{_part(scene_id)}/files/{quote(path)}"
+        with self._transport.open("GET", url, headers=headers) as response:
+            partial = response.status_code == httpx.codes.PARTIAL_CONTENT
+            if partial and not response.headers.get("content-range", "").startswith(f"bytes {start}-"):
+                raise unexpected(response, "the part of the file that was asked for")
+            yield (start if partial else 0), response.iter_bytes()
+
+    def _get(self, path: str, model: type[Model]) -> Model:
+        return _parsed(self._transport.request("GET", path), model)
+
+    def _post(
+        self,
+        path: str,
+        model: type[Model],
+        *,
+        content: bytes | None = None,
+        key: str | None = None,
+        timeout_s: float = IO_TIMEOUT_S,
+    ) -> Model:
+        # With a key also where the caller gave none: a try whose answer was lost may have had its effect.
+        headers = {"Idempotency-Key": key or str(uuid.uuid4())}
+        if content is not None:
+            headers |= {"Content-Type": "application/json", "Content-Length": str(len(content))}
+        body = None if content is None else lambda: iter((content,))
+        response = self._transport.request("POST", path, headers=headers, body=body, timeout_s=timeout_s)
+        return _parsed(response, model)
+
+
+def _part(identifier: str) -> str:
+    return quote(identifier, safe="")
+
+
+def _parsed(response: httpx.Response, model: type[Model]) -> Model:
+    try:
+        return model.model_validate_json(response.content)
+    except ValidationError:
+        raise unexpected(response, f"a {model.__name__} of this version's service") from None
+
+
+def _lines(pieces: Iterator[bytes]) -> Iterator[str]:
+    """Lines of an event stream. httpx would also break lines at characters that JSON may hold in its strings."""
+    rest = b""
+    for piece in pieces:
+        *whole, rest = (rest + piece).split(b"\n")
+        yield from (line.removesuffix(b"\r").decode("utf-8", "replace") for line in whole)
+
+
+def _events(lines: Iterator[str]) -> Iterator[JobEvent]:
+    fields: dict[str, list[str]] = {}
+    for line in lines:
+        name, _, value = line.partition(":")
+        if line == "":
+            if "data" in fields:
+                yield _event(fields)
+            fields = {}
+        elif name == "":
+            yield JobEvent(None, "keep-alive", {})
+        else:
+            fields.setdefault(name, []).append(value.removeprefix(" "))
+
+
+def _event(fields: dict[str, list[str]]) -> JobEvent:
+    number = fields.get("id", [""])[-1]
+    try:
+        data = json.loads("\n".join(fields["data"]))
+    except ValueError:
+        data = None
+    kind = fields.get("event", ["message"])[-1]
+    return JobEvent(int(number) if number.isdecimal() else None, kind, data if isinstance(data, dict) else {})

@@ -1,0 +1,267 @@
+"""HTTP that does not give up at the first trouble: retries with back-off, and answers that become errors.
+
+Everything that a client asks may be repeated: GET and PUT by their nature, POST under its Idempotency-Key.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from http import HTTPStatus
+from typing import Any
+
+import httpx
+from pydantic import ValidationError
+
+from schemas.api.problems import MEDIA_TYPE, PROBLEM_TYPE, Problem
+from service.client.errors import ApiError, ClientError, UnreachableError
+
+CONNECT_TIMEOUT_S = 10.0
+IO_TIMEOUT_S = 60.0
+CHECK_TIMEOUT_S = 180.0  # an answer that waits for the check of a large manifest
+FIRST_DELAY_S, MAX_DELAY_S = 0.2, 15.0
+_SHOWN_CHARACTERS = 200
+_PASSING = (HTTPStatus.INTERNAL_SERVER_ERROR, HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE, 504)
+
+Body = Callable[[], Iterator[bytes]]  # called for every try, so that each begins with the first byte
+
+
+class TroubleError(Exception):
+    """Something that may pass: `cause` is what to raise once patience is over."""
+
+    def __init__(self, cause: ClientError, retry_after_s: float | None = None) -> None:
+        super().__init__(str(cause))
+        self.cause = cause
+        self.retry_after_s = retry_after_s
+
+
+class Patience:
+    """Waits longer and longer between tries, and ends after `limit_s` without success."""
+
+    def __init__(self, limit_s: Callable[[], float], closing: threading.Event) -> None:
+        self._limit_s = limit_s
+        self._closing = closing
+        self.renew()
+
+    def renew(self) -> None:
+        """Something worked: all patience is back."""
+        self._began_s = time.monotonic()
+        self._delay_s = FIRST_DELAY_S
+
+    def pause(self, trouble: TroubleError) -> None:
+        """Wait before the next try.
+
+        Raises
+        ------
+        ClientError
+            The trouble's cause, where there is no patience left.
+        """
+        delay_s = self._delay_s * random.uniform(0.5, 1.0)  # many clients shall not come back at the same moment
+        if trouble.retry_after_s is not None:
+            delay_s = max(delay_s, trouble.retry_after_s)
+        if time.monotonic() + delay_s > self._began_s + self._limit_s() or self._closing.wait(delay_s):
+            raise trouble.cause from trouble
+        self._delay_s = min(2 * self._delay_s, MAX_DELAY_S)
+
+
+class Transport:
+    """Requests to one service under one key. May be used by many threads.
+
+    Parameters
+    ----------
+    url
+        Of the service, with or without a path before `/v1`.
+    key
+        Sent as bearer token, and never shown.
+    connections
+        At one time.
+    patience_s
+        For how long one request is tried again.
+    first_patience_s
+        The same, as long as nothing has ever answered: then the URL is probably wrong.
+
+    Raises
+    ------
+    ClientError
+        Where the URL or the key cannot be one.
+    """
+
+    def __init__(
+        self, url: str, key: str, *, connections: int, patience_s: float, first_patience_s: float | None = None
+    ) -> None:
+        self.url = checked_url(url)
+        self._answered = False
+        self._patience_s = patience_s
+        self._first_patience_s = patience_s if first_patience_s is None else first_patience_s
+        self.closing = threading.Event()
+        self._http = httpx.Client(
+            base_url=self.url,
+            headers={"Authorization": f"Bearer {_checked_key(key)}", "Accept-Encoding": "identity"},
+            timeout=httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, pool=None),
+            limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
+            # A proxy of the environment cannot reach this machine's loopback.
+            trust_env=not is_loopback(httpx.URL(self.url).host),
+        )
+
+    def close(self) -> None:
+        """End all waiting, and all connections."""
+        self.closing.set()
+        self._http.close()
+
+    def patience(self) -> Patience:
+        """For a series of tries of one thing."""
+        return Patience(lambda: self._patience_s if self._answered else self._first_patience_s, self.closing)
+
+    def request(
+        self,
+        method: str,
+        path: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        json: Any = None,
+        body: Body | None = None,
+        timeout_s: float = IO_TIMEOUT_S,
+    ) -> httpx.Response:
+        """The answer to a request, with its body read; tried until it succeeds or cannot.
+
+        Raises
+        ------
+        ApiError
+            The service refused it.
+        UnreachableError
+            Nothing answered.
+        """
+        patience = self.patience()
+        while True:
+            try:
+                with self.open(
+                    method, path, headers=headers, json=json, body=body, read_timeout_s=timeout_s
+                ) as response:
+                    response.read()
+                    return response
+            except TroubleError as trouble:
+                patience.pause(trouble)
+
+    @contextmanager
+    def open(
+        self,
+        method: str,
+        path: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        json: Any = None,
+        body: Body | None = None,
+        read_timeout_s: float = IO_TIMEOUT_S,
+    ) -> Iterator[httpx.Response]:
+        """One try of a request, whose answer is read piece by piece.
+
+        Raises
+        ------
+        ApiError
+            The service refused it.
+        TroubleError
+            It may work another time; also where the connection breaks while the answer is read.
+        """
+        timeout = httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, read=read_timeout_s, pool=None)
+        content = None if body is None else body()
+        try:
+            with self._http.stream(method, path, headers=headers, json=json, content=content, timeout=timeout) as got:
+                self._answered = True
+                if got.status_code >= HTTPStatus.MULTIPLE_CHOICES and got.status_code != HTTPStatus.NOT_MODIFIED:
+                    got.read()
+                    raise _refusal(got)
+                yield got
+        except httpx.TransportError as error:
+            what = str(error) or type(error).__name__
+            raise TroubleError(
+                UnreachableError(
+                    f"{self.url} cannot be reached: {what}. Check the URL, and that the service runs; then give the "
+                    "same command again."
+                )
+            ) from error
+        except (httpx.RequestError, RuntimeError) as error:
+            if not self.closing.is_set() and isinstance(error, RuntimeError):
+                raise
+            raise UnreachableError(f"{method} {path} was given up: {error}") from error
+
+
+def checked_url(url: str) -> str:
+    """A service's URL without a slash at its end.
+
+    Raises
+    ------
+    ClientError
+        Where it is not http or https, or holds a key, a query or a fragment.
+    """
+    try:
+        parsed = httpx.URL(url.strip())
+    except (httpx.InvalidURL, ValueError) as error:
+        raise ClientError(f"{url!r} is not a URL: {error}. Give one such as https://maps.example.org.") from None
+    if parsed.userinfo:
+        raise ClientError("the URL holds a user or password. Give the URL alone, and the key in MRASFM_API_KEY.")
+    if parsed.scheme not in ("http", "https") or not parsed.host or parsed.query or parsed.fragment:
+        raise ClientError(f"{url!r} is not the URL of a service. Give one such as https://maps.example.org.")
+    return str(parsed).rstrip("/")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether requests to the host stay on this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _checked_key(key: str) -> str:
+    key = key.strip()
+    if not key or not key.isascii() or not key.isprintable() or " " in key:
+        raise ClientError("the API key is empty or holds characters that no key has. Give what 'keys create' printed.")
+    return key
+
+
+def _refusal(response: httpx.Response) -> ApiError | TroubleError:
+    given = _given_problem(response)
+    error = ApiError(given or _made_up_problem(response), status=response.status_code)
+    retry_after_s = _seconds(response.headers.get("retry-after"))
+    passing = response.status_code in _PASSING or error.code == "request-in-flight"
+    # Our own 429 without a time is a quota, and no waiting helps; another's comes from a proxy's rate limit.
+    passing |= response.status_code == HTTPStatus.TOO_MANY_REQUESTS and (given is None or retry_after_s is not None)
+    return TroubleError(error, retry_after_s) if passing else error
+
+
+def _given_problem(response: httpx.Response) -> Problem | None:
+    if not response.headers.get("content-type", "").startswith(MEDIA_TYPE):
+        return None
+    try:
+        problem = Problem.model_validate_json(response.content)
+    except ValidationError:
+        return None
+    return problem if problem.type.startswith(PROBLEM_TYPE) else None
+
+
+def _made_up_problem(response: httpx.Response) -> Problem:
+    """For an answer that is not the service's own: of a proxy, or of something else under this URL."""
+    asked = f"{response.request.method} {response.request.url}"
+    remedy = "Check that the URL is that of an MRASfM service; what answers here is something else, or before it."
+    if response.is_redirect:
+        remedy = f"Give the address that it leads to: {response.headers.get('location', '')}."
+    text = " ".join(response.text.split())[:_SHOWN_CHARACTERS]
+    detail = f"{asked} was answered with {response.status_code} {response.reason_phrase}: {text}".rstrip(": ")
+    return Problem(type="about:blank", title="Unexpected answer", detail=detail, remedy=remedy)
+
+
+def unexpected(response: httpx.Response, what: str) -> ApiError:
+    """An answer that says success and is not what the service answers."""
+    problem = _made_up_problem(response).model_copy(
+        update={"detail": f"{response.request.method} {response.request.url}: the answer is not {what}"}
+    )
+    return ApiError(problem, status=response.status_code)
+
+
+def _seconds(retry_after: str | None) -> float | None:
+    """`Retry-After` in seconds; its other form, a date, is not worth trusting two clocks for."""
+    return float(retry_after) if retry_after is not None and retry_after.strip().isdecimal() else None

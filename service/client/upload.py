@@ -1,0 +1,203 @@
+"""Sending a drive: create it, declare its files, send what is missing, commit, and ask for its scene."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from schemas.api.drives import DriveResource, DriveState
+from schemas.api.jobs import JobResource, JobState, ReconstructionSettings
+from service.client.api import Client
+from service.client.drive_folder import DriveFolder, LocalFile, identify
+from service.client.errors import ApiError, ClientError
+from service.client.parallel import Item, Meter, Report, Result, in_parallel, no_report
+from service.client.upload_state import UploadState
+
+PARALLEL = 4
+DECLARED_AT_ONCE = 1000
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What it took until the service had the drive."""
+
+    drive_id: str
+    bytes_sent: int
+    files_sent: int
+    files_skipped: int
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def upload_drive(
+    client: Client,
+    folder: DriveFolder,
+    *,
+    state: UploadState | None = None,
+    parallel: int = PARALLEL,
+    report: Report = no_report,
+) -> Sent:
+    """Bring a drive to the service and commit it.
+
+    What an earlier call brought is not sent again, and a drive that is there already is taken as it is.
+
+    Parameters
+    ----------
+    state
+        Where the upload stands; by default what is kept beside the drive.
+    parallel
+        Files at one time.
+    report
+        Told how many bytes are done, for the stages `hash` and `send`.
+
+    Raises
+    ------
+    ApiError
+        The service refuses the drive.
+    DriveFolderError
+        A file cannot be read, or changes.
+    UnreachableError
+        The service does not answer.
+    """
+    return _Upload(client, folder, state or UploadState(folder, client.url), parallel, report).run()
+
+
+def start_reconstruction(
+    client: Client,
+    drive_id: str,
+    settings: ReconstructionSettings | None = None,
+    *,
+    state: UploadState | None = None,
+) -> JobResource:
+    """Ask for a committed drive's scene.
+
+    With a state, what was asked for before is asked for again only where it failed, was cancelled, or its scene is
+    gone.
+    """
+    settings = settings or ReconstructionSettings()
+    if state is None:
+        return client.reconstruct(drive_id, settings)
+    record = state.job(settings)
+    if record is not None and record.job_id is not None:
+        known = _usable_job(client, record.job_id)
+        if known is not None:
+            return known
+        record = None
+    record = record or state.begin_job(settings)
+    job = client.reconstruct(drive_id, settings, idempotency_key=record.key)
+    record.job_id = job.id
+    state.save()
+    return job
+
+
+def _usable_job(client: Client, job_id: str) -> JobResource | None:
+    try:
+        job = client.job(job_id)
+        if job.scene_id is not None:
+            client.scene(job.scene_id)
+    except ApiError as error:
+        if error.code != "not-found":
+            raise
+        return None
+    return None if job.state in (JobState.FAILED, JobState.CANCELLED) else job
+
+
+class _Upload:
+    def __init__(self, client: Client, folder: DriveFolder, state: UploadState, parallel: int, report: Report) -> None:
+        self._client = client
+        self._folder = folder
+        self._state = state
+        self._parallel = parallel
+        self._report = report
+        self._began_s = time.monotonic()
+        self._seconds: dict[str, float] = {}
+
+    def run(self) -> Sent:
+        drive = self._open_drive()
+        self._passed("create")
+        files = self._identified()
+        self._passed("hash")
+        to_send = self._declared(drive.id, files)
+        if to_send and drive.state == DriveState.COMMITTED:
+            # Its manifest is this one and its images are not: what is here is another drive.
+            self._state.begin_anew()
+            drive = self._open_drive()
+            to_send = self._declared(drive.id, files)
+        self._passed("declare")
+        meter = Meter(self._report, "send", sum(file.size_bytes for file in to_send))
+        self._in_parallel(lambda file: self._send(drive.id, file, meter), to_send)
+        self._passed("send")
+        self._commit(drive)
+        self._passed("commit")
+        return Sent(drive.id, meter.done_bytes, len(to_send), len(files) - len(to_send), self._seconds)
+
+    def _passed(self, phase: str) -> None:
+        now_s = time.monotonic()
+        self._seconds[phase] = round(now_s - self._began_s, 3)
+        self._began_s = now_s
+
+    def _in_parallel(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        return in_parallel(work, items, threads=self._parallel, stop=self._client.stop)
+
+    def _open_drive(self) -> DriveResource:
+        record = self._state.record
+        if record.drive_id is not None:
+            try:
+                return self._client.drive(record.drive_id)
+            except ApiError as error:
+                if error.code != "not-found":
+                    raise
+                self._state.begin_anew()
+        self._state.save()  # before the request, so that a repetition has the same name
+        record = self._state.record
+        drive = self._client.create_drive(self._folder.raw_manifest, idempotency_key=f"{record.upload}-create")
+        record.drive_id = drive.id
+        self._state.save()
+        return drive
+
+    def _identified(self) -> list[LocalFile]:
+        meter = Meter(self._report, "hash", self._folder.size_bytes())
+
+        def identified(path: str) -> LocalFile:
+            file = identify(self._folder.root, path)
+            meter.add(file.size_bytes)
+            return file
+
+        return self._in_parallel(identified, self._folder.paths)
+
+    def _declared(self, drive_id: str, files: Sequence[LocalFile]) -> list[LocalFile]:
+        """The files that must be sent."""
+        wanted: set[str] = set()
+        for i in range(0, len(files), DECLARED_AT_ONCE):
+            wanted.update(self._client.declare(drive_id, files[i : i + DECLARED_AT_ONCE]).to_send)
+        return [file for file in files if file.path in wanted]
+
+    def _send(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
+        def counted() -> Iterator[bytes]:
+            nonlocal sent_bytes
+            meter.add(-sent_bytes)
+            sent_bytes = 0
+            for piece in file.pieces():
+                if self._client.stopped:
+                    raise ClientError("the upload was interrupted")
+                yield piece
+                sent_bytes += len(piece)
+                meter.add(len(piece))
+
+        sent_bytes = 0
+        try:
+            # The drive is this folder's: where a file was changed here since it was sent, the new bytes count.
+            self._client.put_file(drive_id, file, body=counted, replace=True)
+        except ApiError as error:
+            if error.code == "wrong-digest":
+                raise file.changed() from error
+            raise
+
+    def _commit(self, drive: DriveResource) -> None:
+        if drive.state == DriveState.COMMITTED:
+            return
+        try:
+            self._client.commit(drive.id, idempotency_key=f"{self._state.record.upload}-commit")
+        except ApiError as error:
+            if error.code != "drive-committed":  # by another run of the same command
+                raise

@@ -1,0 +1,115 @@
+"""What an upload has reached, so that the same command goes on after an interruption.
+
+Under a name that is kept before the first request is made, a request whose answer was lost is repeated without a
+second effect.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from schemas.api.jobs import ReconstructionSettings
+from service.client.drive_folder import DriveFolder
+from service.data_folder import write_private_file
+
+STATE_NAME = ".mrasfm-upload.json"
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class JobRecord(_Record):
+    """A reconstruction that was asked for: `key` names the request."""
+
+    key: str
+    job_id: str | None = None
+
+
+class UploadRecord(_Record):
+    """One drive on one service: `upload` names the attempt to send it."""
+
+    upload: str
+    drive_id: str | None = None
+    jobs: dict[str, JobRecord] = {}  # by the settings' digest
+
+
+class _Document(_Record):
+    version: int = 1
+    uploads: dict[str, UploadRecord] = {}
+
+
+class UploadState:
+    """The record of a drive that is sent to a service.
+
+    It lies in the drive's folder, or where that is not writable, in the user's cache. Where neither is, an interrupted
+    upload begins anew, and sends no file again that the service has.
+
+    Parameters
+    ----------
+    folder
+        The drive.
+    url
+        Of the service.
+    """
+
+    def __init__(self, folder: DriveFolder, url: str) -> None:
+        self._name = f"{url} {folder.manifest_sha256}"
+        self._places = [folder.root / STATE_NAME, _cache_of(folder.root)]
+        self._document = next((found for place in self._places if (found := _read(place)) is not None), _Document())
+        self.record = self._document.uploads.get(self._name) or _new_record()
+
+    def begin_anew(self) -> None:
+        """Forget the drive: it is gone, or is not this one any more."""
+        self.record = _new_record()
+        self.save()
+
+    def begin_job(self, settings: ReconstructionSettings) -> JobRecord:
+        """Forget the job for these settings, and name the next request."""
+        record = self.record.jobs[_digest(settings)] = JobRecord(key=str(uuid.uuid4()))
+        self.save()
+        return record
+
+    def job(self, settings: ReconstructionSettings) -> JobRecord | None:
+        """What was asked for with these settings."""
+        return self.record.jobs.get(_digest(settings))
+
+    def save(self) -> None:
+        """Keep the record, where there is a place for it."""
+        self._document.uploads[self._name] = self.record
+        text = self._document.model_dump_json(indent=1)
+        for place in self._places:
+            try:
+                if place.parent != self._places[0].parent:
+                    place.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                write_private_file(place, text)
+                return
+            except OSError:
+                continue
+
+
+def _new_record() -> UploadRecord:
+    return UploadRecord(upload=str(uuid.uuid4()))
+
+
+def _read(place: Path) -> _Document | None:
+    try:
+        return _Document.model_validate_json(place.read_bytes())
+    except (OSError, ValidationError):
+        return None  # begins anew, which costs no more than the answers to `declare`
+
+
+def _cache_of(root: Path) -> Path:
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(cache) / "mrasfm" / "uploads" / f"{hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:32]}.json"
+
+
+def _digest(settings: ReconstructionSettings) -> str:
+    values: dict[str, Any] = settings.model_dump(mode="json", exclude_none=True)
+    return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()[:16]

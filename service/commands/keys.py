@@ -1,0 +1,76 @@
+"""`mrasfm keys`: make, list and revoke API keys."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from service.settings import Settings
+
+if TYPE_CHECKING:
+    from sqlalchemy.orm import Session
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser("keys", help="make, list and revoke API keys")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="state of a standalone service (MRASFM_DATA_DIR)")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    create = actions.add_parser("create", help="make a key and print it")
+    create.add_argument("--project", default="default", help="made where there is none of this name")
+    create.add_argument("--name", default="unnamed", help="to recognise the key by")
+    actions.add_parser("list", help="list keys, without their secrets")
+    revoke = actions.add_parser("revoke", help="end a key")
+    revoke.add_argument("key_id", metavar="ID")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Do what is asked; a key is printed once and not kept."""
+    from service.persistence.database import Database, migrate
+
+    settings = Settings() if arguments.data is None else Settings(data_dir=arguments.data)
+    migrate(settings)
+    database = Database.of(settings)
+    try:
+        with database.write() as session:
+            return _ACTIONS[arguments.action](session, settings, arguments)
+    finally:
+        database.close()
+
+
+def _create(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
+    from service.persistence.keys import create_key, create_project, find_project
+
+    for given in (arguments.project, arguments.name):
+        if not 0 < len(given) <= 200 or not given.isprintable():
+            print(f"mrasfm: error: {given!r} is not a name of 1 to 200 printable characters", file=sys.stderr)
+            return 2
+    project = find_project(session, arguments.project) or create_project(session, arguments.project, settings)
+    print(create_key(session, project, arguments.name)[1])
+    return 0
+
+
+def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
+    from sqlalchemy import select
+
+    from service.persistence.tables import ApiKey, Project
+
+    rows = session.execute(select(ApiKey, Project.name).join(Project, ApiKey.project_id == Project.id))
+    for key, project in rows:
+        print(f"{key.id}  {project}  {key.name}  {'revoked' if key.revoked_us else 'valid'}")
+    return 0
+
+
+def _revoke(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
+    from service.persistence.keys import revoke_key
+
+    if revoke_key(session, arguments.key_id):
+        return 0
+    print(f"mrasfm: error: there is no key {arguments.key_id!r}; 'mrasfm keys list' shows them", file=sys.stderr)
+    return 2
+
+
+_ACTIONS = {"create": _create, "list": _list, "revoke": _revoke}

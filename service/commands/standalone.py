@@ -1,0 +1,62 @@
+"""`mrasfm standalone`: the whole service on one machine."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from service.settings import Settings
+
+EXIT_CANNOT_RUN = 2
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser("standalone", help="run the whole service on this machine")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of all state (default: mrasfm-data)")
+    parser.add_argument("--host", help="address to listen on (default: 127.0.0.1)")
+    parser.add_argument("--port", type=int, help="port to listen on (default: 8000; 0 takes a free one)")
+    parser.add_argument("--workers", type=_count, default=1, metavar="N", help="reconstructions at a time (default: 1)")
+    parser.add_argument(
+        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="of the files in DIR/logs"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run until a signal says stop."""
+    from service.broker import BrokerServerError
+    from service.data_folder import DataFolderError
+    from service.standalone import StandaloneError, run_standalone
+    from service.supervisor import SupervisorError
+
+    try:
+        run_standalone(_settings(arguments), workers=arguments.workers, log_level=arguments.log_level, say=_say)
+    except (DataFolderError, BrokerServerError, StandaloneError, SupervisorError) as error:
+        _say(f"error: {error}")
+        return EXIT_CANNOT_RUN
+    except ValidationError as error:
+        for problem in error.errors():
+            name = ".".join(str(part) for part in problem["loc"])
+            _say(f"error: {name} is not valid: {problem['msg']}. Correct MRASFM_{name.upper()} or the option for it.")
+        return EXIT_CANNOT_RUN
+    _say("stopped. Started again with the same folder, it goes on where it was.")
+    return 0
+
+
+def _settings(arguments: argparse.Namespace) -> Settings:
+    given = {"data_dir": arguments.data, "host": arguments.host, "port": arguments.port}
+    return Settings(**{name: value for name, value in given.items() if value is not None})
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
+def _say(line: str) -> None:
+    print(f"mrasfm: {line}", file=sys.stderr, flush=True)

@@ -1,0 +1,34 @@
+"""What every request needs: settings, database, artifact store and broker, opened once a process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import anyio
+
+from service.persistence.artifacts import ArtifactStore
+from service.persistence.database import Database
+from service.persistence.wakeups import Wakeups
+from service.settings import Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Context:
+    """The API process's resources."""
+
+    settings: Settings
+    database: Database
+    artifacts: ArtifactStore
+    wakeups: Wakeups
+    disk: anyio.CapacityLimiter  # uploads that write at one time
+
+    @classmethod
+    def open(cls, settings: Settings) -> Context:
+        """Open everything that the settings name; the broker is not asked."""
+        return cls(
+            settings=settings,
+            database=Database.of(settings),
+            artifacts=ArtifactStore(settings),
+            wakeups=Wakeups(settings),
+            disk=anyio.CapacityLimiter(settings.max_concurrent_writes),
+        )

@@ -1,0 +1,97 @@
+"""The folder that holds one installation's state: private to its owner, used by one `mrasfm standalone` at a time."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+LOCK_FILE = "standalone.lock"
+# What an earlier run left behind is killed within milliseconds of its supervisor's death, but not at once.
+LOCK_PATIENCE_S = 10.0
+LOCK_POLL_S = 0.1
+
+
+class DataFolderError(Exception):
+    """The folder cannot be used; the message says why and what to do."""
+
+
+def make_private_folder(folder: Path) -> None:
+    """Make a folder that only its owner may enter; one that is there already is narrowed to that.
+
+    Raises
+    ------
+    DataFolderError
+        Where it cannot be made or written, or belongs to somebody else.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.chmod(0o700)
+    except OSError as error:
+        raise DataFolderError(
+            f"the data folder {folder} cannot be used: {error.strerror}. "
+            "Give a folder that belongs to you with --data, or correct its owner."
+        ) from error
+
+
+def write_private_file(path: Path, text: str) -> None:
+    """Write a file that only its owner may read, whole or not at all."""
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def exclusive_use(folder: Path, *, patience_s: float = LOCK_PATIENCE_S) -> Iterator[int]:
+    """Hold the folder for this process and the children that inherit the descriptor.
+
+    The lock ends with the last process that has the descriptor open. So a new run never starts beside what an
+    earlier one, killed a moment ago, left behind: two brokers appending to one file would destroy it.
+
+    Yields
+    ------
+    int
+        The descriptor of the lock file, for `pass_fds`.
+
+    Raises
+    ------
+    DataFolderError
+        Where another run, or a process that one left behind, still has the folder after `patience_s`.
+    """
+    descriptor = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        _wait_for_lock(descriptor, folder, patience_s)
+        os.truncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _wait_for_lock(descriptor: int, folder: Path, patience_s: float) -> None:
+    deadline_s = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError as error:
+            if time.monotonic() < deadline_s:
+                time.sleep(LOCK_POLL_S)
+                continue
+            holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip() or "unknown"
+            raise DataFolderError(
+                f"the data folder {folder} is in use by another `mrasfm standalone` (process {holder}). "
+                "Stop that one, or give another folder with --data."
+            ) from error

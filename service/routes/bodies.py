@@ -1,0 +1,115 @@
+"""Request bodies: read within bounds, parsed strictly, described in the OpenAPI page."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from fastapi import Request
+from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
+
+from schemas.api.problems import ProblemItem
+from schemas.parsing import DocumentError, parse_document
+from service.errors import ServiceError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Body(Generic[Model]):
+    """A parsed body and the bytes that it came as."""
+
+    value: Model
+    raw: bytes
+
+
+def json_body(
+    model: type[Model], max_bytes: Callable[[Request], int]
+) -> Callable[[Request], Coroutine[Any, Any, Body[Model]]]:
+    """A dependency that reads a JSON body as `model`.
+
+    FastAPI's own parsing would hold a body of any size in memory, and takes NaN and repeated keys.
+    """
+
+    async def read(request: Request) -> Body[Model]:
+        raw = await read_within(request, max_bytes(request))
+        try:
+            return Body(await run_in_threadpool(parse_document, raw, model), raw)
+        except DocumentError as error:
+            raise invalid(error, what="the request's body") from None
+
+    return read
+
+
+async def read_within(request: Request, max_bytes: int) -> bytes:
+    """The request's body.
+
+    Raises
+    ------
+    ServiceError
+        413 as soon as it is known to be larger than `max_bytes`.
+    """
+    if int(request.headers.get("content-length", 0)) > max_bytes:
+        raise _too_large(request.headers["content-length"], max_bytes)
+    parts, size = [], 0
+    async for part in request.stream():
+        size += len(part)
+        if size > max_bytes:
+            raise _too_large(f"over {max_bytes}", max_bytes)
+        parts.append(part)
+    return b"".join(parts)
+
+
+def _too_large(size: str, max_bytes: int) -> ServiceError:
+    return ServiceError(
+        413,
+        "too-large",
+        "The request is too large",
+        f"the body has {size} bytes, the bound is {max_bytes}",
+        remedy="Split the drive, or ask the operator for a larger bound.",
+    )
+
+
+def invalid(error: DocumentError, *, what: str) -> ServiceError:
+    """422 with all defects of a document."""
+    return ServiceError(
+        422,
+        "invalid-document",
+        "The document does not follow its contract",
+        f"{what}: {error}",
+        remedy="Correct the fields that are named; /docs describes every field.",
+        errors=[ProblemItem(field=problem.path, detail=problem.what) for problem in error.problems[:100]],
+    )
+
+
+def request_sha256(request: Request, raw: bytes) -> str:
+    """Tells requests apart that are made under one idempotency key."""
+    target = f"{request.method} {request.url.path}?{request.url.query}\n"
+    return hashlib.sha256(target.encode() + raw).hexdigest()
+
+
+# Models that bodies are parsed as: the OpenAPI page describes them.
+documented: dict[str, type[BaseModel]] = {}
+
+
+def describe(model: type[BaseModel]) -> dict[str, Any]:
+    """`openapi_extra` of a route whose body is `model`."""
+    documented[model.__name__] = model
+    reference = {"$ref": f"#/components/schemas/{model.__name__}"}
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": reference}}}}
+
+
+def describe_answer(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
+    """`responses` of a route that answers with a stored document of this form."""
+    documented[model.__name__] = model
+    reference = {"$ref": f"#/components/schemas/{model.__name__}"}
+    return {200: {"content": {"application/json": {"schema": reference}}}}
+
+
+def describe_bytes(what: str) -> dict[str, Any]:
+    """`openapi_extra` of a route whose body is a file."""
+    schema = {"type": "string", "format": "binary", "description": what}
+    return {"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": schema}}}}

@@ -1,0 +1,173 @@
+"""What routes ask for by type: the context, who calls, and the idempotent execution of a POST."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import BackgroundTasks, Depends, Header, Query, Request, Response
+from fastapi.responses import JSONResponse
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import BaseModel
+from sqlalchemy.orm import Session
+
+from schemas.api.problems import MEDIA_TYPE
+from service.context import Context
+from service.errors import ServiceError
+from service.persistence import jobs
+from service.persistence.idempotency import Answer, once
+from service.persistence.keys import project_of
+from service.persistence.tables import Job
+from service.persistence.wakeups import BrokerError
+from service.routes.bodies import request_sha256
+from service.routes.paging import MAX_LIMIT
+
+log = logging.getLogger("mrasfm.api")
+
+_bearer = HTTPBearer(auto_error=False, description="An API key: `Authorization: Bearer mrasfm_...`")
+
+
+def get_context(request: Request) -> Context:
+    """The process's resources."""
+    context: Context = request.app.state.context
+    return context
+
+
+ContextDep = Annotated[Context, Depends(get_context)]
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whose key the request carries."""
+
+    project_id: str
+
+
+def get_caller(
+    context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+) -> Caller:
+    """Who calls.
+
+    Raises
+    ------
+    ServiceError
+        401 without a valid key.
+    """
+    project_id = None
+    if credentials is not None:
+        with context.database.read() as session:
+            project_id = project_of(session, credentials.credentials)
+    if project_id is None:
+        given = "the API key is not valid" if credentials is not None else "the request carries no API key"
+        raise ServiceError(
+            401,
+            "unauthorized",
+            "No valid API key",
+            given,
+            remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",
+            headers={"WWW-Authenticate": 'Bearer realm="mrasfm"'},
+        )
+    return Caller(project_id)
+
+
+CallerDep = Annotated[Caller, Depends(get_caller)]
+
+Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items a page")]
+Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the page before")]
+_IDEMPOTENCY = (
+    "Names this request: repeated under the same key it has its effect once, and the first answer is replayed for a day"
+)
+
+
+@dataclass(frozen=True)
+class Once:
+    """Runs a POST's effect in one transaction, once a key, and wakes workers up for the jobs that it made."""
+
+    context: Context
+    caller: Caller
+    request: Request
+    background: BackgroundTasks
+    key: str | None
+
+    def __call__(self, effect: Callable[[Session], Answer], raw: bytes = b"") -> Response:
+        """Answer the request; `raw` is its body."""
+        answer = once(
+            self.context.database,
+            effect,
+            project_id=self.caller.project_id,
+            key=self.key,
+            request_sha256=request_sha256(self.request, raw),
+            keep_us=int(self.context.settings.idempotency_hours * 3600e6),
+        )
+        headers = dict(answer.headers)
+        if answer.replayed:
+            headers["Idempotent-Replayed"] = "true"
+        if answer.jobs:
+            # After the answer: a broker that hangs must not hold up a request that is safely recorded.
+            self.background.add_task(wake_up, self.context, list(answer.jobs))
+        return JSONResponse(answer.body, status_code=answer.status, headers=headers, background=self.background)
+
+
+def get_once(
+    context: ContextDep,
+    caller: CallerDep,
+    request: Request,
+    background: BackgroundTasks,
+    idempotency_key: Annotated[
+        str | None, Header(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description=_IDEMPOTENCY)
+    ] = None,
+) -> Once:
+    """The idempotent execution of this request."""
+    return Once(context, caller, request, background, idempotency_key)
+
+
+OnceDep = Annotated[Once, Depends(get_once)]
+
+
+def wake_up(context: Context, waiting: list[Job]) -> None:
+    """Tell workers about jobs; where the broker does not answer, the reconciler does it later."""
+    try:
+        context.wakeups.send(waiting)
+    except BrokerError as error:
+        log.warning("no worker was woken up", extra={"fields": {"why": str(error), "jobs": len(waiting)}})
+        return
+    with context.database.write() as session:
+        jobs.mark_enqueued(session, [job.id for job in waiting])
+
+
+def answer(status: int, body: BaseModel, *, waiting: tuple[Job, ...] = (), **headers: str) -> Answer:
+    """An answer with a resource as its body; header names are written with underscores."""
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return Answer(status=status, body=body.model_dump(mode="json"), headers=named, jobs=waiting)
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """`responses` of a route: which problems it answers with."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    known = {
+        400: "The request is malformed",
+        401: "No valid API key",
+        404: "There is no such thing in this project",
+        405: "The resource has no such method",
+        409: "The resource is not in the right state; the problem says what to do",
+        413: "Too large, or the storage quota is full",
+        416: "The range lies outside the file",
+        422: "The request or the drive is at fault; all defects are listed",
+        429: "A quota is full; try later",
+        503: "Not ready",
+        507: "The disk is full",
+    }
+    return {status: {"description": known[status], "content": content} for status in statuses}
+
+
+def expiry_us(created_us: int, days: float | None) -> int | None:
+    """When a resource is deleted; None: never by itself."""
+    return None if days is None else created_us + int(days * 86400e6)
+
+
+def moment(time_us: int | None) -> datetime | None:
+    """A time of the database as the API shows it."""
+    return None if time_us is None else datetime.fromtimestamp(time_us / 1e6, UTC)

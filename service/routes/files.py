@@ -1,0 +1,277 @@
+"""The files of a drive: one by one, or all in one archive."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from schemas.api.common import Page
+from schemas.api.drives import DeclaredFiles, DeclareFiles, DriveFileResource, StoredFiles
+from service.context import Context
+from service.errors import ServiceError
+from service.persistence import drives
+from service.persistence.idempotency import Answer
+from service.persistence.storing import storing
+from service.persistence.tables import Blob, DriveFile
+from service.routes.bodies import Body, describe, describe_bytes, json_body
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, get_context, problems
+from service.routes.paging import cursor_of, position_of
+from service.uploads.archive import unpack
+from service.uploads.archive_limits import ArchiveLimits
+from service.uploads.digests import parse_digest
+from service.uploads.images import check_image
+from service.uploads.spool import Spooled, receive
+
+router = APIRouter(prefix="/v1/drives/{drive_id}", tags=["files"])
+
+_DRAINED_BYTES = 16 << 20
+read_declaration = json_body(DeclareFiles, lambda request: get_context(request).settings.max_json_bytes)
+
+ContentDigest = Annotated[
+    str | None,
+    Header(
+        alias="Content-Digest",
+        max_length=2000,
+        description="`sha-256=:BASE64:` of the body (RFC 9530). Bytes with another digest are refused and discarded",
+    ),
+]
+Replace = Annotated[bool, Query(description="take the bytes although others are stored under this name")]
+
+
+@router.get("/files", responses=problems(401, 404, 422))
+def list_files(
+    drive_id: str,
+    caller: CallerDep,
+    context: ContextDep,
+    limit: Limit = 1000,
+    cursor: Cursor = None,
+    stored: Annotated[bool | None, Query(description="only files that are here, or only those that are not")] = None,
+) -> Page[DriveFileResource]:
+    """Files that the manifest names, by path."""
+    with context.database.read() as session:
+        drive = drives.get(session, caller.project_id, drive_id)
+        statement = select(DriveFile, Blob).outerjoin(Blob, DriveFile.blob_id == Blob.id)
+        statement = statement.where(DriveFile.drive_id == drive.id)
+        after = position_of(cursor, str)
+        if after is not None:
+            statement = statement.where(DriveFile.path > after[0])
+        if stored is not None:
+            statement = statement.where(DriveFile.blob_id.is_not(None) if stored else DriveFile.blob_id.is_(None))
+        rows = session.execute(statement.order_by(DriveFile.path).limit(limit)).all()
+    last = rows[-1][0].path if len(rows) == limit else None
+    return Page(items=[_shown(file, blob) for file, blob in rows], next=None if last is None else cursor_of(last))
+
+
+@router.post(
+    "/files:declare",
+    response_model=DeclaredFiles,
+    responses=problems(401, 404, 409, 413, 422),
+    openapi_extra=describe(DeclareFiles),
+)
+def declare_files(
+    drive_id: str,
+    once: OnceDep,
+    caller: CallerDep,
+    body: Annotated[Body[DeclareFiles], Depends(read_declaration)],
+) -> Response:
+    """Say which files you have, and learn which of them must be sent.
+
+    A content that the project has stored already, in this drive or another, is not sent again.
+    """
+
+    def effect(session: Session) -> Answer:
+        drive = drives.get(session, caller.project_id, drive_id, lock=True)
+        stored, to_send = drives.declare(session, drive, body.value.files)
+        return answer(200, DeclaredFiles(stored=stored, to_send=to_send))
+
+    return once(effect, body.raw)
+
+
+@router.put(
+    "/files/{path:path}",
+    response_model=DriveFileResource,
+    responses={
+        200: {"description": "Was stored before"},
+        201: {"model": DriveFileResource, "description": "Stored"},
+        **problems(400, 401, 404, 409, 413, 422, 507),
+    },
+    openapi_extra=describe_bytes("the file's bytes"),
+)
+async def put_file(
+    drive_id: str,
+    path: str,
+    request: Request,
+    response: Response,
+    caller: CallerDep,
+    context: ContextDep,
+    content_digest: ContentDigest = None,
+    replace: Replace = False,
+) -> DriveFileResource:
+    """Store one file of an open drive, whole or not at all. Sending the same bytes again changes nothing."""
+    stream = request.stream()
+    try:
+        await run_in_threadpool(_require_wanted, context, caller.project_id, drive_id, path)
+        spooled = await _received(request, stream, context, context.settings.max_file_bytes, content_digest)
+    except ServiceError:
+        await _drain(request, stream)
+        raise
+    with spooled:
+        new, shown = await run_in_threadpool(_keep, context, caller.project_id, drive_id, path, spooled, replace)
+    response.status_code = 201 if new else 200
+    return shown
+
+
+@router.delete("/files/{path:path}", status_code=204, responses=problems(401, 404, 409, 422))
+def delete_file(drive_id: str, path: str, caller: CallerDep, context: ContextDep) -> None:
+    """Forget the bytes of one file of an open drive."""
+    with context.database.write() as session:
+        drives.detach(session, drives.get(session, caller.project_id, drive_id, lock=True), path)
+
+
+@router.put(
+    "/archive",
+    responses=problems(400, 401, 404, 409, 413, 422, 507),
+    openapi_extra=describe_bytes(
+        "a zip, tar, tar.gz, tar.bz2 or tar.xz of files under the names that the manifest gives"
+    ),
+)
+async def put_archive(
+    drive_id: str,
+    request: Request,
+    caller: CallerDep,
+    context: ContextDep,
+    content_digest: ContentDigest = None,
+    replace: Replace = False,
+) -> StoredFiles:
+    """Store all files of an archive in an open drive, or none of them. One folder around them is taken off."""
+    stream = request.stream()
+    try:
+        await run_in_threadpool(_require_open, context, caller.project_id, drive_id)
+        archive = await _received(request, stream, context, context.settings.max_archive_bytes, content_digest)
+    except ServiceError:
+        await _drain(request, stream)
+        raise
+    with archive:
+        return await run_in_threadpool(_unpack, context, caller.project_id, drive_id, archive, replace)
+
+
+async def _received(
+    request: Request, stream: AsyncIterator[bytes], context: Context, max_bytes: int, content_digest: str | None
+) -> Spooled:
+    length = request.headers.get("content-length")
+    return await receive(
+        stream,
+        context.settings.spool_dir,
+        max_bytes=max_bytes,
+        expected_bytes=None if length is None else int(length),
+        expected_sha256=parse_digest(content_digest),
+        min_free_bytes=context.settings.min_free_disk_bytes,
+        on_disk=context.disk,
+    )
+
+
+async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
+    """Read on a little after a refusal: most clients look at the answer only once they have sent everything."""
+    left = _DRAINED_BYTES
+    if int(request.headers.get("content-length", 0)) > left:
+        return
+    try:
+        async for part in stream:
+            left -= len(part)
+            if left < 0:
+                return
+    except (ClientDisconnect, RuntimeError):  # RuntimeError: the stream has been read to its end
+        return
+
+
+def _require_wanted(context: Context, project_id: str, drive_id: str, path: str) -> None:
+    """Refuse a file that would not be taken, before its bytes are."""
+    with context.database.read() as session:
+        drive = drives.get(session, project_id, drive_id)
+        drives.require_file(session, drive, path)
+
+
+def _require_open(context: Context, project_id: str, drive_id: str) -> None:
+    with context.database.read() as session:
+        drives.require_open(drives.get(session, project_id, drive_id))
+
+
+def _keep(
+    context: Context, project_id: str, drive_id: str, path: str, spooled: Spooled, replace: bool
+) -> tuple[bool, DriveFileResource]:
+    check_image(spooled.path, path)
+    with storing(context.database, context.artifacts, project_id=project_id) as store:
+        stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
+        with context.database.write() as session:
+            drive = drives.get(session, project_id, drive_id, lock=True)
+            new = drives.attach(session, drive, path, stored, replace=replace)
+            file = drives.require_file(session, drive, path)
+            return new, _shown(file, session.get_one(Blob, file.blob_id))
+
+
+def _unpack(context: Context, project_id: str, drive_id: str, archive: Spooled, replace: bool) -> StoredFiles:
+    with context.database.read() as session:
+        drive = drives.get(session, project_id, drive_id)
+        expected = set(session.scalars(select(DriveFile.path).where(DriveFile.drive_id == drive.id)))
+        manifest_key = session.get_one(Blob, drive.manifest_blob_id).key
+    settings = context.settings
+    unpacked = unpack(
+        archive.path,
+        expected,
+        same_manifest=lambda raw: _same_json(raw, context.artifacts.read(manifest_key)),
+        folder=settings.spool_dir,
+        limits=ArchiveLimits(
+            max_entries=3 * len(expected) + 1000,
+            max_bytes=settings.max_archive_bytes,
+            max_ratio=settings.max_compression_ratio,
+            max_file_bytes=settings.max_file_bytes,
+            min_free_bytes=settings.min_free_disk_bytes,
+        ),
+    )
+    try:
+        return _keep_all(context, project_id, drive_id, unpacked, replace)
+    finally:
+        for _, spooled in unpacked:
+            spooled.discard()
+
+
+def _keep_all(
+    context: Context, project_id: str, drive_id: str, unpacked: list[tuple[str, Spooled]], replace: bool
+) -> StoredFiles:
+    with storing(context.database, context.artifacts, project_id=project_id) as store:
+        stored = [
+            (name, store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes))
+            for name, spooled in unpacked
+        ]
+        with context.database.write() as session:
+            drive = drives.get(session, project_id, drive_id, lock=True)
+            for name, file in stored:
+                drives.attach(session, drive, name, file, replace=replace)
+            count = drives.stored_of(session, [drive_id])[drive_id].files
+            return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
+
+
+def _same_json(a: bytes, b: bytes) -> bool:
+    try:
+        return bool(json.loads(a) == json.loads(b))
+    except (ValueError, RecursionError):
+        return False
+
+
+def _shown(file: DriveFile, blob: Blob | None) -> DriveFileResource:
+    return DriveFileResource.model_validate(
+        {
+            "path": file.path,
+            "role": file.role,
+            "stored": blob is not None,
+            "size_bytes": None if blob is None else blob.size_bytes,
+            "sha256": None if blob is None else blob.sha256,
+        }
+    )

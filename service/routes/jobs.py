@@ -1,0 +1,154 @@
+"""Jobs: list, show, cancel, retry, and the stream of their events."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from sqlalchemy import select, tuple_
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+
+from schemas.api.common import Page
+from schemas.api.jobs import JobResource
+from service.context import Context
+from service.persistence import jobs
+from service.persistence.idempotency import Answer
+from service.persistence.owned import require
+from service.persistence.tables import TERMINAL, Job, JobAttempt, JobEvent, JobState, now_us
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, expiry_us, problems
+from service.routes.job_views import RETRY_AFTER_S, etag_of, shown
+from service.routes.paging import cursor_of, position_of
+from service.routes.ranges import none_match
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+
+@router.get("", responses=problems(401, 422))
+def list_jobs(
+    caller: CallerDep,
+    context: ContextDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+    drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
+) -> Page[JobResource]:
+    """Jobs of the project, newest first."""
+    statement = select(Job).where(Job.project_id == caller.project_id)
+    if drive_id is not None:
+        statement = statement.where(Job.drive_id == drive_id)
+    after = position_of(cursor, int, str)
+    if after is not None:
+        statement = statement.where(tuple_(Job.created_us, Job.id) < after)
+    with context.database.read() as session:
+        found = session.scalars(statement.order_by(Job.created_us.desc(), Job.id.desc()).limit(limit)).all()
+        attempts = _attempts(session, [job.id for job in found])
+    last = found[-1] if len(found) == limit else None
+    return Page(
+        items=[shown(job, attempts.get(job.id, []), context.settings) for job in found],
+        next=None if last is None else cursor_of(last.created_us, last.id),
+    )
+
+
+@router.get(
+    "/{job_id}",
+    response_model=JobResource,
+    responses={304: {"description": "Nothing has changed since the ETag in If-None-Match"}, **problems(401, 404)},
+)
+def get_job(
+    job_id: str,
+    caller: CallerDep,
+    context: ContextDep,
+    response: Response,
+    if_none_match: Annotated[str | None, Header(max_length=2000)] = None,
+) -> Response | JobResource:
+    """One job: poll this every `Retry-After` seconds, with `If-None-Match`, or read its events."""
+    with context.database.read() as session:
+        job = require(session, Job, caller.project_id, job_id)
+        attempts = _attempts(session, [job_id]).get(job_id, [])
+    etag = etag_of(job, context.settings)
+    headers = {"ETag": etag, "Cache-Control": "no-cache"}
+    if job.state not in TERMINAL:
+        headers["Retry-After"] = str(RETRY_AFTER_S)
+    if none_match(if_none_match, etag):
+        return Response(status_code=304, headers=headers)
+    response.headers.update(headers)
+    return shown(job, attempts, context.settings)
+
+
+@router.post("/{job_id}:cancel", status_code=202, response_model=JobResource, responses=problems(401, 404, 409, 422))
+def cancel_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
+    """Ask for a job's end. One that waits ends at once; one that runs is told to stop, and killed if it does not."""
+
+    def effect(session: Session) -> Answer:
+        require(session, Job, caller.project_id, job_id)
+        jobs.request_cancel(session, job_id)
+        job = session.get_one(Job, job_id, populate_existing=True)
+        attempts = _attempts(session, [job_id]).get(job_id, [])
+        return answer(202, shown(job, attempts, context.settings), Location=f"/v1/jobs/{job_id}")
+
+    return once(effect)
+
+
+@router.post(
+    "/{job_id}:retry", status_code=202, response_model=JobResource, responses=problems(401, 404, 409, 422, 429)
+)
+def retry_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
+    """Do again what failed or was cancelled, as a new job. Finished stages are reused."""
+
+    def effect(session: Session) -> Answer:
+        expires_us = expiry_us(now_us(), context.settings.job_retention_days)
+        new = jobs.retry(session, require(session, Job, caller.project_id, job_id), expires_us=expires_us)
+        return answer(
+            202,
+            shown(new, [], context.settings),
+            waiting=(new,),
+            Location=f"/v1/jobs/{new.id}",
+            Retry_After=str(RETRY_AFTER_S),
+        )
+
+    return once(effect)
+
+
+def _existing(job_id: str, caller: CallerDep, context: ContextDep) -> str:
+    """Asked before the stream begins: a stream cannot answer 404 any more."""
+    with context.database.read() as session:
+        return require(session, Job, caller.project_id, job_id).id
+
+
+@router.get("/{job_id}/events", response_class=EventSourceResponse, responses=problems(401, 404, 422))
+async def stream_events(
+    job_id: Annotated[str, Depends(_existing)],
+    context: ContextDep,
+    last_event_id: Annotated[
+        int | None, Header(ge=0, lt=2**62, description="go on after this event, as a browser does by itself")
+    ] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """The job's changes of state and its progress, from the beginning, until it has ended."""
+    last = last_event_id or 0
+    while True:
+        ended, events = await run_in_threadpool(_news, context, job_id, last)
+        for event in events:
+            last = event.id
+            yield ServerSentEvent(id=str(event.id), event=event.kind, data=event.data)
+        if ended and not events:
+            return
+        if not events:
+            await asyncio.sleep(context.settings.poll_seconds)
+
+
+def _news(context: Context, job_id: str, last: int) -> tuple[bool, list[JobEvent]]:
+    with context.database.read() as session:
+        state = session.scalar(select(Job.state).where(Job.id == job_id))
+        ended = state is None or JobState(state) in TERMINAL
+        return ended, jobs.events_after(session, job_id, last)
+
+
+def _attempts(session: Session, job_ids: list[str]) -> dict[str, list[JobAttempt]]:
+    found: dict[str, list[JobAttempt]] = {}
+    statement = select(JobAttempt).where(JobAttempt.job_id.in_(job_ids)).order_by(JobAttempt.fence)
+    for attempt in session.scalars(statement):
+        found.setdefault(attempt.job_id, []).append(attempt)
+    return found

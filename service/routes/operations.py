@@ -1,0 +1,139 @@
+"""Is it alive, is it ready, how is it: for load balancers, monitoring and people."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.metadata import version
+
+from fastapi import APIRouter, Response
+from sqlalchemy import delete, false, func, select
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+
+from schemas.api.status import DiskStatus, Health, QueueStatus, Ready, ServiceStatus, WorkerStatus
+from service.context import Context
+from service.errors import ServiceError
+from service.metrics import CONTENT_TYPE, ONLINE_US, Metrics
+from service.persistence.database import is_current
+from service.persistence.tables import Job, JobState, WorkerSeen, now_us
+from service.persistence.wakeups import QUEUES, BrokerError
+from service.routes.dependencies import CallerDep, ContextDep, moment, problems
+
+router = APIRouter(tags=["operation"])
+
+
+@router.get("/livez")
+async def live() -> Ready:
+    """The process answers."""
+    return Ready(status="alive")
+
+
+@router.get("/readyz", responses=problems(503))
+def ready(context: ContextDep) -> Ready:
+    """Database and artifact store can be written. A broker that is down does not matter here: uploads go on."""
+    try:
+        current = is_current(context.database)
+        with context.database.write() as session:
+            session.execute(delete(WorkerSeen).where(false()))  # a standby or a read-only file refuses it
+    except Exception as error:
+        raise _not_ready("the database", error) from error
+    if not current:
+        raise _not_ready("the database's schema", None)
+    try:
+        context.artifacts.require_writable()
+    except Exception as error:
+        raise _not_ready("the artifact store", error) from error
+    return Ready(status="ready")
+
+
+def _not_ready(what: str, error: Exception | None) -> ServiceError:
+    why = "is not the one this version expects" if error is None else f"cannot be used ({type(error).__name__})"
+    return ServiceError(
+        503,
+        "not-ready",
+        "The service is not ready",
+        f"{what} {why}",
+        remedy="Run 'mrasfm migrate'." if error is None else "The operator has to look at its log and at its disk.",
+        headers={"Retry-After": "5"},
+    )
+
+
+@router.get("/v1/status", responses=problems(401))
+def status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
+    """What works and what does not, and what that means for you."""
+    broker, reasons = True, []
+    try:
+        context.wakeups.require_broker()
+    except BrokerError:
+        broker = False
+        reasons.append("the broker does not answer: jobs are accepted and start when it is back")
+    with context.database.read() as session:
+        workers, queue = _workers(session), _queue(session, context)
+    served = {name for worker in workers if worker.online for name in worker.queues}
+    for kind, name in QUEUES.items():
+        if name not in served:
+            reasons.append(f"no worker serves the queue {name!r}: jobs of kind {kind} are accepted and wait")
+    disk = _disk(context)
+    if not disk.accepts_uploads:
+        reasons.append("the disk is full: uploads are refused with 507")
+    return ServiceStatus(
+        status=Health.DEGRADED if reasons else Health.OK,
+        reasons=reasons,
+        version=version("mrasfm"),
+        broker=broker,
+        workers=workers,
+        queue=queue,
+        disk=disk,
+    )
+
+
+def _workers(session: Session) -> list[WorkerStatus]:
+    now = now_us()
+    rows = session.scalars(
+        select(WorkerSeen).where(WorkerSeen.seen_us > now - 86_400_000_000).order_by(WorkerSeen.name)
+    )
+    return [
+        WorkerStatus.model_validate(
+            {
+                "name": row.name,
+                "queues": row.queues.split(","),
+                "concurrency": row.concurrency,
+                "seen_at": moment(row.seen_us),
+                "online": row.seen_us > now - ONLINE_US,
+            }
+        )
+        for row in rows
+    ]
+
+
+def _queue(session: Session, context: Context) -> QueueStatus:
+    silent = Job.heartbeat_us < now_us() - int(context.settings.stalled_seconds * 1e6)
+    counts = dict(session.execute(select(Job.state, func.count()).group_by(Job.state)).tuples().all())
+    stalled = select(func.count()).select_from(Job).where(Job.state == JobState.RUNNING, silent)
+    return QueueStatus(
+        queued=counts.get(JobState.QUEUED, 0),
+        running=counts.get(JobState.RUNNING, 0),
+        stalled=session.scalar(stalled) or 0,
+    )
+
+
+def _disk(context: Context) -> DiskStatus:
+    context.settings.spool_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    usage = shutil.disk_usage(context.settings.spool_dir)
+    return DiskStatus(
+        free_bytes=usage.free,
+        total_bytes=usage.total,
+        accepts_uploads=usage.free > context.settings.min_free_disk_bytes,
+    )
+
+
+def metrics_route(metrics: Metrics) -> APIRouter:
+    """`/metrics` of these metrics."""
+    metrics_router = APIRouter(tags=["operation"])
+
+    @metrics_router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+    async def read_metrics() -> Response:
+        """Metrics for Prometheus."""
+        return Response(await run_in_threadpool(metrics.text), media_type=CONTENT_TYPE)
+
+    return metrics_router

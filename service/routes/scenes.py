@@ -1,0 +1,151 @@
+"""Scenes: list, show, delete, download."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import StreamingResponse
+from sqlalchemy import delete, select, tuple_
+from sqlalchemy.orm import Session
+
+from schemas.api.common import Page
+from schemas.api.scenes import SceneFileResource, SceneResource
+from service.context import Context
+from service.errors import not_found
+from service.persistence.owned import require
+from service.persistence.tables import Blob, Scene, SceneFile
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment, problems
+from service.routes.paging import cursor_of, position_of
+from service.routes.ranges import Part, content_disposition, none_match, requested_part
+from service.uploads.digests import format_digest
+
+router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+_FILE = {"schema": {"type": "string", "format": "binary"}}
+_DOWNLOADS: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The whole file", "content": {"application/octet-stream": _FILE}},
+    206: {"description": "The range that was asked for", "content": {"application/octet-stream": _FILE}},
+    304: {"description": "The client has this version"},
+}
+
+
+@router.get("", responses=problems(401, 422))
+def list_scenes(
+    caller: CallerDep,
+    context: ContextDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+    drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
+) -> Page[SceneResource]:
+    """Scenes of the project, newest first, without their files."""
+    statement = select(Scene).where(Scene.project_id == caller.project_id)
+    if drive_id is not None:
+        statement = statement.where(Scene.drive_id == drive_id)
+    after = position_of(cursor, int, str)
+    if after is not None:
+        statement = statement.where(tuple_(Scene.created_us, Scene.id) < after)
+    with context.database.read() as session:
+        found = session.scalars(statement.order_by(Scene.created_us.desc(), Scene.id.desc()).limit(limit)).all()
+    last = found[-1] if len(found) == limit else None
+    return Page(
+        items=[_shown(scene, []) for scene in found],
+        next=None if last is None else cursor_of(last.created_us, last.id),
+    )
+
+
+@router.get("/{scene_id}", responses=problems(401, 404))
+def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneResource:
+    """One scene and its files."""
+    with context.database.read() as session:
+        scene = require(session, Scene, caller.project_id, scene_id)
+        statement = select(SceneFile, Blob).join(Blob, SceneFile.blob_id == Blob.id)
+        rows = session.execute(statement.where(SceneFile.scene_id == scene_id).order_by(SceneFile.path)).all()
+    return _shown(scene, [_shown_file(file, blob) for file, blob in rows])
+
+
+@router.delete("/{scene_id}", status_code=204, responses=problems(401, 404))
+def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> None:
+    """Delete a scene and its files. Its drive stays."""
+    with context.database.write() as session:
+        require(session, Scene, caller.project_id, scene_id)
+        session.execute(delete(Scene).where(Scene.id == scene_id))
+
+
+@router.head("/{scene_id}/files/{path:path}", include_in_schema=False)
+@router.get(
+    "/{scene_id}/files/{path:path}",
+    response_class=Response,
+    responses={**_DOWNLOADS, **problems(401, 404, 416)},
+)
+def download(scene_id: str, path: str, request: Request, caller: CallerDep, context: ContextDep) -> Response:
+    """One file of a scene. `Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
+    with context.database.read() as session:
+        scene = require(session, Scene, caller.project_id, scene_id)
+        file, blob = _get_file(session, scene, path)
+    etag = f'"{blob.sha256}"'
+    headers = {
+        "ETag": etag,
+        "Repr-Digest": format_digest(blob.sha256),
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "private, no-cache",
+        "Content-Disposition": content_disposition(_download_name(scene, path)),
+        "X-Content-Type-Options": "nosniff",
+    }
+    if none_match(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    asked = None
+    if request.method == "GET":
+        asked = requested_part(request.headers, size_bytes=blob.size_bytes, etag=etag)
+    part = asked or Part(0, blob.size_bytes)
+    headers["Content-Length"] = str(part.stop - part.start)
+    if asked is not None:
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{blob.size_bytes}"
+    if request.method == "HEAD":
+        return Response(headers=headers, media_type=file.media_type)
+    return _streamed(context, blob, part, status=200 if asked is None else 206, headers=headers, kind=file.media_type)
+
+
+def _streamed(
+    context: Context, blob: Blob, part: Part, *, status: int, headers: dict[str, str], kind: str
+) -> StreamingResponse:
+    pieces = context.artifacts.stream(blob.key, start=part.start, stop=part.stop)
+    return StreamingResponse(pieces, status_code=status, headers=headers, media_type=kind)
+
+
+def _download_name(scene: Scene, path: str) -> str:
+    """Says which drive the file is of: a folder of downloads holds many a points.ply."""
+    return f"{scene.name}-{re.sub('/+', '-', path)}"
+
+
+def _get_file(session: Session, scene: Scene, path: str) -> tuple[SceneFile, Blob]:
+    file = session.get(SceneFile, (scene.id, path)) if path.isprintable() else None
+    if file is None:
+        raise not_found(f"file in scene {scene.id} named", path)
+    return file, session.get_one(Blob, file.blob_id)
+
+
+def _shown_file(file: SceneFile, blob: Blob) -> SceneFileResource:
+    return SceneFileResource(
+        path=file.path,
+        size_bytes=blob.size_bytes,
+        sha256=blob.sha256,
+        media_type=file.media_type,
+        url=f"/v1/scenes/{file.scene_id}/files/{file.path}",
+    )
+
+
+def _shown(scene: Scene, files: list[SceneFileResource]) -> SceneResource:
+    return SceneResource.model_validate(
+        {
+            "id": scene.id,
+            "name": scene.name,
+            "drive_id": scene.drive_id,
+            "job_id": scene.job_id,
+            "summary": scene.summary,
+            "files": files,
+            "created_at": moment(scene.created_us),
+            "expires_at": moment(scene.expires_us),
+        }
+    )
