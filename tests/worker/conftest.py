@@ -1,0 +1,81 @@
+"""A small rendered drive, and how long to wait for processes."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from mrasfm_engine.synthetic.drive_writer import render_drives
+from mrasfm_engine.synthetic.options import SynthOptions
+from service.settings import Settings
+from worker.messages import Work
+from worker.progress import Progress, ProgressMeter
+from worker.stages import Verdict
+
+DEADLINE_S = 60.0
+
+
+@pytest.fixture(scope="session")
+def small_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered drive of 2 cameras and 6 units. Tests only read it."""
+    out = tmp_path_factory.mktemp("rendered") / "drive"
+    options = SynthOptions(cameras=2, units=6, seed=3, width=480, height=270, texture_px=256)
+    (folder,) = render_drives(options, out)
+    return folder
+
+
+@pytest.fixture
+def own_drive(small_drive: Path, tmp_path: Path) -> Path:
+    """A copy of that drive to damage."""
+    return Path(shutil.copytree(small_drive, tmp_path / "drive"))
+
+
+@pytest.fixture
+def scratch(tmp_path: Path) -> Path:
+    """The folder of an attempt."""
+    folder = tmp_path / "attempt"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    """Settings with steps that a test can wait for."""
+    return settings_with(tmp_path)
+
+
+def settings_with(data_dir: Path, **fields: float) -> Settings:
+    """Settings of a test, with some of them changed."""
+    values = {"terminate_after_seconds": 20.0, "kill_after_seconds": 40.0, "engine_threads": 1, **fields}
+    return Settings(data_dir=data_dir, **values)  # type: ignore[arg-type]
+
+
+def meter_of(work: Work = Work.RECONSTRUCTION) -> ProgressMeter:
+    """A meter that starts now."""
+    return ProgressMeter(work, started_s=time.monotonic())
+
+
+def go_on(progress: Progress) -> Verdict:
+    """The tick of an attempt that nobody stops."""
+    return Verdict.GO_ON
+
+
+def wait_until(is_so: Callable[[], bool], what: str) -> None:
+    """Wait for something that happens soon."""
+    end_s = time.monotonic() + DEADLINE_S
+    while not is_so():
+        assert time.monotonic() < end_s, f"{what} did not happen"
+        time.sleep(0.02)
+
+
+def is_gone(pid: int) -> bool:
+    """Whether a process has ended; one that only waits to be reaped has."""
+    try:
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True

@@ -1,0 +1,231 @@
+"""Attempts at real drives, in real children."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import psutil
+import pytest
+
+from mrasfm_engine.cli import main
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.axes import flu_from_body
+from mrasfm_engine.io.preflight import check_manifest
+from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from schemas import BodyAxes, Pose
+from schemas.parsing import parse_manifest
+from service.settings import Settings
+from tests.worker.conftest import go_on, meter_of, settings_with
+from worker.messages import Work
+from worker.outcomes import Cancelled, Failed, Outcome, Succeeded
+from worker.progress import Progress
+from worker.stages import Attempt, AttemptFolder, Tick, Verdict, run_attempt
+
+STAGES = ["preflight", "features", "matches", "mapping", "refinement", "export"]
+
+
+def attempt(
+    drive: Path,
+    scratch: Path,
+    settings: Settings,
+    tick: Tick = go_on,
+    work: Work = Work.RECONSTRUCTION,
+    **asked: object,
+) -> Outcome:
+    return run_attempt(
+        Attempt(work=work, drive=drive, settings=asked),
+        scratch=scratch,
+        tick=tick,
+        meter=meter_of(work),
+        settings=settings,
+    )
+
+
+def signal_once_it_works(number: signal.Signals) -> Tick:
+    """Sends a signal to the child as soon as it reports a stage."""
+    sent = []
+
+    def tick(progress: Progress) -> Verdict:
+        if progress.stage and not sent:
+            sent.append(number)
+            (child,) = psutil.Process().children()
+            os.kill(child.pid, number)
+        return Verdict.GO_ON
+
+    return tick
+
+
+def leftovers(scratch: Path) -> list[str]:
+    return [str(path) for path in scratch.rglob("*") if "partial" in path.name]
+
+
+def test_reconstruction_and_another_that_reuses_its_stages(
+    small_drive: Path, scratch: Path, settings: Settings, tmp_path: Path
+) -> None:
+    seen: list[Progress] = []
+
+    def tick(progress: Progress) -> Verdict:
+        seen.append(progress)
+        return Verdict.GO_ON
+
+    outcome = attempt(small_drive, scratch, settings, tick, max_keypoints=1000, seed=5)
+    assert isinstance(outcome, Succeeded)
+    report = outcome.report
+    assert report == json.loads((outcome.out / "report.json").read_text(encoding="utf-8"))
+    assert report["summary"]["registered_units"] == 6
+    assert report["settings"]["features"]["max_keypoints"] == 1000
+    assert report["settings"]["seed"] == 5
+    assert report["settings"]["threads"] == 1
+    assert (outcome.out / "points.ply").stat().st_size > 0
+    assert leftovers(scratch) == []
+
+    percents = [progress.percent for progress in seen]
+    assert percents == sorted(percents)
+    assert percents[0] == 0.0
+    assert 50.0 < percents[-1] <= 97.0
+    stages = [progress.stage for progress in seen if progress.stage]
+    assert sorted(set(stages), key=STAGES.index) == list(dict.fromkeys(stages))
+    assert all(progress.done <= progress.total for progress in seen)
+    assert {progress.unit for progress in seen if progress.stage == "matches"} <= {"pairs"}
+
+    second = tmp_path / "second"
+    AttemptFolder(second).out.mkdir(parents=True)
+    AttemptFolder(scratch).finished_stages.rename(AttemptFolder(second).finished_stages)
+    again = attempt(small_drive, second, settings, tick, max_keypoints=1000, seed=5)
+    assert isinstance(again, Succeeded)
+    reused = {stage["stage"]: stage["reused"] for stage in again.report["stages"]}
+    assert reused == {"features": True, "matches": True, "mapping": True, "refinement": False}
+    assert seen[-1].reused == ("features", "matches", "mapping")
+
+
+def test_bad_input_has_the_words_of_the_command(
+    own_drive: Path, scratch: Path, settings: Settings, capfd: pytest.CaptureFixture[str]
+) -> None:
+    images = sorted((own_drive / "images").rglob("*.jpg"))
+    images[0].unlink()
+    images[3].write_bytes(images[3].read_bytes()[:-2000])
+    assert main(["reconstruct", str(own_drive), "--out", str(own_drive.parent / "scene")]) == 2
+    words = capfd.readouterr().err
+    outcome = attempt(own_drive, scratch, settings)
+    assert isinstance(outcome, Failed)
+    assert outcome.code == "missing-file"
+    assert not outcome.retryable
+    assert outcome.stage == "preflight"
+    assert f"mrasfm: error: {outcome.what}\n  {outcome.remedy}" in words
+    assert "1 more error" in outcome.what
+    errors = [finding for finding in outcome.findings if finding["severity"] == "error"]
+    assert len(errors) == 2
+    assert str(own_drive) not in json.dumps(outcome.findings) + outcome.what
+
+
+@pytest.mark.parametrize("work", list(Work))
+def test_broken_manifest(own_drive: Path, scratch: Path, settings: Settings, work: Work) -> None:
+    (own_drive / "drive.json").write_text('{"name": NaN}', encoding="utf-8")
+    outcome = attempt(own_drive, scratch, settings, work=work)
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable, outcome.stage) == ("bad-document", False, "")
+    assert outcome.what == "drive manifest drive.json: holds NaN, which is not a JSON number"
+
+
+def test_unknown_setting(small_drive: Path, scratch: Path, settings: Settings) -> None:
+    outcome = attempt(small_drive, scratch, settings, gravity=9.81)
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable) == ("bad-settings", False)
+    assert "gravity" in outcome.what
+
+
+def test_drive_that_cannot_be_reconstructed(own_drive: Path, scratch: Path, settings: Settings) -> None:
+    """Every image is the same grey."""
+    from cv2 import imread, imwrite
+
+    for file in (own_drive / "images").rglob("*.jpg"):
+        pixels = imread(str(file))
+        pixels[:] = 90
+        assert imwrite(str(file), pixels)
+    outcome = attempt(own_drive, scratch, settings)
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable, outcome.stage) == ("no-features", False, "features")
+
+
+def test_preflight_of_a_sound_drive(small_drive: Path, scratch: Path, settings: Settings) -> None:
+    outcome = attempt(small_drive, scratch, settings, work=Work.PREFLIGHT)
+    assert isinstance(outcome, Succeeded)
+    assert outcome.report["sound"] is True
+    assert all(finding["severity"] == "warning" for finding in outcome.report["findings"])
+
+
+def test_preflight_finds_a_damaged_image(own_drive: Path, scratch: Path, settings: Settings) -> None:
+    file = sorted((own_drive / "images").rglob("*.jpg"))[0]
+    file.write_bytes(b"")
+    outcome = attempt(own_drive, scratch, settings, work=Work.PREFLIGHT)
+    assert isinstance(outcome, Succeeded)
+    assert outcome.report["sound"] is False
+    assert [finding["code"] for finding in outcome.report["findings"]] == ["empty-file"]
+
+
+def test_preflight_finds_an_inverted_calibration(own_drive: Path, scratch: Path, settings: Settings) -> None:
+    """Of a stereo pair in axes where its inverse stands upright too: only the images tell."""
+    path = own_drive / "drive.json"
+    document = json.loads(path.read_text(encoding="utf-8"))
+    rdf_from_flu = se3.inverse(flu_from_body(BodyAxes.RDF))
+    document["rig"]["body_axes"] = "rdf"
+    for camera in document["rig"]["cameras"]:
+        rdf_from_cam = rdf_from_flu @ matrix_from_pose(Pose(**camera["rig_from_cam"]))
+        camera["rig_from_cam"] = pose_from_matrix(se3.inverse(rdf_from_cam)).model_dump()
+    path.write_text(json.dumps(document), encoding="utf-8")
+    assert check_manifest(parse_manifest(path.read_bytes()), use_gnss=False) == []
+    outcome = attempt(own_drive, scratch, settings, work=Work.PREFLIGHT, use_gnss=False)
+    assert isinstance(outcome, Succeeded)
+    assert outcome.report["sound"] is False
+    assert [finding["code"] for finding in outcome.report["findings"]] == ["calibration-inverted"]
+
+
+def test_killed_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
+    outcome = attempt(small_drive, scratch, settings, signal_once_it_works(signal.SIGKILL))
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable) == ("out-of-memory", True)
+    assert outcome.stage in STAGES
+    assert repr(outcome.stage) in outcome.what
+    assert "memory ran out" in outcome.what
+
+
+def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
+    outcome = attempt(small_drive, scratch, settings, signal_once_it_works(signal.SIGABRT))
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable) == ("engine-abort", True)
+    assert "SIGABRT" in outcome.what
+    assert "Fatal Python error: Aborted" in outcome.log_tail  # faulthandler says where it was
+
+
+def test_cancel(small_drive: Path, scratch: Path, settings: Settings) -> None:
+    """By the token alone: signals would come after 20 s."""
+
+    def tick(progress: Progress) -> Verdict:
+        return Verdict.CANCEL if progress.stage else Verdict.GO_ON
+
+    outcome = attempt(small_drive, scratch, settings, tick)
+    assert isinstance(outcome, Cancelled)
+    assert outcome.stage in STAGES
+    scene = AttemptFolder(scratch).out
+    assert not scene.exists() or {path.name for path in scene.iterdir()} <= {".stages"}
+    assert leftovers(scratch) == []
+    assert '"cancelled"' in AttemptFolder(scratch).result.read_text(encoding="utf-8")
+
+
+def test_timeout(small_drive: Path, scratch: Path, tmp_path: Path) -> None:
+    outcome = attempt(small_drive, scratch, settings_with(tmp_path, job_timeout_seconds=0.5))
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable) == ("timeout", False)
+    assert "0.5 s" in outcome.what
+
+
+def test_full_disk(small_drive: Path, scratch: Path, settings: Settings) -> None:
+    """Writing into the scene's folder fails, as the engine says; later it may not."""
+    AttemptFolder(scratch).out.write_text("a file where the folder belongs", encoding="utf-8")
+    outcome = attempt(small_drive, scratch, settings)
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable, outcome.stage) == ("storage", True, "features")
+    assert str(scratch) not in outcome.what

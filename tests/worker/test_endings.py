@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import dataclasses
+import signal
+from pathlib import Path
+
+import pytest
+
+from mrasfm_engine.errors import InputError
+from tests.worker.conftest import settings_with
+from worker.child_output import TAIL_BYTES, ChildOutput
+from worker.engine_settings import engine_config
+from worker.escalation import SHUT_DOWN_GRACE_S, Escalation, StopReason
+from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
+from worker.oom import oom_kills
+from worker.outcomes import Abandoned, Cancelled, Ending, Failed, Succeeded, outcome_of
+
+GOOD = ChildResult(report={"sound": True})
+
+
+def ending(**fields: object) -> Ending:
+    plain = Ending(
+        returncode=0,
+        stopped_for=None,
+        result=None,
+        stage="mapping",
+        log_tail="the end\n",
+        oom_kills=0,
+        out=Path("scene"),
+        timeout_s=60.0,
+    )
+    return dataclasses.replace(plain, **fields)  # type: ignore[arg-type]
+
+
+def failed(**fields: object) -> Failed:
+    outcome = outcome_of(ending(**fields))
+    assert isinstance(outcome, Failed)
+    assert outcome.log_tail == "the end\n"
+    return outcome
+
+
+def error(kind: ErrorKind) -> ChildResult:
+    return ChildResult(error=ChildError(kind=kind, code="some-code", what="it is bad", remedy="Make it good."))
+
+
+def test_result_decides_however_the_child_ended() -> None:
+    """A crash while native libraries are unloaded spoils nothing."""
+    for code in (0, -signal.SIGSEGV):
+        assert outcome_of(ending(result=GOOD, returncode=code)) == Succeeded(report={"sound": True}, out=Path("scene"))
+
+
+def test_cancelled_even_where_it_was_done_already() -> None:
+    outcome = outcome_of(ending(result=GOOD, stopped_for=StopReason.CANCEL))
+    assert isinstance(outcome, Cancelled)
+    assert "'mapping'" in outcome.what
+
+
+def test_late_result_is_better_than_a_timeout() -> None:
+    assert isinstance(outcome_of(ending(result=GOOD, stopped_for=StopReason.TIMEOUT)), Succeeded)
+    late = failed(result=error(ErrorKind.CANCELLED), stopped_for=StopReason.TIMEOUT)
+    assert (late.code, late.retryable) == ("timeout", False)
+    assert "60 s" in late.what
+
+
+@pytest.mark.parametrize("reason", [StopReason.SHUT_DOWN, StopReason.FENCED, StopReason.ORPHANED])
+def test_abandoned_whatever_it_left(reason: StopReason) -> None:
+    assert outcome_of(ending(result=GOOD, stopped_for=reason)) == Abandoned(reason=reason)
+
+
+@pytest.mark.parametrize(
+    ("kind", "retryable"),
+    [
+        (ErrorKind.INPUT, False),
+        (ErrorKind.RECONSTRUCTION, False),
+        (ErrorKind.STORAGE, True),
+        (ErrorKind.OTHER, True),
+    ],
+)
+def test_errors_of_the_engine_keep_their_words(kind: ErrorKind, retryable: bool) -> None:
+    outcome = failed(result=error(kind))
+    assert (outcome.code, outcome.what, outcome.remedy) == ("some-code", "it is bad", "Make it good.")
+    assert (outcome.retryable, outcome.stage) == (retryable, "mapping")
+
+
+def test_kernel_that_says_so_makes_it_certain() -> None:
+    assert failed(returncode=-signal.SIGKILL, oom_kills=1).what == "memory ran out in stage 'mapping'"
+    for unknown in (0, None):
+        assert "was killed in stage 'mapping', most often" in failed(returncode=-signal.SIGKILL, oom_kills=unknown).what
+
+
+def test_real_time_signal_has_no_name() -> None:
+    assert "with signal 47" in failed(returncode=-47).what
+
+
+def test_escalation_takes_its_steps_in_time(tmp_path: Path) -> None:
+    sent: list[signal.Signals] = []
+    escalation = Escalation(
+        sent.append, tmp_path / "cancel", settings_with(tmp_path, terminate_after_seconds=10, kill_after_seconds=30)
+    )
+    escalation.advance(5.0)
+    assert not (tmp_path / "cancel").exists()
+    escalation.stop(StopReason.CANCEL, 100.0)
+    escalation.advance(100.0)
+    assert (tmp_path / "cancel").exists()
+    escalation.stop(StopReason.CANCEL, 105.0)  # asked again at every tick: the clock runs on
+    escalation.stop(StopReason.TIMEOUT, 105.0)
+    assert escalation.reason is StopReason.CANCEL
+    escalation.advance(109.9)
+    assert sent == []
+    escalation.advance(110.0)
+    assert sent == [signal.SIGTERM]
+    escalation.advance(129.9)
+    escalation.advance(130.0)
+    escalation.advance(200.0)
+    assert sent == [signal.SIGTERM, signal.SIGKILL]
+
+
+def test_stronger_reasons_take_over(tmp_path: Path) -> None:
+    sent: list[signal.Signals] = []
+    escalation = Escalation(sent.append, tmp_path / "cancel", settings_with(tmp_path))
+    escalation.stop(StopReason.TIMEOUT, 100.0)
+    escalation.stop(StopReason.SHUT_DOWN, 101.0)
+    escalation.advance(101.0 + SHUT_DOWN_GRACE_S - 0.1)
+    assert sent == []
+    escalation.stop(StopReason.FENCED, 102.0)
+    escalation.stop(StopReason.SHUT_DOWN, 102.0)
+    escalation.advance(102.0)
+    assert (escalation.reason, sent) == (StopReason.FENCED, [signal.SIGKILL])
+
+
+def test_escalation_on_a_full_disk_goes_on_to_signals(tmp_path: Path) -> None:
+    sent: list[signal.Signals] = []
+    escalation = Escalation(sent.append, tmp_path / "no-folder" / "cancel", settings_with(tmp_path))
+    escalation.stop(StopReason.CANCEL, 0.0)
+    escalation.advance(25.0)
+    assert sent == [signal.SIGTERM]
+
+
+def test_output_is_decoded_leniently(tmp_path: Path) -> None:
+    output = ChildOutput(tmp_path / "child.log")
+    output.add(b"one\xff\r\ntw\0o \x1b[31mred\n\xe2\x82")
+    assert output.tail() == "one\ntwo [31mred\n"
+    output.add(b"\xac\n")
+    assert output.tail() == "one\ntwo [31mred\n€\n"
+
+
+def test_one_endless_line_has_a_tail(tmp_path: Path) -> None:
+    output = ChildOutput(tmp_path / "no-folder" / "child.log")  # nor does a file that cannot be written hurt
+    output.add(b"x" * 100_000)
+    assert output.tail() == "x" * TAIL_BYTES
+
+
+def test_oom_counts_of_both_control_group_versions(tmp_path: Path) -> None:
+    groups, mounts = tmp_path / "cgroup", tmp_path / "mounts"
+    groups.write_text("9:name=systemd:/\n4:memory,hugetlb:/jobs/one\n0::/\n", encoding="utf-8")
+    assert oom_kills(groups=groups, mounts=mounts) is None
+    (mounts / "memory/jobs/one").mkdir(parents=True)
+    (mounts / "memory/jobs/one/memory.oom_control").write_text(
+        "oom_kill_disable 0\nunder_oom 0\noom_kill 3\n", encoding="utf-8"
+    )
+    assert oom_kills(groups=groups, mounts=mounts) == 3
+    # In a container: one hierarchy, and the path is the host's.
+    groups.write_text("0::/docker/abc\n", encoding="utf-8")
+    (mounts / "memory.events").write_text("low 0\noom 7\noom_kill 5\noom_group_kill 0\n", encoding="utf-8")
+    assert oom_kills(groups=groups, mounts=mounts) == 5
+    assert oom_kills(groups=tmp_path / "nothing", mounts=mounts) is None
+
+
+def test_messages_come_back_as_they_were(tmp_path: Path) -> None:
+    request = ChildRequest(
+        work=Work.PREFLIGHT,
+        drive=tmp_path / "drive",
+        out=tmp_path / "scene",
+        settings={"use_gnss": False, "seed": None},
+        threads=2,
+        cancel_file=tmp_path / "cancel",
+        result_file=tmp_path / "result.json",
+        progress_fd=5,
+        parent_pid=77,
+    )
+    request.write(tmp_path / "request.json")
+    assert ChildRequest.read(tmp_path / "request.json") == request
+    assert ChildResult.read(tmp_path / "result.json") is None
+    for result in (GOOD, error(ErrorKind.INPUT)):
+        result.write(tmp_path / "result.json")
+        assert ChildResult.read(tmp_path / "result.json") == result
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["request.json", "result.json"]
+
+
+@pytest.mark.parametrize("settings", [{"max_keypoints": 0}, {"seed": -1}, {"seed": "x"}, {"threads": 4}])
+def test_settings_out_of_range(settings: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=next(iter(settings))) as caught:
+        engine_config(settings, threads=1)
+    assert caught.value.code == "bad-settings"

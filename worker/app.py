@@ -1,0 +1,84 @@
+"""The Celery application of the workers."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import mmap
+import os
+import signal
+import sys
+from typing import Any
+
+from celery import Celery, signals
+
+from service.logs import configure
+from service.persistence.wakeups import TASK, celery_options
+from service.settings import Settings
+from worker.execution import Runner
+from worker.lease import RenewLeases, ReportPresence
+
+_PR_SET_PDEATHSIG = 1
+
+
+class ShutdownFlag:
+    """One byte that a worker's main process shares with its pool processes.
+
+    Memory without a lock: an event with one would hang the main process for ever if a pool process were killed while
+    it held the lock.
+    """
+
+    def __init__(self) -> None:
+        self._byte = mmap.mmap(-1, 1)
+
+    def set(self) -> None:
+        """The worker was told to stop."""
+        self._byte[0] = 1
+
+    def is_set(self) -> bool:
+        """Whether the worker was told to stop."""
+        return self._byte[0] == 1
+
+
+def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
+    """The application that `mrasfm worker` runs; its pool processes are forked from it."""
+    app = Celery("mrasfm", set_as_current=False)
+    app.conf.update(celery_options(settings))
+    app.conf.update(worker_hijack_root_logger=False, worker_redirect_stdouts=False, worker_send_task_events=False)
+    app.mrasfm_settings = settings  # type: ignore[attr-defined]
+    app.steps["consumer"].add(RenewLeases)
+    app.steps["consumer"].add(ReportPresence)
+    flag = ShutdownFlag()
+    main_pid = os.getpid()
+    runner: Runner | None = None
+
+    @signals.setup_logging.connect(weak=False)
+    def _log(**_: Any) -> None:
+        configure(log_level)
+        logging.getLogger("celery.app.trace").setLevel("WARNING")
+
+    @signals.worker_shutting_down.connect(weak=False)
+    def _stop(**_: Any) -> None:
+        flag.set()
+
+    @signals.worker_process_init.connect(weak=False)
+    def _begin(**_: Any) -> None:
+        nonlocal runner
+        _die_with(main_pid)
+        runner = Runner(settings, shutting_down=flag.is_set)
+        runner.sweep_scratch()
+
+    @app.task(name=TASK)
+    def run_job(job_id: str) -> None:
+        assert runner is not None, "pool processes are initialised before they get work"
+        runner.run(job_id)
+
+    return app
+
+
+def _die_with(main_pid: int) -> None:
+    """End this pool process with the worker's main process, however that ends; its stage ends with it."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != main_pid:  # it ended before the kernel knew
+        os._exit(1)

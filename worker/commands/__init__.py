@@ -1,0 +1,1 @@
+"""Subcommands of `mrasfm` that the workers add."""

@@ -1,0 +1,34 @@
+"""`mrasfm reconciler`: keeps the system of record, the broker and the workers in step."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+
+from service.settings import Settings
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "reconciler",
+        help="run the service's reconciler",
+        description="Wakes workers up for jobs whose message was lost, frees jobs of workers that died, deletes what "
+        "has passed its retention date. Settings: environment MRASFM_*.",
+    )
+    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reconcile until told to stop."""
+    from service.logs import configure
+    from worker.reconciler import Reconciler
+
+    configure(arguments.log_level)
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    Reconciler(Settings()).run(ended)
+    return 0

@@ -1,0 +1,54 @@
+"""`mrasfm worker`: takes jobs and runs them."""
+
+from __future__ import annotations
+
+import argparse
+
+from service.settings import Settings
+
+QUEUES = ("checks", "reconstructions")
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "worker", help="run a worker of the service", description="Settings: environment MRASFM_*."
+    )
+    parser.add_argument(
+        "--queues", default=",".join(QUEUES), help="checks (of drives), reconstructions, or both (default)"
+    )
+    parser.add_argument("--concurrency", type=int, default=1, help="jobs at one time (default 1)")
+    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Work until told to stop; a job under way is given back, and another worker goes on with it."""
+    import os
+    import socket
+    import sys
+
+    from worker.app import make_app
+
+    wanted = arguments.queues.split(",")
+    unknown = sorted(set(wanted) - set(QUEUES))
+    settings = Settings()
+    if unknown or not 1 <= arguments.concurrency <= 1024 or settings.redis_url is None:
+        what = "MRASFM_REDIS_URL is not set" if settings.redis_url is None else "--concurrency must be 1 to 1024"
+        what = f"--queues: there is no queue {unknown[0]!r}, only {' and '.join(QUEUES)}" if unknown else what
+        print(f"mrasfm: error: {what}", file=sys.stderr)
+        return 2
+    app = make_app(settings, log_level=arguments.log_level)
+    worker = app.Worker(
+        hostname=f"{wanted[0] if len(wanted) == 1 else 'all'}.{os.getpid()}@{socket.gethostname()}",
+        queues=wanted,
+        concurrency=arguments.concurrency,
+        pool="prefork",
+        loglevel=arguments.log_level.upper(),
+        without_gossip=True,
+        without_mingle=True,
+        without_heartbeat=True,
+        quiet=True,
+    )
+    worker.start()
+    return int(worker.exitcode or 0)

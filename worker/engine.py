@@ -1,0 +1,112 @@
+"""Calls the engine, in a child process, and puts how that ended into a result."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mrasfm_engine import stages
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
+from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.io.findings import as_json, error
+from mrasfm_engine.io.preflight import UnsoundDriveError, check_drive, is_sound
+from mrasfm_engine.pipeline import reconstruct
+from worker.engine_settings import engine_config
+from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
+from worker.progress_pipe import ProgressWriter
+
+CANCEL_INTERVAL_S = 0.2
+
+_KINDS = (
+    (InputError, ErrorKind.INPUT),
+    (ReconstructionError, ErrorKind.RECONSTRUCTION),
+    (StorageError, ErrorKind.STORAGE),
+    (CancelledError, ErrorKind.CANCELLED),
+)
+
+
+def work(request: ChildRequest) -> ChildResult:
+    """Do what is asked. The engine's own errors are results; anything else is raised."""
+    progress = ProgressWriter(request.progress_fd)
+    cancelled = CancelFile(request.cancel_file)
+    try:
+        config = engine_config(request.settings, threads=request.threads)
+        do = _reconstruct if request.work is Work.RECONSTRUCTION else _preflight
+        return ChildResult(report=do(request, config, progress, cancelled))
+    except MrasfmError as problem:
+        return ChildResult(error=_described(problem, request))
+
+
+class CancelFile:
+    """Whether somebody has put the file there that asks to stop; once so, always so.
+
+    The engine asks thousands of times a second, the disk is asked a few times.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._found = False
+        self._look_at_s = 0.0
+
+    def __call__(self) -> bool:
+        """Whether to stop."""
+        now_s = time.monotonic()
+        if not self._found and now_s >= self._look_at_s:
+            self._look_at_s = now_s + CANCEL_INTERVAL_S
+            self._found = self._path.exists()
+        return self._found
+
+
+def _reconstruct(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    def report(stage: str, done: int, total: int) -> None:
+        progress(stage, done, total)
+        if stage == "refinement" and done == total:
+            progress("export", 0, 1)
+
+    reconstruct(request.drive, request.out, config, progress=report, cancel=cancelled)
+    progress("export", 1, 1)
+    # What was written, and not what was returned: the file has been through the writer's conversions.
+    written: dict[str, Any] = json.loads((request.out / "report.json").read_text(encoding="utf-8"))
+    return written
+
+
+def _preflight(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    """The findings of a reconstruction's first seconds: manifest, files, and whether the calibration is inverted."""
+    run = stages.Run(read_drive(request.drive), config, stages.store_of(request.out), progress, cancelled)
+    findings = check_drive(run.drive, use_gnss=config.use_gnss, progress=run.step("preflight"))
+    if is_sound(findings):
+        progress("calibration", 0, 1)
+        try:
+            stages.probe(run)
+        except InputError as problem:
+            findings.insert(0, error(problem.code, _without_paths(problem.what, request), problem.remedy))
+        progress("calibration", 1, 1)
+    if cancelled():
+        raise CancelledError
+    return {"findings": [as_json(finding) for finding in findings], "sound": is_sound(findings)}
+
+
+def _described(problem: MrasfmError, request: ChildRequest) -> ChildError:
+    findings = problem.findings if isinstance(problem, UnsoundDriveError) else ()
+    return ChildError(
+        kind=next((kind for of, kind in _KINDS if isinstance(problem, of)), ErrorKind.OTHER),
+        code=problem.code,
+        what=_without_paths(problem.what, request),
+        remedy=problem.remedy,
+        findings=[as_json(finding) for finding in findings],
+    )
+
+
+def _without_paths(what: str, request: ChildRequest) -> str:
+    """Files by their names in the drive or scene: where these lie on this machine is of no interest to who asked."""
+    for folder in (request.drive, request.drive.resolve(), request.out, request.out.resolve()):
+        what = what.replace(f"{folder}/", "")
+    return what

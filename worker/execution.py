@@ -1,0 +1,302 @@
+"""What a worker does with a message: claim the job, run its attempt, and record what came of it."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from obstore.exceptions import BaseError as StoreError
+
+from schemas.api.jobs import JobKind
+from schemas.api.problems import PROBLEM_TYPE, Problem
+from schemas.api.scenes import SceneSummary
+from service.logs import log_fields
+from service.persistence import jobs, scenes
+from service.persistence.artifacts import ArtifactStore
+from service.persistence.database import Database
+from service.persistence.drive_files import DriveGoneError, materialise
+from service.persistence.storing import StoredFile, file_sha256, store_file
+from service.persistence.tables import now_us
+from service.settings import Settings
+from worker.checkpoints import CheckpointKeeper
+from worker.escalation import StopReason
+from worker.heart import Heart
+from worker.messages import Work
+from worker.outcomes import Abandoned, Cancelled, Failed, Outcome, Succeeded
+from worker.progress import Progress, ProgressMeter
+from worker.scratch import attempt_folder, sweep
+from worker.stages import Attempt, AttemptFolder, Verdict, run_attempt
+
+log = logging.getLogger("mrasfm.worker")
+
+_WORK = {JobKind.PREFLIGHT: Work.PREFLIGHT, JobKind.RECONSTRUCTION: Work.RECONSTRUCTION}
+_TITLES = {
+    "out-of-memory": "Memory ran out",
+    "engine-abort": "The engine ended unexpectedly",
+    "timeout": "The attempt took too long",
+    "storage": "The worker's files or the artifact store failed",
+    "worker-error": "The worker failed",
+}
+
+Counting = Callable[[int, int], None]  # done, total
+
+
+class _StoppedError(Exception):
+    """One of the worker's own stages was stopped."""
+
+    def __init__(self, verdict: Verdict) -> None:
+        super().__init__(verdict)
+        self.verdict = verdict
+
+
+class Runner:
+    """Executes jobs, one at a time, in this process.
+
+    Parameters
+    ----------
+    shutting_down
+        Asked several times a second: whether the worker was told to stop.
+    """
+
+    def __init__(self, settings: Settings, *, shutting_down: Callable[[], bool] = lambda: False) -> None:
+        self._settings = settings
+        self._shutting_down = shutting_down
+        self._database = Database.of(settings)
+        self._artifacts = ArtifactStore(settings)
+        self._owner = f"{socket.gethostname()}:{os.getpid()}"
+
+    def run(self, job_id: str) -> None:
+        """Do a job that waits; nothing where there is nothing to do any more."""
+        if self._shutting_down():
+            return
+        with self._database.write() as session:
+            held = jobs.claim(session, job_id, owner=self._owner, lease_us=int(self._settings.lease_seconds * 1e6))
+        if held is None:
+            log.info("nothing to do", extra={"fields": {"job_id": job_id}})
+            return
+        with log_fields(job_id=job_id, attempt=held.attempt, fence=held.fence):
+            log.info("begins", extra={"fields": {"kind": held.kind}})
+            try:
+                self._run_held(held)
+            except jobs.FencedError:
+                log.warning("the job is not ours any more; nothing was published")
+
+    def _run_held(self, held: jobs.Claim) -> None:
+        meter = ProgressMeter(_WORK[held.kind], started_s=time.monotonic())
+        try:
+            with (
+                attempt_folder(self._settings.scratch_dir, f"{held.job_id}.{held.fence}") as folder,
+                Heart(self._database, held, self._settings) as heart,
+            ):
+                self._do(held, AttemptFolder(folder), heart, meter)
+        except jobs.FencedError:
+            raise
+        except (OSError, StoreError) as error:
+            log.exception("the attempt failed on this machine")
+            self._fail(held, _of_machine(error, meter.stage))
+        except Exception:
+            log.exception("the attempt failed on this machine")
+            self._fail(held, _of_worker(meter.stage))
+        except SystemExit:
+            # This process was told to end and not, or not only, the main one: by a cold shutdown, or by who signals
+            # all of a service's processes at once.
+            self._release(held)
+            raise
+
+    def _do(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> None:
+        publishing = self._counting(heart, meter, "publish")
+        try:
+            outcome = self._attempt(held, folder, heart, meter)
+            self._record(held, outcome, publishing)
+        except _StoppedError as stopped:
+            self._record(held, _of_verdict(stopped.verdict, meter.stage), publishing)
+
+    def _attempt(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> Outcome:
+        drive = folder.root / "drive"
+        try:
+            materialise(self._database, self._artifacts, held.drive_id, drive, progress=self._counting(heart, meter, "fetch"))
+        except DriveGoneError:
+            return Failed(
+                code="drive-deleted",
+                what=f"drive {held.drive_id} was deleted",
+                remedy="Upload it again.",
+                retryable=False,
+                stage="fetch",
+            )
+        keeper = CheckpointKeeper(
+            self._database,
+            self._artifacts,
+            held,
+            folder=folder.finished_stages,
+            spare=folder.root / "checkpoints",
+        )
+        if held.kind is JobKind.RECONSTRUCTION:
+            keeper.restore()
+        with keeper:
+            return run_attempt(
+                Attempt(work=_WORK[held.kind], drive=drive, settings=held.settings),
+                scratch=folder.root,
+                tick=lambda progress: self._tick(heart, progress),
+                meter=meter,
+                settings=self._settings,
+            )
+
+    def _counting(self, heart: Heart, meter: ProgressMeter, stage: str) -> Counting:
+        """A callback for one of the worker's own stages, which stops where a child would be stopped."""
+
+        def count(done: int, total: int) -> None:
+            meter.update(stage, done, total)
+            verdict = self._tick(heart, meter.at(time.monotonic()))
+            if verdict is not Verdict.GO_ON:
+                raise _StoppedError(verdict)
+
+        return count
+
+    def _tick(self, heart: Heart, progress: Progress) -> Verdict:
+        verdict = heart.tell(progress)
+        return Verdict.SHUT_DOWN if verdict is Verdict.GO_ON and self._shutting_down() else verdict
+
+    def _record(self, held: jobs.Claim, outcome: Outcome, progress: Counting) -> None:
+        match outcome:
+            case Succeeded() if held.kind is JobKind.PREFLIGHT:
+                with self._database.write() as session:
+                    jobs.record_findings(session, held, outcome.report["findings"], sound=outcome.report["sound"])
+                log.info("checked", extra={"fields": {"sound": outcome.report["sound"]}})
+            case Succeeded():
+                self._publish(held, outcome, progress)
+            case Failed():
+                self._fail(held, outcome)
+            case Cancelled():
+                with self._database.write() as session:
+                    jobs.cancelled(session, held)
+                log.info("cancelled")
+            case Abandoned(reason=StopReason.SHUT_DOWN):
+                self._release(held)
+            case Abandoned():
+                raise jobs.FencedError
+
+    def _release(self, held: jobs.Claim) -> None:
+        with self._database.write() as session:
+            jobs.release(session, held)
+        log.info("released: this worker stops")
+
+    def _fail(self, held: jobs.Claim, failed: Failed) -> None:
+        problem = Problem(
+            type=PROBLEM_TYPE + failed.code,
+            title=_TITLES.get(failed.code, "The drive could not be reconstructed"),
+            detail=failed.what,
+            remedy=failed.remedy,
+            findings=[dict(finding) for finding in failed.findings],
+            log_tail=failed.log_tail or None,
+            stage=failed.stage or None,
+            retryable=failed.retryable,
+            job_id=held.job_id,
+        )
+        with self._database.write() as session:
+            state = jobs.fail(
+                session,
+                held,
+                problem,
+                max_attempts=self._settings.max_attempts,
+                retry_delay_us=int(self._settings.retry_delay_seconds * 1e6),
+            )
+        log.error("the attempt failed", extra={"fields": {"code": failed.code, "what": failed.what, "job": state}})
+
+    def _publish(self, held: jobs.Claim, done: Succeeded, progress: Counting) -> None:
+        found = sorted(_artifacts(done.out).items())
+        files = {}
+        for i, (name, path) in enumerate(found):
+            files[name] = self._store(held, path)
+            progress(i + 1, len(found))
+        kept_days = self._settings.scene_retention_days
+        expires_us = None if kept_days is None else now_us() + int(kept_days * 86400e6)
+        with self._database.write() as session:
+            scene_id = scenes.publish(session, held, files=files, summary=_summary(done.report), expires_us=expires_us)
+        log.info("published", extra={"fields": {"scene_id": scene_id}})
+
+    def _store(self, held: jobs.Claim, path: Path) -> StoredFile:
+        return store_file(
+            self._database,
+            self._artifacts,
+            project_id=held.project_id,
+            path=path,
+            sha256=file_sha256(path),
+            size_bytes=path.stat().st_size,
+        )
+
+    def sweep_scratch(self) -> None:
+        """Remove what killed processes of this machine left behind, and end the leases of their jobs at once."""
+        sweep(self._settings.scratch_dir, self._disown)
+
+    def _disown(self, attempt: str) -> None:
+        job_id, _, fence = attempt.rpartition(".")
+        if not fence.isdecimal():
+            return
+        with self._database.write() as session:
+            was_running = jobs.end_lease(session, job_id, int(fence))
+        if was_running:
+            log.warning("its process has died", extra={"fields": {"job_id": job_id, "fence": int(fence)}})
+
+
+def _artifacts(out: Path) -> dict[str, Path]:
+    """Files of a scene by the names they are served under; what begins with a dot is the engine's own."""
+    found = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
+    return {name.as_posix(): path for name, path in found.items() if not any(p.startswith(".") for p in name.parts)}
+
+
+def _summary(report: dict[str, Any]) -> SceneSummary:
+    summary = report["summary"]
+    return SceneSummary(
+        registered_units=summary["registered_units"],
+        units=summary["total_units"],
+        registered_images=summary["registered_images"],
+        images=summary["total_images"],
+        points=summary["points"],
+        georeferenced=summary["georeferenced"],
+        warnings=len(report["findings"]),
+        engine_version=report["engine_version"],
+    )
+
+
+def _of_verdict(verdict: Verdict, stage: str) -> Outcome:
+    match verdict:
+        case Verdict.CANCEL:
+            return Cancelled(
+                what=f"the job was cancelled in stage {stage!r}",
+                remedy="Retry the job to go on: finished stages are reused.",
+                stage=stage,
+            )
+        case Verdict.SHUT_DOWN:
+            return Abandoned(reason=StopReason.SHUT_DOWN)
+    return Abandoned(reason=StopReason.FENCED)
+
+
+def _of_machine(error: Exception, stage: str) -> Failed:
+    """Without paths and addresses, which are the operator's and stand in the log."""
+    remedy = "Retry the job later; if it fails again, the operator finds the reason in the worker's log."
+    if isinstance(error, FileNotFoundError):
+        what = "a file that belongs to the drive or the attempt is missing"
+    elif not isinstance(error, OSError):
+        what = "the artifact store did not answer as it should"
+    elif error.errno in (errno.ENOSPC, errno.EDQUOT):
+        what = "the worker's disk is full"
+        remedy = "The operator has to free space in the worker's data folder; then retry the job."
+    else:
+        what = f"the worker could not work on its files: {error.strerror or type(error).__name__}"
+    return Failed(code="storage", what=what, remedy=remedy, retryable=True, stage=stage)
+
+
+def _of_worker(stage: str) -> Failed:
+    return Failed(
+        code="worker-error",
+        what="the worker failed outside of the engine",
+        remedy="Retry the job; if it fails again, report it with the worker's log.",
+        retryable=True,
+        stage=stage,
+    )

@@ -1,0 +1,89 @@
+"""Keeps messages of long jobs from being delivered a second time while their worker lives.
+
+Redis has no acknowledgements of its own. Kombu keeps what was delivered in the hash `unacked`, with the time of
+delivery in the sorted set `unacked_index`, and any worker puts back what is older than the visibility timeout. Without
+renewal a job that is longer than the timeout would be started again and again; with a timeout as long as the longest
+job a killed worker's message would come back as late. So the timeout is short, and the main process renews it.
+
+The fields of kombu that are used here are private: its version is pinned and a test holds the behaviour.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any
+
+from celery import bootsteps
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.persistence import workers
+from service.persistence.database import Database
+from service.settings import Settings
+
+log = logging.getLogger("mrasfm.worker")
+
+_PATIENCE_S = 2.0  # the main process must not wait long for the database: it renews leases
+
+
+class RenewLeases(bootsteps.StartStopStep):
+    """Renews the delivery time of every message that this worker holds."""
+
+    requires = ("celery.worker.consumer.tasks:Tasks",)
+    _timer: Any = None
+
+    def start(self, consumer: Any) -> None:
+        """With every connection to the broker."""
+        every_s = consumer.app.mrasfm_settings.visibility_renew_seconds
+        self._timer = consumer.timer.call_repeatedly(every_s, self._renew, (consumer,))
+
+    def stop(self, consumer: Any) -> None:
+        """When the connection is lost or the worker stops."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    @staticmethod
+    def _renew(consumer: Any) -> None:
+        channel = consumer.task_consumer.channel
+        tags = list(channel.qos._delivered)
+        if not tags:
+            return
+        with channel.conn_or_acquire() as client:
+            client.zadd(channel.unacked_index_key, dict.fromkeys(tags, time.time()), xx=True)
+
+
+class ReportPresence(bootsteps.StartStopStep):
+    """Tells the system of record that this worker is there."""
+
+    requires = ("celery.worker.consumer.tasks:Tasks",)
+    _timer: Any = None
+
+    def start(self, consumer: Any) -> None:
+        """With every connection to the broker."""
+        settings: Settings = consumer.app.mrasfm_settings
+        self._report(consumer)
+        self._timer = consumer.timer.call_repeatedly(settings.visibility_renew_seconds, self._report, (consumer,))
+
+    def stop(self, consumer: Any) -> None:
+        """When the connection is lost or the worker stops."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    @staticmethod
+    def _report(consumer: Any) -> None:
+        # Opened for each report: pool processes are forked from this one and must not share a connection with it.
+        database = Database(consumer.app.mrasfm_settings.resolved_database_url, patience_s=_PATIENCE_S)
+        try:
+            with database.write() as session:
+                workers.report(
+                    session,
+                    name=consumer.hostname,
+                    queues=sorted(consumer.app.amqp.queues.consume_from),
+                    concurrency=consumer.controller.concurrency,
+                )
+        except SQLAlchemyError:
+            log.warning("the database did not take this worker's report", exc_info=True)
+        finally:
+            database.close()

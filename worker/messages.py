@@ -1,0 +1,123 @@
+"""What a supervisor and its child process tell each other, as files in the attempt's folder.
+
+Only the standard library: the child reads its request before it loads anything else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+
+class Work(StrEnum):
+    """What a child is asked to do."""
+
+    RECONSTRUCTION = "reconstruction"
+    PREFLIGHT = "preflight"
+
+
+class ErrorKind(StrEnum):
+    """Which of the engine's errors ended the child's work."""
+
+    INPUT = "input"
+    RECONSTRUCTION = "reconstruction"
+    STORAGE = "storage"
+    CANCELLED = "cancelled"
+    OTHER = "other"  # a scene that contradicts itself, or does not read back as it was written
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChildRequest:
+    """What one child process does.
+
+    Attributes
+    ----------
+    drive
+        Folder with `drive.json`.
+    out
+        Folder of the scene; finished stages lie in its `.stages`.
+    settings
+        As in the API's `ReconstructionSettings`.
+    cancel_file
+        The child ends its work where this file exists.
+    result_file
+        Where the child writes its ChildResult.
+    progress_fd
+        Inherited descriptor of a pipe that takes lines of progress.
+    parent_pid
+        The supervisor: without it the child ends.
+    """
+
+    work: Work
+    drive: Path
+    out: Path
+    settings: dict[str, Any]
+    threads: int
+    cancel_file: Path
+    result_file: Path
+    progress_fd: int
+    parent_pid: int
+
+    def write(self, path: Path) -> None:
+        """Put the request where the child reads it."""
+        path.write_text(json.dumps(asdict(self), default=str), encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path) -> ChildRequest:
+        """The request in a file."""
+        values = json.loads(path.read_text(encoding="utf-8"))
+        values["work"] = Work(values["work"])
+        for name in ("drive", "out", "cancel_file", "result_file"):
+            values[name] = Path(values[name])
+        return cls(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChildError:
+    """An error of the engine, in its words.
+
+    Attributes
+    ----------
+    findings
+        All that the check of the drive found, where that is what refused it.
+    """
+
+    kind: ErrorKind
+    code: str
+    what: str
+    remedy: str
+    findings: list[dict[str, str]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChildResult:
+    """How a child's work ended: with a report, or with an error."""
+
+    report: dict[str, Any] | None = None
+    error: ChildError | None = None
+
+    def write(self, path: Path) -> None:
+        """Write the result whole or not at all: a result that is there is complete."""
+        partial = path.with_name(path.name + ".partial")
+        with partial.open("w", encoding="utf-8") as file:
+            json.dump(asdict(self), file, allow_nan=False)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+
+    @classmethod
+    def read(cls, path: Path) -> ChildResult | None:
+        """The result in a file; None where the child left none."""
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        error = values["error"]
+        return cls(
+            report=values["report"],
+            error=None if error is None else ChildError(**{**error, "kind": ErrorKind(error["kind"])}),
+        )
