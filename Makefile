@@ -37,9 +37,12 @@ check: setup ## lint, types, import contracts
 acceptance: setup ## every figure that the README claims, as a table (real drives needed; ACCEPTANCE="--only 1,2")
 	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)
 
-lock: setup ## renew requirements.lock from pyproject.toml (needs uv)
+lock: ## renew the locks from pyproject.toml: all, and what the container image needs (needs uv)
 	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet -o requirements.lock
+	uv pip compile pyproject.toml --extra build --constraints requirements.lock --universal --python-version 3.11 \
+	  --generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
+	  -o requirements-runtime.lock
 
 schema: setup ## export the JSON Schema of the drive manifest
 	$(BIN)/python -m schemas.export

@@ -1,0 +1,37 @@
+"""docker-compose.yml, as far as it can be checked without Docker."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from service.settings import Settings
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+COMPOSE = (REPOSITORY / "docker-compose.yml").read_text(encoding="utf-8")
+EXAMPLE = (REPOSITORY / ".env.example").read_text(encoding="utf-8")
+
+
+def test_every_setting_that_it_passes_exists() -> None:
+    passed = set(re.findall(r"^ +MRASFM_(\w+):", COMPOSE, re.MULTILINE))
+    assert passed >= {"DATABASE_URL", "REDIS_URL", "ARTIFACTS_URL"}
+    assert {name.lower() for name in passed} <= set(Settings.model_fields)
+
+
+def test_secrets_are_required_and_have_no_value_anywhere() -> None:
+    required = set(re.findall(r"\$\{(\w+):\?", COMPOSE))
+    assert required == {"POSTGRES_PASSWORD", "VALKEY_PASSWORD", "S3_ACCESS_KEY_ID", "S3_SECRET_ACCESS_KEY"}
+    assert set(re.findall(r"^(\w+)=$", EXAMPLE, re.MULTILINE)) == required
+    assert not re.findall(r"^\w+=.", EXAMPLE, re.MULTILINE)
+    assert not re.findall(rf"\$\{{(?:{'|'.join(required)})(?!:\?)", COMPOSE)
+
+
+def test_every_variable_of_the_example_is_used() -> None:
+    for name in re.findall(r"^#?([A-Z_0-9]+)=", EXAMPLE, re.MULTILINE):
+        assert f"${{{name}:" in COMPOSE, name
+
+
+def test_images_are_pinned_and_only_the_api_is_published_on_loopback() -> None:
+    for image in re.findall(r"image: (\S+)", COMPOSE):
+        assert re.search(r":(v?\d|\$\{MRASFM_VERSION)", image), image
+    assert re.findall(r"ports: (.*)", COMPOSE) == ['["${MRASFM_LISTEN:-127.0.0.1}:${MRASFM_PORT:-8000}:8000"]']

@@ -1,0 +1,96 @@
+"""What `mrasfm standalone` makes of its settings, and what it says where it cannot run."""
+
+from __future__ import annotations
+
+import argparse
+import socket
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from service import broker
+from service.commands import standalone as command
+from service.settings import Settings
+from service.standalone import child_specs
+
+
+def run(*arguments: str) -> int:
+    parser = argparse.ArgumentParser()
+    command.register(parser.add_subparsers())
+    parsed = parser.parse_args(["standalone", *arguments])
+    return int(parsed.run(parsed))
+
+
+def test_everything_starts_after_the_broker_and_no_command_line_has_its_password(tmp_path: Path) -> None:
+    embedded = broker.prepare(tmp_path / "broker")
+    specs = child_specs(Settings(data_dir=tmp_path), embedded, workers=1, log_level="info")
+    assert [spec.name for spec in specs] == ["broker", "api", "checker", "worker", "reconciler"]
+    assert all(list(spec.depends_on) == ["broker"] for spec in specs[1:])
+    assert all(spec.environment["MRASFM_REDIS_URL"] == embedded.url for spec in specs[1:])
+    password = (tmp_path / "broker" / "password").read_text(encoding="ascii")
+    assert password not in repr(specs)
+    assert not any(password in argument for spec in specs for argument in spec.argv)
+
+
+def test_with_a_broker_outside_none_is_started(tmp_path: Path) -> None:
+    specs = child_specs(Settings(data_dir=tmp_path), None, workers=1, log_level="info")
+    assert [spec.name for spec in specs] == ["api", "checker", "worker", "reconciler"]
+    assert not any(spec.depends_on or "MRASFM_REDIS_URL" in spec.environment for spec in specs)
+
+
+@pytest.mark.parametrize(("set_threads", "workers", "shared"), [(0, 1, False), (0, 2, True), (3, 2, False)])
+def test_several_workers_share_the_cores(tmp_path: Path, set_threads: int, workers: int, shared: bool) -> None:
+    settings = Settings(data_dir=tmp_path, engine_threads=set_threads)
+    *_, worker, _ = child_specs(settings, None, workers=workers, log_level="info")
+    assert ("MRASFM_ENGINE_THREADS" in worker.environment) == shared
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "named"),
+    [("MRASFM_PORT", "70000", "port is not valid"), ("MRASFM_LEASE_SECONDS", "soon", "MRASFM_LEASE_SECONDS")],
+)
+def test_a_wrong_setting_is_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    variable: str,
+    value: str,
+    named: str,
+) -> None:
+    monkeypatch.setenv(variable, value)
+    assert run("--data", str(tmp_path / "state")) == 2
+    assert named in capsys.readouterr().err
+    assert not (tmp_path / "state").exists()
+
+
+def test_a_database_that_is_away_is_named_without_its_password(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(socket.socket()) as nobody:  # bound but not listening: connections are refused
+        nobody.bind(("127.0.0.1", 0))
+        port = nobody.getsockname()[1]
+        monkeypatch.setenv("MRASFM_DATABASE_URL", f"postgresql+psycopg://mrasfm:topsecret@127.0.0.1:{port}/mrasfm")
+        assert run("--data", str(tmp_path), "--port", "0") == 2
+    said = capsys.readouterr().err
+    assert f"the database postgresql+psycopg://mrasfm:***@127.0.0.1:{port}/mrasfm cannot be used" in said
+    assert "Check MRASFM_DATABASE_URL" in said
+    assert "topsecret" not in said
+
+
+def test_a_file_in_the_data_folder_s_place_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "state").write_text("", encoding="ascii")
+    assert run("--data", str(tmp_path / "state")) == 2
+    assert f"the data folder {tmp_path / 'state'} cannot be used" in capsys.readouterr().err
+
+
+def test_an_address_of_another_machine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--data", str(tmp_path), "--host", "192.0.2.1", "--port", "0") == 2
+    assert "cannot listen on 192.0.2.1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("workers", ["0", "-1", "two"])
+def test_a_number_of_workers_is_a_number(workers: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("--workers", workers)
+    assert "not a whole number above 0" in capsys.readouterr().err
