@@ -18,12 +18,9 @@ setup: .venv/.done ## a virtual environment in .venv with the mrasfm command
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-demo: setup ## render a drive of six cameras, reconstruct it, say where the scene is and how good
+demo: setup ## render two drives of six cameras, send them through the service, compare the scenes with the truth
 	rm -rf demo
-	$(BIN)/mrasfm synth --cameras 6 --units 20 --seed 1 --out demo/drive
-	$(BIN)/mrasfm reconstruct demo/drive --out demo/scene
-	$(BIN)/mrasfm evaluate demo/scene --truth demo/drive/truth.tum
-	@echo "The scene is in demo/scene: points.ply for a viewer, model/ for COLMAP, report.json for the figures."
+	$(BIN)/mrasfm demo --out demo
 
 test: setup ## the fast suite and one real drive
 	$(BIN)/python -m pytest -m "not slow"

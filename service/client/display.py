@@ -12,6 +12,7 @@ from rich.progress import (
     BarColumn,
     DownloadColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TaskProgressColumn,
     TextColumn,
@@ -19,9 +20,19 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from service.client.follow import JobNews
+from service.client.follow import ENDED, JobNews
 
 _LINE_EVERY_S = 10.0
+_NAME = "{task.description:<9}"
+
+
+def _byte_columns() -> tuple[ProgressColumn, ...]:
+    return (TextColumn(_NAME), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+
+
+def _job_columns() -> tuple[ProgressColumn, ...]:
+    what = TextColumn("{task.fields[what]}")
+    return (TextColumn(_NAME), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), what)
 
 
 class Display:
@@ -57,43 +68,51 @@ class Display:
 class _Bars:
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._bytes = Progress(
-            TextColumn("{task.description:<9}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), console=console
-        )
-        columns = (TextColumn("{task.description:<9}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-        self._job = Progress(*columns, TextColumn("{task.fields[what]}"), console=console)
-        self._current: Progress | None = None
+        self._lock = threading.Lock()
+        self._bars: Progress | None = None
+        self._shows_job = False
         self._tasks: dict[str, TaskID] = {}
 
     def begin(self) -> None:
         """Nothing is shown before there is something."""
 
     def end(self) -> None:
-        self._show(None)
+        with self._lock:
+            self._end_bars()
 
     def say(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def bytes_done(self, stage: str, done_bytes: int, total_bytes: int) -> None:
-        self._show(self._bytes)
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bytes.add_task(stage, total=total_bytes)
-        self._bytes.update(self._tasks[stage], completed=done_bytes, total=total_bytes)
+        with self._lock:
+            bars = self._bars_for(job=False)
+            if stage not in self._tasks:
+                self._tasks[stage] = bars.add_task(stage, total=total_bytes)
+            bars.update(self._tasks[stage], completed=done_bytes, total=total_bytes)
+            if done_bytes >= total_bytes:
+                del self._tasks[stage]  # the next of this name is another's
 
     def job(self, news: JobNews) -> None:
-        self._show(self._job)
-        if "job" not in self._tasks:
-            self._tasks["job"] = self._job.add_task("job", total=100.0, what="")
-        self._job.update(self._tasks["job"], completed=news.percent, what=described(news))
+        with self._lock:
+            bars = self._bars_for(job=True)
+            if "job" not in self._tasks:
+                self._tasks["job"] = bars.add_task("job", total=100.0, what="")
+            bars.update(self._tasks["job"], completed=news.percent, what=described(news))
 
-    def _show(self, wanted: Progress | None) -> None:
-        if self._current is wanted:
-            return
-        if self._current is not None:
-            self._current.stop()
-        self._current = wanted
-        if wanted is not None:
-            wanted.start()
+    def _bars_for(self, *, job: bool) -> Progress:
+        """Bars of this kind: those that are shown, or new ones below."""
+        if self._bars is None or self._shows_job is not job:
+            self._end_bars()
+            self._bars = Progress(*(_job_columns() if job else _byte_columns()), console=self._console)
+            self._shows_job = job
+            self._bars.start()
+        return self._bars
+
+    def _end_bars(self) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+        self._bars = None
+        self._tasks.clear()
 
 
 class _Lines:
@@ -138,6 +157,8 @@ def described(news: JobNews) -> str:
     """
     if news.state == "QUEUED":
         return "QUEUED" if news.attempt == 0 else f"QUEUED again after attempt {news.attempt}"
+    if news.state in ENDED:
+        return news.state
     parts = [news.state, f"{news.percent:.1f} %"]
     if news.stage is not None:
         of = f" {news.done}/{news.total} {news.unit or ''}".rstrip() if news.total else ""

@@ -47,8 +47,9 @@ def follow(client: Client, job_id: str, *, tell: Tell = lambda news: None) -> Jo
     JobResource
         As it ended: `state` says how.
     """
-    job, etag, retry_after_s = client.poll_job(job_id, None)
-    assert job is not None  # nothing can be unchanged at the first question
+    job = client.job(job_id)
+    etag: str | None = None
+    retry_after_s = 0.0
     listener = _Listener(client, _news(job), tell)
     while job.state not in ENDED:
         if listener.silent_connections < _SILENT_CONNECTIONS:

@@ -30,7 +30,7 @@ _PASSING = (HTTPStatus.INTERNAL_SERVER_ERROR, HTTPStatus.BAD_GATEWAY, HTTPStatus
 Body = Callable[[], Iterator[bytes]]  # called for every try, so that each begins with the first byte
 
 
-class TroubleError(Exception):
+class TroubleError(ClientError):
     """Something that may pass: `cause` is what to raise once patience is over."""
 
     def __init__(self, cause: ClientError, retry_after_s: float | None = None) -> None:
@@ -176,7 +176,7 @@ class Transport:
                     raise _refusal(got)
                 yield got
         except httpx.TransportError as error:
-            what = str(error) or type(error).__name__
+            what = str(error).rstrip(".") or type(error).__name__
             raise TroubleError(
                 UnreachableError(
                     f"{self.url} cannot be reached: {what}. Check the URL, and that the service runs; then give the "

@@ -173,6 +173,8 @@ class _Upload:
         return [file for file in files if file.path in wanted]
 
     def _send(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
+        sent_bytes = 0
+
         def counted() -> Iterator[bytes]:
             nonlocal sent_bytes
             meter.add(-sent_bytes)
@@ -184,7 +186,6 @@ class _Upload:
                 sent_bytes += len(piece)
                 meter.add(len(piece))
 
-        sent_bytes = 0
         try:
             # The drive is this folder's: where a file was changed here since it was sent, the new bytes count.
             self._client.put_file(drive_id, file, body=counted, replace=True)

@@ -54,6 +54,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Send a drive to a service, ask for its scene, and with --wait or --out get it.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,  # --key SECRET must not pass for --key-file
     )
     parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.json")
     parser.add_argument("--url", required=True, help="of the service, for example http://127.0.0.1:8000")

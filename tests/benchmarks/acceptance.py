@@ -6,6 +6,7 @@
 | 2 | time of mapping against COLMAP's global mapper on the same matches |
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
+| 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.real_drives import accuracy, speed
 from tests.benchmarks.rendered_drives import SEEDS, rendered
+from tests.benchmarks.service import service
 from tests.benchmarks.table import Figure, failed, save, show
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -34,7 +36,13 @@ Line = Callable[[Path, Path], Iterator[Figure]]  # of the folders of real drives
 
 def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
     """What can be measured, by number."""
-    return {"1": accuracy, "2": speed, "3": lambda data, work: rendered(work, seeds), "4": fresh_clone}
+    return {
+        "1": accuracy,
+        "2": speed,
+        "3": lambda data, work: rendered(work, seeds),
+        "4": fresh_clone,
+        "5": service,
+    }
 
 
 def main() -> int:
@@ -47,7 +55,7 @@ def main() -> int:
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()
-    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3"]
+    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5"]
     lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
     known = lines_for([int(seed) for seed in arguments.seeds.split(",")])
     if unknown := set(lines) - set(known):

@@ -40,14 +40,14 @@ STEREO = (
 DDAD_IMAGES = 18
 
 
-def _imported(data: Path, name: str, work: Path) -> Path:
+def imported(data: Path, name: str, work: Path) -> Path:
     drive = work / name
     if not drive.exists():
         mrasfm("import", data / name, "--out", drive)
     return drive
 
 
-def _reconstructed(drive: Path, out: Path, *options: str) -> Path:
+def reconstructed(drive: Path, out: Path, *options: str) -> Path:
     """The scene; one that this run has reconstructed before is used again."""
     if not (out / "report.json").exists():
         mrasfm("reconstruct", drive, "--out", out, *options)
@@ -57,12 +57,12 @@ def _reconstructed(drive: Path, out: Path, *options: str) -> Path:
 def accuracy(data: Path, work: Path) -> Iterator[Figure]:
     """Line 1."""
     for bounds in STEREO:
-        drive = _imported(data, bounds.name, work)
+        drive = imported(data, bounds.name, work)
         for title, options, most in (
             ("without GNSS", ("--no-gnss",), bounds.metric_rmse_m),
             ("with GNSS", (), bounds.metric_rmse_gnss_m),
         ):
-            scene = _reconstructed(drive, work / f"{bounds.name} {title}", *options)
+            scene = reconstructed(drive, work / f"{bounds.name} {title}", *options)
             yield from _stereo_figures(f"{bounds.name} {title}", evaluate(scene, drive), bounds.images, most)
     yield from _ddad(data, work)
     yield from _peers(data, work)
@@ -77,8 +77,8 @@ def _stereo_figures(title: str, errors: dict, images: int, most: float) -> Itera
 
 
 def _ddad(data: Path, work: Path) -> Iterator[Figure]:
-    drive = _imported(data, "ddad", work)
-    scene = read_poses(_reconstructed(drive, work / "ddad scene"))
+    drive = imported(data, "ddad", work)
+    scene = read_poses(reconstructed(drive, work / "ddad scene"))
     yield exactly("1", "ddad: images registered", scene.registered_images, DDAD_IMAGES)
     # The drive's files are images/CAMERA_01/000000.jpg, the source's truth has CAMERA_01/000000.
     sensors = json.loads((data / "ddad" / "T_world_sensor.json").read_text(encoding="utf-8"))
@@ -93,8 +93,8 @@ def _ddad(data: Path, work: Path) -> Iterator[Figure]:
 
 def _peers(data: Path, work: Path) -> Iterator[Figure]:
     """COLMAP on the matches of kitti06 without GNSS, for comparison."""
-    drive = _imported(data, "kitti06", work)
-    scene = _reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
+    drive = imported(data, "kitti06", work)
+    scene = reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
     truth = read_tum(drive / "truth.tum").world_from_rig
     for mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION, Mapper.INCREMENTAL_FIXED_CALIBRATION):
         result = run_peer(scene / "features.db", mapper, threads=THREADS)
@@ -109,8 +109,8 @@ def _peers(data: Path, work: Path) -> Iterator[Figure]:
 
 def speed(data: Path, work: Path) -> Iterator[Figure]:
     """Line 2: mapping and refinement after matching, against COLMAP's global mapper on the same matches."""
-    drive = _imported(data, "kitti06", work)
-    scene = _reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
+    drive = imported(data, "kitti06", work)
+    scene = reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
     ours = statistics.median(_mapping_seconds(drive, scene) for _ in range(REPETITIONS))
     yield Figure(line="2", what=f"mapping of kitti06, median of {REPETITIONS}", value=ours, unit="s")
     for mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
