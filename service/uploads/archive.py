@@ -12,14 +12,14 @@ from service.uploads.archive_names import MANIFEST, EntryNames, is_ignored, may_
 from service.uploads.decompress import compression_of
 from service.uploads.images import check_image
 from service.uploads.spool import Spooled, SpoolWriter
-from service.uploads.tar_reader import is_tar, read_tar
-from service.uploads.zip_reader import SIGNATURES, read_directory, read_entry
+from service.uploads.tar_reader import read_tar
+from service.uploads.zip_reader import SIGNATURES, ZipReader
 
 __all__ = ["ArchiveLimits", "SameManifest", "unpack"]
 
 SameManifest = Callable[[bytes], bool]
 
-_START_BYTES = 512
+_START_BYTES = 8
 
 
 def unpack(
@@ -66,13 +66,8 @@ def unpack(
             stream.seek(0)
             if start.startswith(SIGNATURES):
                 _unpack_zip(stream, unpacking, limits)
-            elif (compression := compression_of(start)) is not None or is_tar(start):
-                _unpack_tar(stream, compression, unpacking, limits)
             else:
-                raise Refusal.NOT_AN_ARCHIVE(
-                    "the file is neither a zip nor a tar archive",
-                    "Send a zip, or a tar that is plain or compressed with gzip, bzip2 or xz.",
-                )
+                _unpack_tar(stream, compression_of(start), unpacking, limits)
         return unpacking.finish(same_manifest)
     except BaseException:
         unpacking.discard()
@@ -80,18 +75,19 @@ def unpack(
 
 
 def _unpack_zip(stream: BinaryIO, unpacking: _Unpacking, limits: ArchiveLimits) -> None:
-    entries = [entry for entry in read_directory(stream, limits) if not is_ignored(entry.name)]
-    for entry in entries:
-        unpacking.names.add(entry.name)
+    archive = ZipReader(stream, limits)
+    entries = [(name, info) for name, info in archive.entries if not is_ignored(name)]
+    for name, _ in entries:
+        unpacking.names.add(name)
     unpacking.names.settle()  # before anything is unpacked
-    for entry in entries:
-        unpacking.write(entry.name, entry.size_bytes, read_entry(stream, entry))
+    for name, info in entries:
+        unpacking.write(name, info.file_size, archive.read(name, info))
 
 
 def _unpack_tar(stream: BinaryIO, compression: str | None, unpacking: _Unpacking, limits: ArchiveLimits) -> None:
-    for entry in read_tar(stream, compression, limits):
-        if not is_ignored(entry.name) and unpacking.names.add(entry.name):
-            unpacking.write(entry.name, entry.size_bytes, entry.read())
+    for name, size_bytes, content in read_tar(stream, compression, limits):
+        if not is_ignored(name) and unpacking.names.add(name):
+            unpacking.write(name, size_bytes, content)
 
 
 class _Unpacking:

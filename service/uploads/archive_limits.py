@@ -18,7 +18,7 @@ class ArchiveLimits:
     Parameters
     ----------
     max_entries
-        Folders and files that are ignored count. Memory grows with it: some 300 bytes an entry.
+        Folders and files that are ignored count. Memory grows with it: some 1,000 bytes an entry.
     max_bytes
         Of all entries, unpacked.
     max_ratio

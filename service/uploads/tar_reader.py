@@ -1,114 +1,51 @@
-"""Strict reading of tar archives from outside (POSIX.1-2017 pax and ustar, GNU's long names), in one pass.
+"""Tar archives from outside (pax, ustar, GNU's long names), read in one pass with the standard library's tarfile.
 
-Python's tarfile reads headers of any length into memory, takes damaged headers for the end and seeks where it is told;
-here the archive is a stream whose every byte is accounted for.
+Tarfile reads headers of any length into memory, with a pax parser (before Python 3.11.10) whose time and memory grow
+with the square of it, and takes a damaged header for the end: so its stream gives it only so much, and is looked at.
 """
 
 from __future__ import annotations
 
+import io
+import lzma
 import re
+import tarfile
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import BinaryIO
+from functools import partial
+from typing import Any, BinaryIO, cast
 
 from service.errors import ServiceError
 from service.uploads.archive_errors import Refusal, damaged, shown
-from service.uploads.archive_limits import ArchiveLimits, Budget
+from service.uploads.archive_limits import SMALL_BYTES, ArchiveLimits, Budget, require_ratio
 from service.uploads.archive_names import safe_name
-from service.uploads.decompress import UnpackedStream
+from service.uploads.decompress import ERRORS, MAX_XZ_MEMORY_BYTES, Packed, unpacked
 
-_BLOCK_BYTES = 512
-_CHUNK_BYTES = 1 << 20
-_ZERO_BLOCK = bytes(_BLOCK_BYTES)
-_MAX_EXTENSION_BYTES = 1 << 20  # of names, times and extended attributes of one entry
-_MAX_EXTENSIONS = 16  # of one entry; tools write up to four
-# What an entry may take beside its content: headers, long names, padding; and the padding of the archive's end.
-_OVERHEAD_PER_ENTRY_BYTES = 8 * _BLOCK_BYTES
-_OVERHEAD_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 18
+_READ_AHEAD_BYTES = 1 << 16
+_MAX_HEADER_BYTES = 8 << 10  # of one entry: names, times and extended attributes
+_PADDING_BYTES = 1 << 20  # of the archive's end, at most
 
-_FILES = frozenset({b"0", b"\0", b"7"})  # 7: contiguous, a file like others
-_FOLDER = b"5"
-_LONG_NAME, _LONG_LINK = b"L", b"K"
-_PAX, _PAX_SOLARIS, _PAX_GLOBAL = b"x", b"X", b"g"
+_FILES = frozenset({tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.CONTTYPE})
 _REFUSED = {
-    b"1": "a hard link",
-    b"2": "a symbolic link",
-    b"3": "a device",
-    b"4": "a device",
-    b"6": "a pipe",
-    b"S": "a sparse file",
+    tarfile.LNKTYPE: "a hard link",
+    tarfile.SYMTYPE: "a symbolic link",
+    tarfile.CHRTYPE: "a device",
+    tarfile.BLKTYPE: "a device",
+    tarfile.FIFOTYPE: "a pipe",
+    tarfile.GNUTYPE_SPARSE: "a sparse file",
     b"M": "the rest of a file of another archive",
     b"D": "a list of files of an incremental backup",
 }
 _SPARSE_KEY = "GNU.sparse."
-_OCTAL = re.compile(rb" *([0-7]*)[ \0]*")
-_PAX_LENGTH = re.compile(rb"([1-9][0-9]{0,6}) ")
-_PAX_SIZE = re.compile(r"[0-9]{1,19}")
+_PAX_SIZE = re.compile("[0-9]{1,19}")
 
 
-class TarEntry:
-    """One file of the archive; its content is to be read before the next entry is asked for, or it is skipped."""
+def read_tar(
+    stream: BinaryIO, compression: str | None, limits: ArchiveLimits
+) -> Iterator[tuple[str, int, Iterator[bytes]]]:
+    """Name, size and content of all files of the archive in their order; folders are left out.
 
-    def __init__(self, stream: UnpackedStream, name: str, size_bytes: int) -> None:
-        self.name = name
-        self.size_bytes = size_bytes
-        self._stream = stream
-        self._left_bytes = size_bytes
-
-    def read(self) -> Iterator[bytes]:
-        """The content in chunks of bounded size.
-
-        Raises
-        ------
-        ServiceError
-            422, if the archive ends before the content does or is damaged.
-        """
-        while self._left_bytes:
-            chunk = self._stream.read(min(self._left_bytes, _CHUNK_BYTES))
-            if not chunk:
-                raise damaged(f"it ends inside entry {shown(self.name)}, so it is truncated")
-            self._left_bytes -= len(chunk)
-            yield chunk
-
-    def skip(self) -> None:
-        """Go to the next entry's header."""
-        for _ in self.read():
-            pass
-        padding_bytes = -self.size_bytes % _BLOCK_BYTES
-        if len(self._stream.read(padding_bytes)) < padding_bytes:
-            raise damaged(f"it ends inside entry {shown(self.name)}, so it is truncated")
-
-
-@dataclass(frozen=True, slots=True)
-class _Header:
-    raw_name: bytes
-    kind: bytes
-    size_bytes: int
-
-
-@dataclass(slots=True)
-class _Extension:
-    """What the headers before an entry's own say about it."""
-
-    name: bytes | None = None
-    size_bytes: int | None = None
-    headers: int = 0
-
-
-def is_tar(block: bytes) -> bool:
-    """Whether a file begins with a tar header, or is an empty tar archive."""
-    return len(block) == _BLOCK_BYTES and (block == _ZERO_BLOCK or _checksum_fits(block))
-
-
-def read_tar(stream: BinaryIO, compression: str | None, limits: ArchiveLimits) -> Iterator[TarEntry]:
-    """All files of the archive in their order; folders are left out.
-
-    Parameters
-    ----------
-    stream
-        At its beginning.
-    compression
-        As `compression_of` says.
+    A content that is not read before the next file is asked for is skipped.
 
     Raises
     ------
@@ -116,147 +53,161 @@ def read_tar(stream: BinaryIO, compression: str | None, limits: ArchiveLimits) -
         415 `not-an-archive` if there is no tar archive inside, 422 that names the entry if it is damaged, over a limit
         or holds what is refused.
     """
-    max_bytes = limits.max_bytes + limits.max_entries * _OVERHEAD_PER_ENTRY_BYTES + _OVERHEAD_BYTES
-    unpacked = UnpackedStream(stream, compression, limits=limits, max_bytes=max_bytes)
+    _require_tar(_Stream(stream, compression, limits))
+    stream.seek(0)
+    blocks = _Stream(stream, compression, limits)
     budget = Budget(limits)
-    extension = _Extension()
-    block = unpacked.read(_BLOCK_BYTES)
-    if not is_tar(block):
-        raise Refusal.NOT_AN_ARCHIVE(
-            f"the {compression or 'sent'} data hold no tar archive", "Send a zip or a tar archive of the drive's files."
-        )
-    while block != _ZERO_BLOCK:
-        header = _header(block)
-        if header.kind in (_LONG_NAME, _LONG_LINK, _PAX, _PAX_SOLARIS, _PAX_GLOBAL):
-            _extend(extension, header, unpacked)
-        else:
-            entry = _entry(header, extension, unpacked, budget=budget)
-            if entry is not None:
-                yield entry
-                entry.skip()
-            extension = _Extension()
-        block = unpacked.read(_BLOCK_BYTES)
-        if len(block) < _BLOCK_BYTES:
-            raise damaged("it ends without its end mark, so it is truncated")
-    if extension.name is not None or extension.size_bytes is not None:
-        raise damaged("it ends before an entry whose name or size it gives")
-    while rest := unpacked.read(_CHUNK_BYTES):
+    for archive, member in _members(blocks):
+        name = _checked_name(member)
+        budget.entry(name, member.size)
+        blocks.begin(f"entry {shown(name)}", member.size)
+        if not member.isdir():
+            content = cast(BinaryIO, archive.extractfile(member))
+            yield name, member.size, iter(partial(content.read, _CHUNK_BYTES), b"")
+    while rest := blocks.take(_CHUNK_BYTES):
         if rest.strip(b"\0"):
             raise damaged("other bytes follow its end mark")
 
 
-def _entry(header: _Header, extension: _Extension, stream: UnpackedStream, *, budget: Budget) -> TarEntry | None:
-    """The checked entry; None for a folder."""
-    raw_name = header.raw_name if extension.name is None else extension.name
-    size_bytes = header.size_bytes if extension.size_bytes is None else extension.size_bytes
-    if header.kind in _REFUSED:
-        raise _refused(raw_name, f"is {_REFUSED[header.kind]}")
-    is_folder = header.kind == _FOLDER or (header.kind == b"\0" and raw_name.endswith(b"/"))
-    if not is_folder and header.kind not in _FILES:
-        raise _refused(raw_name, f"is of the unknown type {shown(header.kind)}")
-    name = safe_name(raw_name, is_folder=is_folder)
-    if is_folder and size_bytes:
-        raise damaged(f"folder {shown(name)} has content")
-    budget.entry(name, size_bytes)
-    stream.begin_section(f"entry {shown(name)} of the archive")
-    return None if is_folder else TarEntry(stream, name, size_bytes)
+class _Stream(io.BufferedIOBase):
+    """What tarfile reads from: forwards, whole or not at all, and of an entry's headers only so much.
+
+    The total size and the compression ratio, of the archive and of each entry, are watched.
+    """
+
+    def __init__(self, stream: BinaryIO, compression: str | None, limits: ArchiveLimits) -> None:
+        self._packed = Packed(stream)
+        self._content = unpacked(self._packed, compression)
+        self._compression = compression
+        self._max_ratio = limits.max_ratio
+        self._max_bytes = limits.max_bytes + limits.max_entries * _MAX_HEADER_BYTES + _PADDING_BYTES
+        self._left_bytes = _MAX_HEADER_BYTES
+        self._entry_start = (0, 0)
+        self.where = "its beginning"
+        self.latest = b""
+
+    def begin(self, where: str, content_bytes: int) -> None:
+        """An entry's content begins; `where` names it in messages."""
+        self.where = where
+        self._left_bytes = content_bytes
+        self._entry_start = (self._packed.packed_bytes, self._packed.unpacked_bytes)
+
+    def allow_headers(self) -> None:
+        """The next entry's headers may be read."""
+        self._left_bytes = _MAX_HEADER_BYTES
+
+    def tell(self) -> int:
+        return self._packed.unpacked_bytes
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is None or size < 0:
+            raise damaged(f"a header behind {self.where} declares a negative size")
+        self._left_bytes -= size
+        if self._left_bytes < 0:
+            raise Refusal.TOO_LARGE(
+                f"the archive has headers of over {_MAX_HEADER_BYTES} bytes for one entry, behind {self.where}",
+                "Make the archive without extended attributes (tar --no-xattrs).",
+            )
+        self.latest = self._whole(size)
+        return self.latest
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        if whence != io.SEEK_SET or offset < self.tell():
+            raise damaged(f"a header behind {self.where} points back")
+        while self.tell() < offset:
+            self._whole(min(offset - self.tell(), _CHUNK_BYTES))
+        return offset
+
+    def take(self, size_bytes: int) -> bytes:
+        """The next bytes; fewer only at the end."""
+        try:
+            data = self._content.read(size_bytes)
+        except ERRORS as error:
+            raise self._refusal(error) from None
+        self._packed.unpacked_bytes += len(data)
+        if self._packed.unpacked_bytes > self._max_bytes:
+            raise Refusal.TOO_LARGE(
+                f"the archive unpacks to over {self._max_bytes} bytes", "Send the drive in several archives."
+            )
+        self._check_ratio("the archive", self._packed.packed_bytes, self._packed.unpacked_bytes)
+        # What was read ahead of the entry may belong to it.
+        packed_bytes = self._packed.packed_bytes - self._entry_start[0] + _READ_AHEAD_BYTES
+        unpacked_bytes = self._packed.unpacked_bytes - self._entry_start[1] - SMALL_BYTES
+        self._check_ratio(f"{self.where} of the archive", packed_bytes, unpacked_bytes)
+        return data
+
+    def _whole(self, size_bytes: int) -> bytes:
+        data = self.take(size_bytes)
+        if len(data) < size_bytes:
+            raise damaged(f"it ends in or behind {self.where} without its end mark, so it is truncated")
+        return data
+
+    def _check_ratio(self, what: str, packed_bytes: int, unpacked_bytes: int) -> None:
+        require_ratio(what, packed_bytes=packed_bytes, unpacked_bytes=unpacked_bytes, max_ratio=self._max_ratio)
+
+    def _refusal(self, error: Exception) -> ServiceError:
+        if isinstance(error, lzma.LZMAError) and "emory" in str(error):
+            return Refusal.UNSUPPORTED(
+                f"the archive needs over {MAX_XZ_MEMORY_BYTES // 1_000_000} MB of memory to be unpacked",
+                "Compress it with xz -9 at most, or with gzip.",
+            )
+        return damaged(f"its {self._compression} data are damaged or truncated, or other bytes follow them")
 
 
-def _refused(raw_name: bytes, problem: str) -> ServiceError:
-    return Refusal.UNSAFE(f"entry {shown(raw_name)} of the archive {problem}", "Put the file itself into the archive.")
+def _require_tar(stream: _Stream) -> None:
+    """Refuse what begins neither with a header nor with the end mark of an empty archive."""
+    block = stream.take(tarfile.BLOCKSIZE)
+    try:
+        if block != bytes(tarfile.BLOCKSIZE):
+            tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+    except tarfile.HeaderError:
+        raise Refusal.NOT_AN_ARCHIVE(
+            "the file is neither a zip nor a tar archive",
+            "Send a zip, or a tar that is plain or compressed with gzip, bzip2 or xz.",
+        ) from None
 
 
-def _header(block: bytes) -> _Header:
-    if not _checksum_fits(block):
-        raise damaged("a header has the wrong checksum")
-    name = block[:100].partition(b"\0")[0]
-    kind = block[156:157]
-    size_bytes = _number(block[124:136], name)
-    prefix = block[345:500].partition(b"\0")[0]
-    if prefix and block[257:263] == b"ustar\0":  # GNU's own format keeps other things in these bytes
-        name = prefix + b"/" + name
-    return _Header(name, kind, size_bytes)
+def _members(blocks: _Stream) -> Iterator[tuple[tarfile.TarFile, tarfile.TarInfo]]:
+    """The archive at each of its entries."""
+    try:
+        archive = tarfile.TarFile(fileobj=cast(Any, blocks), encoding="utf-8", errors="surrogateescape")
+        while (member := archive.next()) is not None:
+            _forget(archive)
+            yield archive, member
+            blocks.allow_headers()
+    except (tarfile.TarError, ValueError, LookupError, ArithmeticError):
+        raise damaged(f"a header behind {blocks.where} is malformed, or its entry is missing") from None
+    if blocks.latest.strip(b"\0"):
+        name = blocks.latest[:100].partition(b"\0")[0]
+        raise damaged(f"the header {shown(name)} behind {blocks.where} has a wrong checksum or number")
 
 
-def _checksum_fits(block: bytes) -> bool:
-    declared = _OCTAL.fullmatch(block[148:156])
-    if declared is None or not declared[1]:
-        return False
-    summed = block[:148] + b" " * 8 + block[156:]
-    unsigned = sum(summed)
-    signed = unsigned - 256 * sum(byte > 127 for byte in summed)  # as some old systems counted
-    return int(declared[1], 8) in (unsigned, signed)
-
-
-def _number(data: bytes, name: bytes) -> int:
-    """A header's number: octal, or in GNU's way binary with the first bit set."""
-    if data[0] & 0x80:
-        if data[0] & 0x40:
-            raise damaged(f"entry {shown(name)} declares a negative size")
-        return int.from_bytes(bytes([data[0] & 0x3F]) + data[1:], "big")
-    octal = _OCTAL.fullmatch(data)
-    if octal is None:
-        raise damaged(f"entry {shown(name)} declares the size {shown(data)}, which is not a number")
-    return int(octal[1] or b"0", 8)
-
-
-def _extend(extension: _Extension, header: _Header, stream: UnpackedStream) -> None:
-    extension.headers += 1
-    if extension.headers > _MAX_EXTENSIONS:
-        raise damaged(f"over {_MAX_EXTENSIONS} headers without an entry follow each other")
-    if header.size_bytes > _MAX_EXTENSION_BYTES:
-        raise Refusal.TOO_LARGE(
-            f"the archive holds a header of {header.size_bytes} bytes, the bound is {_MAX_EXTENSION_BYTES}",
-            "Make the archive without extended attributes.",
-        )
-    padded_bytes = header.size_bytes + -header.size_bytes % _BLOCK_BYTES
-    data = stream.read(padded_bytes)
-    if len(data) < padded_bytes:
-        raise damaged("it ends inside a header, so it is truncated")
-    data = data[: header.size_bytes]
-    if header.kind == _PAX_GLOBAL:
-        _check_global(data)
-        return
-    if header.kind == _LONG_NAME:
-        extension.name = data.partition(b"\0")[0]
-    elif header.kind != _LONG_LINK:  # links are refused by their own header
-        _apply_pax(extension, data)
-
-
-def _check_global(data: bytes) -> None:
-    """Comments, as git's, are fine; what holds for all entries at once cannot be a name or a size."""
-    for key, _ in _pax_records(data):
+def _forget(archive: Any) -> None:
+    """Drop the entry and the comments for all entries, as git's, that the archive keeps in memory."""
+    for key in archive.pax_headers:
         if key in ("path", "size", "linkpath") or key.startswith(_SPARSE_KEY):
             raise Refusal.UNSUPPORTED(
                 f"the archive gives all its entries the same {key!r}", "Make the archive again with another tool."
             )
+    archive.pax_headers.clear()
+    archive.members.clear()
 
 
-def _apply_pax(extension: _Extension, data: bytes) -> None:
-    for key, value in _pax_records(data):
-        if key == "path":
-            if b"\0" in value:
-                raise _refused(value, "has control or invisible characters in its name")
-            extension.name = value
-        elif key == "size":
-            text = value.decode("ascii", "replace")
-            if not _PAX_SIZE.fullmatch(text):
-                raise damaged(f"an entry declares the size {shown(value)}, which is not a number of bytes")
-            extension.size_bytes = int(text)
-        elif key.startswith(_SPARSE_KEY):
-            raise _refused(extension.name or b"", "is a sparse file")
-
-
-def _pax_records(data: bytes) -> Iterator[tuple[str, bytes]]:
-    """Keys and values of records of the form 'LENGTH KEY=VALUE' and a line feed."""
-    at = 0
-    while at < len(data):
-        length = _PAX_LENGTH.match(data, at)
-        end = at + int(length[1]) if length else 0
-        if length is None or not length.end() < end <= len(data) or data[end - 1 : end] != b"\n":
-            raise damaged("a pax header is malformed")
-        key, equals, value = data[length.end() : end - 1].partition(b"=")
-        if not equals:
-            raise damaged("a pax header is malformed")
-        yield key.decode("utf-8", "backslashreplace"), value
-        at = end
+def _checked_name(member: tarfile.TarInfo) -> str:
+    raw_name = member.name.encode("utf-8", "surrogateescape")
+    kind = _REFUSED.get(member.type)
+    if any(key.startswith(_SPARSE_KEY) for key in member.pax_headers):
+        kind = _REFUSED[tarfile.GNUTYPE_SPARSE]
+    elif kind is None and member.type not in _FILES and not member.isdir():
+        kind = f"of the unknown type {shown(member.type)}"
+    if kind is not None:
+        raise Refusal.UNSAFE(
+            f"entry {shown(raw_name)} of the archive is {kind}", "Put the file itself into the archive."
+        )
+    name = safe_name(raw_name, is_folder=member.isdir())
+    # Tarfile takes a pax size that is not a number for 0.
+    if member.size < 0 or not _PAX_SIZE.fullmatch(member.pax_headers.get("size", "0")):
+        raise damaged(f"entry {shown(name)} declares a size that is negative or not a number")
+    if member.isdir() and member.size:
+        raise damaged(f"folder {shown(name)} has content")
+    return name
