@@ -8,26 +8,23 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
-from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel
-from pydantic.json_schema import models_json_schema
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from schemas.api.problems import MEDIA_TYPE, Problem, ProblemItem
+from schemas.api.problems import MEDIA_TYPE, ProblemItem
 from service.context import Context
 from service.errors import ServiceError
 from service.metrics import Metrics
+from service.openapi import allowed_methods, openapi_page
 from service.request_log import RequestLog
 from service.routes import drives, files, jobs, operations, reconstructions, scenes
-from service.routes.bodies import documented
+from service.routes.documentation import add_documentation
 from service.settings import Settings
 from service.uploads.spool import sweep
 
@@ -63,14 +60,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         await asyncio.gather(sweeping, return_exceptions=True)
         context.database.close()
 
-    app = FastAPI(title="MRASfM", version=version("mrasfm"), description=_ABOUT, lifespan=lifespan)
+    app = FastAPI(
+        title="MRASfM", version=version("mrasfm"), description=_ABOUT, lifespan=lifespan, docs_url=None, redoc_url=None
+    )
     app.state.context = context
     for module in (drives, files, reconstructions, jobs, scenes, operations):
         app.include_router(module.router)
     app.include_router(operations.metrics_route(metrics))
+    add_documentation(app)
     _answer_errors(app)
     app.add_middleware(RequestLog, metrics=metrics, failed=_failed)
-    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    app.openapi = lambda: openapi_page(app)  # type: ignore[method-assign]
     return app
 
 
@@ -106,6 +106,8 @@ def _answer_errors(app: FastAPI) -> None:
         detail = f"{request.method} {request.url.path}: {error.detail}"
         remedy = "See /docs for what there is."
         headers = dict(error.headers or {})
+        if error.status_code == 405:
+            headers["Allow"] = ", ".join(allowed_methods(app, request.url.path)) or headers.get("Allow", "GET")
         return problem_response(
             ServiceError(error.status_code, code, str(error.detail), detail, remedy=remedy, headers=headers)
         )
@@ -154,18 +156,3 @@ def problem_response(error: ServiceError) -> JSONResponse:
     """An error as RFC 9457 has it."""
     body = error.problem.model_dump(mode="json", exclude_defaults=True)
     return JSONResponse(body, status_code=error.status, headers=error.headers, media_type=MEDIA_TYPE)
-
-
-def _openapi(app: FastAPI) -> dict[str, Any]:
-    """FastAPI's page, and the models of bodies that we read ourselves."""
-    if app.openapi_schema is None:
-        page = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-        models: list[type[BaseModel]] = [*documented.values(), Problem]
-        _, extra = models_json_schema(
-            [(model, "validation") for model in models], ref_template="#/components/schemas/{model}"
-        )
-        page["components"]["schemas"] |= extra["$defs"]
-        for unused in ("HTTPValidationError", "ValidationError"):
-            page["components"]["schemas"].pop(unused, None)
-        app.openapi_schema = page
-    return app.openapi_schema

@@ -65,7 +65,8 @@ class _Records(Collector):
 
     def _counts(self) -> tuple[dict[str, int], int, int]:
         with self._database.read() as session:
-            states = dict(session.execute(select(Job.state, func.count()).group_by(Job.state)).tuples().all())
+            by_state = select(Job.state, func.count()).group_by(Job.state)
+            states: dict[str, int] = {row[0]: row[1] for row in session.execute(by_state)}
             seen = WorkerSeen.seen_us > now_us() - ONLINE_US
             workers = session.scalar(select(func.count()).select_from(WorkerSeen).where(seen)) or 0
             used = session.scalar(select(func.coalesce(func.sum(Project.used_bytes), 0))) or 0

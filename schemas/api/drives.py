@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
@@ -12,6 +12,27 @@ from schemas.api.common import Finding, RequestBody, Resource, Sha256, Times
 from schemas.drive import RelativePath
 
 MAX_DECLARED_FILES = 10_000
+
+EXAMPLE_MANIFEST: dict[str, Any] = {
+    "version": 1,
+    "name": "ring-road-2026-05-04",
+    "rig": {
+        "cameras": [
+            {
+                "name": "front",
+                "model": "PINHOLE",
+                "width": 1280,
+                "height": 720,
+                "params": [910.0, 910.0, 640.0, 360.0],
+                "rig_from_cam": {"rotation_xyzw": [-0.5, 0.5, -0.5, 0.5], "translation_m": [1.6, 0.0, 1.4]},
+            }
+        ]
+    },
+    "frames": [
+        {"timestamp_us": 1777887000000000, "source_frame": 0, "images": {"front": {"file": "front/000000.png"}}},
+        {"timestamp_us": 1777887000100000, "source_frame": 1, "images": {"front": {"file": "front/000001.png"}}},
+    ],
+}
 
 
 class DriveState(StrEnum):

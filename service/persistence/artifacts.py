@@ -65,10 +65,15 @@ class ArtifactStore:
         """Where the objects lie on this machine, or None where they lie elsewhere."""
         return self._root
 
-    def adopt(self, path: Path, key: str, sha256: str) -> None:
+    def adopt(self, path: Path, key: str, sha256: str, *, synced: bool = False) -> None:
         """Make the file `path` the object `key`; the file is gone afterwards.
 
         When this returns, the object survives a power cut.
+
+        Parameters
+        ----------
+        synced
+            Whether the file's bytes are on the disk already.
         """
         if self._root is None:
             obstore.put(self._store, key, path)
@@ -79,7 +84,8 @@ class ArtifactStore:
         target = self._root / key
         target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         try:
-            _sync(path)
+            if not synced:
+                _sync(path)
             path.replace(target)
         except OSError as error:
             if error.errno != errno.EXDEV:
@@ -110,8 +116,9 @@ class ArtifactStore:
                     raise
                 shutil.copy2(self._root / key, target)
             return
+        found = obstore.get(self._store, key)  # first: what is not there leaves no empty file
         with target.open("xb") as file:
-            for chunk in obstore.get(self._store, key).stream(min_chunk_size=_CHUNK_BYTES):
+            for chunk in found.stream(min_chunk_size=_CHUNK_BYTES):
                 file.write(chunk)
         os.chmod(target, 0o440)
         os.utime(target, ns=(content_mtime_ns(sha256),) * 2)

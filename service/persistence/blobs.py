@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import secrets
 
-from sqlalchemy import ColumnElement, delete, exists, select, update
+from sqlalchemy import ColumnElement, delete, select, update
+from sqlalchemy import exists as sql_exists
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
@@ -15,6 +16,12 @@ from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Proje
 def new_key(project_id: str, sha256: str) -> str:
     """Where a content that is not stored yet goes in the artifact store."""
     return f"blobs/{project_id}/{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+
+
+def exists(session: Session, project_id: str, sha256: str) -> bool:
+    """Whether the project has this content."""
+    found = select(Blob.id).where(Blob.project_id == project_id, Blob.sha256 == sha256)
+    return session.scalar(found) is not None
 
 
 def find(session: Session, project_id: str, sha256: str) -> Blob | None:
@@ -48,6 +55,7 @@ def record(
     statement = insert(Blob).values(**values, touched_us=now_us()).on_conflict_do_nothing()
     if session.execute(statement.returning(Blob.id)).first() is not None:
         _take_space(session, project_id, size_bytes, within_quota=within_quota)
+        return session.get_one(Blob, values["id"])
     blob = find(session, project_id, sha256)
     assert blob is not None
     return blob
@@ -77,10 +85,10 @@ def quota_full(project: Project, size_bytes: int) -> ServiceError:
 def unused() -> ColumnElement[bool]:
     """The condition that nothing refers to a blob."""
     return ~(
-        exists().where(Drive.manifest_blob_id == Blob.id)
-        | exists().where(DriveFile.blob_id == Blob.id)
-        | exists().where(SceneFile.blob_id == Blob.id)
-        | exists().where(Checkpoint.blob_id == Blob.id)
+        sql_exists().where(Drive.manifest_blob_id == Blob.id)
+        | sql_exists().where(DriveFile.blob_id == Blob.id)
+        | sql_exists().where(SceneFile.blob_id == Blob.id)
+        | sql_exists().where(Checkpoint.blob_id == Blob.id)
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -79,13 +80,10 @@ def _sqlite(url: str, patience_s: float) -> Engine:
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, record: Any) -> None:
         connection.isolation_level = None  # transactions begin where we say, not where the driver guesses
-        for statement in (
-            f"PRAGMA busy_timeout={round(1000 * patience_s)}",
-            "PRAGMA journal_mode=WAL",  # readers do not wait for the writer
-            "PRAGMA synchronous=FULL",  # what was answered with 202 survives a power cut
-            "PRAGMA foreign_keys=ON",
-        ):
-            connection.execute(statement)
+        connection.execute(f"PRAGMA busy_timeout={round(1000 * patience_s)}")
+        _write_ahead(connection, patience_s)
+        connection.execute("PRAGMA synchronous=FULL")  # what was answered with 202 survives a power cut
+        connection.execute("PRAGMA foreign_keys=ON")
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Any) -> None:
@@ -93,6 +91,22 @@ def _sqlite(url: str, patience_s: float) -> Engine:
         connection.exec_driver_sql(f"BEGIN {mode}")
 
     return engine
+
+
+def _write_ahead(connection: sqlite3.Connection, patience_s: float) -> None:
+    """Make readers not wait for the writer.
+
+    While one process changes a new database to this mode, SQLite refuses the others at once, whatever its timeout is.
+    """
+    end_s = time.monotonic() + patience_s
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(0.02)
 
 
 def migrate(settings: Settings) -> None:

@@ -159,13 +159,15 @@ def require_file(session: Session, drive: Drive, path: str) -> DriveFile:
     return file
 
 
-def attach(session: Session, drive: Drive, path: str, stored: StoredFile, *, replace: bool) -> bool:
+def attach(
+    session: Session, drive: Drive, path: str, stored: StoredFile, *, replace: bool
+) -> tuple[bool, DriveFile, Blob]:
     """Give a file of an open drive its bytes.
 
     Returns
     -------
-    bool
-        False where it had them already.
+    new, file, blob
+        `new` is False where it had them already.
 
     Raises
     ------
@@ -175,7 +177,7 @@ def attach(session: Session, drive: Drive, path: str, stored: StoredFile, *, rep
     file = require_file(session, drive, path)
     present = None if file.blob_id is None else session.get_one(Blob, file.blob_id)
     if present is not None and present.sha256 == stored.sha256:
-        return False
+        return False, file, present
     require_open(drive)
     if present is not None and not replace:
         raise ServiceError(
@@ -186,10 +188,10 @@ def attach(session: Session, drive: Drive, path: str, stored: StoredFile, *, rep
             remedy="If these are the right ones, send them again with ?replace=true; if not, see who else writes this "
             "drive.",
         )
-    file.blob_id = blobs.record(session, project_id=drive.project_id, **stored.identity).id
-    file.stored_us = now_us()
+    blob = blobs.record(session, project_id=drive.project_id, **stored.identity)
+    file.blob_id, file.stored_us = blob.id, now_us()
     session.flush()
-    return True
+    return True, file, blob
 
 
 def require_open(drive: Drive) -> None:

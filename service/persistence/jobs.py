@@ -196,8 +196,13 @@ def heartbeat(session: Session, held: Claim, *, lease_us: int, note: ProgressNot
     return job.cancel_requested_us is not None
 
 
-def succeed(session: Session, held: Claim, *, scene_id: str | None = None) -> None:
+def succeed(session: Session, held: Claim, *, scene_id: str | None = None, reused: Sequence[str] = ()) -> None:
     """End the job; what it made is written in the same session.
+
+    Parameters
+    ----------
+    reused
+        Stages whose results were there already: all of them, where progress told of those it had time for.
 
     Raises
     ------
@@ -209,7 +214,7 @@ def succeed(session: Session, held: Claim, *, scene_id: str | None = None) -> No
         held,
         JobState.SUCCEEDED,
         "succeeded",
-        {"percent": 100.0, "eta_low_s": 0.0, "eta_high_s": 0.0, "scene_id": scene_id},
+        {"percent": 100.0, "eta_low_s": 0.0, "eta_high_s": 0.0, "scene_id": scene_id, "reused": list(reused)},
     )
 
 
@@ -223,7 +228,7 @@ def fail(session: Session, held: Claim, problem: Problem, *, max_attempts: int, 
     """
     described = problem.model_dump(mode="json", exclude_none=True)
     outcome = problem.type.removeprefix(PROBLEM_TYPE)
-    job = _locked(session, held)
+    job = _locked(session, held.job_id)
     if problem.retryable and held.attempt < max_attempts and job.cancel_requested_us is None:
         _requeue(session, held, outcome, described, not_before_us=now_us() + retry_delay_us)
         return JobState.QUEUED
@@ -252,7 +257,7 @@ def release(session: Session, held: Claim) -> None:
     FencedError
         Where the job is not this holder's any more.
     """
-    if _locked(session, held).cancel_requested_us is not None:
+    if _locked(session, held.job_id).cancel_requested_us is not None:
         cancelled(session, held)
         return
     _requeue(session, held, "released", None, not_before_us=0, counted=False)
@@ -266,6 +271,7 @@ def request_cancel(session: Session, job_id: str) -> None:
     ServiceError
         409 where the job has ended otherwise.
     """
+    job = _locked(session, job_id)  # else the job could pass from one state to the other between two conditions
     now = now_us()
     unheld = or_(
         Job.state == JobState.QUEUED, (Job.state == JobState.RUNNING) & (func.coalesce(Job.lease_until_us, 0) < now)
@@ -279,7 +285,6 @@ def request_cancel(session: Session, job_id: str) -> None:
     if _change(session, job_id, running, {"cancel_requested_us": now}):
         _tell_state(session, job_id)
         return
-    job = session.get_one(Job, job_id, populate_existing=True)
     if job.state in (JobState.SUCCEEDED, JobState.FAILED):
         raise ServiceError(
             409,
@@ -402,9 +407,9 @@ def _held(held: Claim) -> ColumnElement[bool]:
     return (Job.state == JobState.RUNNING) & (Job.fence == held.fence)
 
 
-def _locked(session: Session, held: Claim) -> Job:
+def _locked(session: Session, job_id: str) -> Job:
     """The job, which nobody else changes until the session ends: a request to cancel it comes before or after."""
-    return session.get_one(Job, held.job_id, populate_existing=True, with_for_update=True)
+    return session.get_one(Job, job_id, populate_existing=True, with_for_update=True)
 
 
 def _claim_of(job: Job) -> Claim:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 
 from sqlalchemy.orm import Session
@@ -33,8 +33,14 @@ def publish(
     files: Mapping[str, StoredFile],
     summary: SceneSummary,
     expires_us: int | None,
+    reused: Sequence[str] = (),
 ) -> str:
     """Make a scene of stored files, by path, and end its job.
+
+    Parameters
+    ----------
+    reused
+        Stages of the job whose results were there already.
 
     Returns
     -------
@@ -47,7 +53,7 @@ def publish(
         Where the job is not this holder's any more; the caller's session must roll back.
     """
     scene_id = new_id("scn")
-    jobs.succeed(session, held, scene_id=scene_id)
+    jobs.succeed(session, held, scene_id=scene_id, reused=reused)
     drive = session.get(Drive, held.drive_id)
     session.add(
         Scene(

@@ -12,6 +12,7 @@ from typing import Any
 from service.persistence import blobs
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.database import Database
+from service.persistence.tables import Blob
 
 _CHUNK_BYTES = 1 << 20
 _BATCH = 500
@@ -48,6 +49,7 @@ def store_file(
     path: Path,
     sha256: str,
     size_bytes: int,
+    synced: bool = False,
     started: Callable[[str], None] = lambda key: None,
 ) -> StoredFile:
     """Put a file into the artifact store, unless the project has its content already; the file is gone afterwards.
@@ -57,18 +59,28 @@ def store_file(
 
     Parameters
     ----------
+    synced
+        Whether the file's bytes are on the disk already.
     started
         Told the key of a new object before its bytes are there.
     """
-    with database.write() as session:
-        known = blobs.find(session, project_id, sha256)
+    known = _find(database, project_id, sha256)
     if known is not None:
         path.unlink()
         return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key)
     key = blobs.new_key(project_id, sha256)
     started(key)
-    artifacts.adopt(path, key, sha256)
+    artifacts.adopt(path, key, sha256, synced=synced)
     return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key)
+
+
+def _find(database: Database, project_id: str, sha256: str) -> Blob | None:
+    """The project's blob of this content. Most contents are new, and these need not wait for the writers' turn."""
+    with database.read() as session:
+        if not blobs.exists(session, project_id, sha256):
+            return None
+    with database.write() as session:
+        return blobs.find(session, project_id, sha256)
 
 
 @contextlib.contextmanager
@@ -95,7 +107,7 @@ class Storing:
         self._new: list[str] = []
 
     def __call__(self, path: Path, *, sha256: str, size_bytes: int) -> StoredFile:
-        """Store a file as `store_file` does."""
+        """Store a file of the spool, whose bytes are on the disk, as `store_file` does."""
         return store_file(
             self._database,
             self._artifacts,
@@ -103,8 +115,14 @@ class Storing:
             path=path,
             sha256=sha256,
             size_bytes=size_bytes,
+            synced=True,
             started=self._new.append,
         )
+
+    def recorded(self, key: str) -> None:
+        """Note that a transaction that has committed names this object."""
+        if key in self._new:
+            self._new.remove(key)
 
     def take_back(self) -> None:
         """Remove the objects that no blob names: nobody else knows their keys."""

@@ -95,11 +95,13 @@ def request_sha256(request: Request, raw: bytes) -> str:
 documented: dict[str, type[BaseModel]] = {}
 
 
-def describe(model: type[BaseModel]) -> dict[str, Any]:
-    """`openapi_extra` of a route whose body is `model`."""
+def describe(model: type[BaseModel], example: dict[str, Any] | None = None) -> dict[str, Any]:
+    """`openapi_extra` of a route whose body is `model`; the model's own examples are shown where none is given."""
     documented[model.__name__] = model
-    reference = {"$ref": f"#/components/schemas/{model.__name__}"}
-    return {"requestBody": {"required": True, "content": {"application/json": {"schema": reference}}}}
+    content: dict[str, Any] = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
+    if example is not None:
+        content["example"] = example
+    return {"requestBody": {"required": True, "content": {"application/json": content}}}
 
 
 def describe_answer(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:

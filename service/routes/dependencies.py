@@ -154,6 +154,7 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
         405: "The resource has no such method",
         409: "The resource is not in the right state; the problem says what to do",
         413: "Too large, or the storage quota is full",
+        415: "The bytes are of no kind that is taken here",
         416: "The range lies outside the file",
         422: "The request or the drive is at fault; all defects are listed",
         429: "A quota is full; try later",

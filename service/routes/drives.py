@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from schemas.api.common import Finding, Page
-from schemas.api.drives import DriveResource, DriveState, PreflightResource
+from schemas.api.drives import EXAMPLE_MANIFEST, DriveResource, DriveState, PreflightResource
 from schemas.drive import DriveManifest
 from service.context import Context
 from service.errors import ServiceError
@@ -45,7 +45,7 @@ read_manifest = json_body(DriveManifest, lambda request: get_context(request).se
     status_code=201,
     response_model=DriveResource,
     responses=problems(401, 409, 413, 422, 429, 507),
-    openapi_extra=describe(DriveManifest),
+    openapi_extra=describe(DriveManifest, EXAMPLE_MANIFEST),
 )
 async def create_drive(
     once: OnceDep, caller: CallerDep, context: ContextDep, body: Annotated[Body[DriveManifest], Depends(read_manifest)]

@@ -137,7 +137,7 @@ def delete_file(drive_id: str, path: str, caller: CallerDep, context: ContextDep
 
 @router.put(
     "/archive",
-    responses=problems(400, 401, 404, 409, 413, 422, 507),
+    responses=problems(400, 401, 404, 409, 413, 415, 422, 507),
     openapi_extra=describe_bytes(
         "a zip, tar, tar.gz, tar.bz2 or tar.xz of files under the names that the manifest gives"
     ),
@@ -211,9 +211,9 @@ def _keep(
         stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
         with context.database.write() as session:
             drive = drives.get(session, project_id, drive_id, lock=True)
-            new = drives.attach(session, drive, path, stored, replace=replace)
-            file = drives.require_file(session, drive, path)
-            return new, _shown(file, session.get_one(Blob, file.blob_id))
+            new, file, blob = drives.attach(session, drive, path, stored, replace=replace)
+        store.recorded(blob.key)
+        return new, _shown(file, blob)
 
 
 def _unpack(context: Context, project_id: str, drive_id: str, archive: Spooled, replace: bool) -> StoredFiles:

@@ -108,7 +108,8 @@ def _workers(session: Session) -> list[WorkerStatus]:
 
 def _queue(session: Session, context: Context) -> QueueStatus:
     silent = Job.heartbeat_us < now_us() - int(context.settings.stalled_seconds * 1e6)
-    counts = dict(session.execute(select(Job.state, func.count()).group_by(Job.state)).tuples().all())
+    by_state = select(Job.state, func.count()).group_by(Job.state)
+    counts: dict[str, int] = {row[0]: row[1] for row in session.execute(by_state)}
     stalled = select(func.count()).select_from(Job).where(Job.state == JobState.RUNNING, silent)
     return QueueStatus(
         queued=counts.get(JobState.QUEUED, 0),

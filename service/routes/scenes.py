@@ -73,7 +73,12 @@ def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> None:
         session.execute(delete(Scene).where(Scene.id == scene_id))
 
 
-@router.head("/{scene_id}/files/{path:path}", include_in_schema=False)
+@router.head(
+    "/{scene_id}/files/{path:path}",
+    response_class=Response,
+    summary="Download's headers",
+    responses={200: {"description": "What a download would answer"}, 304: _DOWNLOADS[304], **problems(401, 404)},
+)
 @router.get(
     "/{scene_id}/files/{path:path}",
     response_class=Response,

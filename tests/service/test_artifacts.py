@@ -1,0 +1,153 @@
+"""The artifact store, in a folder and in S3."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import boto3
+import pytest
+
+from service.persistence.artifacts import ArtifactStore, content_mtime_ns
+from service.settings import Settings
+from tests.service.live_api import HOST, free_port, settings_of, wait_until
+
+CONTENT = os.urandom(3_000_000)
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+KEY = f"blobs/prj_1/{SHA256[:2]}/{SHA256}-0001"
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint() -> Iterator[str]:
+    """An S3 server on loopback."""
+    port = free_port()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "moto.server", "-H", HOST, "-p", str(port)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+    def listens() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex((HOST, port)) == 0
+
+    try:
+        wait_until(listens, "the S3 server's start")
+        yield f"http://{HOST}:{port}"
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(params=["folder", "s3"])
+def store_settings(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    if request.param == "folder":
+        return settings_of(tmp_path / "data")
+    endpoint = request.getfixturevalue("s3_endpoint")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+    bucket = tmp_path.name.lower().replace("_", "-")[:60]
+    boto3.client("s3", endpoint_url=endpoint, region_name="us-east-1").create_bucket(Bucket=bucket)
+    return settings_of(tmp_path / "data", artifacts_url=f"s3://{bucket}/prefix", s3_endpoint=endpoint)
+
+
+@pytest.fixture
+def store(store_settings: Settings) -> ArtifactStore:
+    return ArtifactStore(store_settings)
+
+
+@pytest.fixture
+def stored(store: ArtifactStore, tmp_path: Path) -> ArtifactStore:
+    """A store with one object."""
+    put(store, tmp_path / "scratch", CONTENT, KEY)
+    return store
+
+
+def put(store: ArtifactStore, path: Path, content: bytes, key: str) -> None:
+    path.write_bytes(content)
+    store.adopt(path, key, hashlib.sha256(content).hexdigest())
+    assert not path.exists()
+
+
+def read(store: ArtifactStore, start: int, stop: int) -> bytes:
+    async def collect() -> bytes:
+        return b"".join([piece async for piece in store.stream(KEY, start=start, stop=stop)])
+
+    return asyncio.run(collect())
+
+
+def test_what_was_stored_is_read_again(stored: ArtifactStore) -> None:
+    assert stored.read(KEY) == CONTENT
+    assert [item.key for item in stored.objects()] == [KEY]
+
+
+@pytest.mark.parametrize(
+    ("start", "stop"), [(0, 1), (0, len(CONTENT)), (1_048_575, 1_048_577), (len(CONTENT) - 1, len(CONTENT)), (5, 5)]
+)
+def test_parts_are_streamed(stored: ArtifactStore, start: int, stop: int) -> None:
+    assert read(stored, start, stop) == CONTENT[start:stop]
+
+
+def test_a_fetched_file_depends_on_its_content_alone(stored: ArtifactStore, tmp_path: Path) -> None:
+    targets = [tmp_path / "one", tmp_path / "two"]
+    for target in targets:
+        stored.fetch(KEY, target, SHA256)
+        assert target.read_bytes() == CONTENT
+        assert target.stat().st_mtime_ns == content_mtime_ns(SHA256)
+        assert target.stat().st_mode & 0o222 == 0, "a stage cannot change what is stored"
+        target.unlink()
+    assert stored.read(KEY) == CONTENT
+
+
+def test_what_is_not_there(store: ArtifactStore, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        store.read(KEY)
+    with pytest.raises(FileNotFoundError):
+        store.fetch(KEY, tmp_path / "x", SHA256)
+    assert not (tmp_path / "x").exists()
+    with pytest.raises(FileNotFoundError):
+        read(store, 0, 5)
+    store.delete([KEY])
+
+
+def test_deleted_objects_are_gone(stored: ArtifactStore, tmp_path: Path) -> None:
+    put(stored, tmp_path / "b", b"b", "blobs/other")
+    stored.delete([KEY, "blobs/never"])
+    assert [item.key for item in stored.objects()] == ["blobs/other"]
+
+
+def test_objects_say_when_they_came(stored: ArtifactStore) -> None:
+    (item,) = stored.objects()
+    assert item.changed_us > 1_700_000_000_000_000, "not the time that is made of the content"
+
+
+def test_a_store_that_can_be_written(store: ArtifactStore) -> None:
+    store.require_writable()
+    assert list(store.objects()) == []
+
+
+def test_a_folder_on_another_disk(tmp_path: Path) -> None:
+    """Where a rename is not possible the bytes are copied, and the copy is whole or not there."""
+    other = Path("/dev/shm")
+    if not other.is_dir() or other.stat().st_dev == tmp_path.stat().st_dev:
+        pytest.skip("no second file system")
+    scratch = other / f"adopted-{os.getpid()}"
+    store = ArtifactStore(settings_of(tmp_path / "data"))
+    put(store, scratch, CONTENT, KEY)
+    assert store.read(KEY) == CONTENT
+    assert [item.key for item in store.objects()] == [KEY]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    store = ArtifactStore(settings_of(tmp_path / "data"))
+    assert store.folder is not None
+    store.folder.rmdir()
+    store.folder.write_bytes(b"a file in its place")
+    with pytest.raises(OSError, match="directory"):
+        store.require_writable()

@@ -1,0 +1,142 @@
+"""Which bytes belong to whom, how many they are, and when they may go; on both databases."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+from sqlalchemy import select, update
+
+from service.errors import ServiceError
+from service.persistence import blobs
+from service.persistence.database import Database
+from service.persistence.keys import create_project
+from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Job, Project, Scene, SceneFile, now_us
+from service.settings import Settings
+
+EVER_US = 2**62
+
+
+@pytest.fixture
+def project_id(database: Database, database_settings: Settings) -> str:
+    with database.write() as session:
+        project = create_project(session, "test", database_settings)
+        project.max_bytes = 100
+        return project.id
+
+
+def record(database: Database, project_id: str, name: str, size_bytes: int = 10, **options: Any) -> str:
+    with database.write() as session:
+        key = blobs.new_key(project_id, name * 64)
+        blob = blobs.record(session, project_id=project_id, sha256=name * 64, size_bytes=size_bytes, key=key, **options)
+        return blob.id
+
+
+def used(database: Database, project_id: str) -> int:
+    with database.read() as session:
+        return session.get_one(Project, project_id).used_bytes
+
+
+def forget(database: Database, before_us: int = EVER_US) -> int:
+    with database.write() as session:
+        return len(blobs.forget_unused(session, untouched_since_us=before_us))
+
+
+def test_a_content_is_counted_once(database: Database, project_id: str) -> None:
+    assert record(database, project_id, "a") == record(database, project_id, "a")
+    assert used(database, project_id) == 10
+
+
+def test_the_quota_holds_to_the_byte(database: Database, project_id: str) -> None:
+    record(database, project_id, "a", 90)
+    with pytest.raises(ServiceError) as refused:
+        record(database, project_id, "b", 11)
+    assert (refused.value.status, refused.value.code) == (413, "quota-full")
+    assert used(database, project_id) == 90
+    record(database, project_id, "c", 10)
+    record(database, project_id, "a", 90)
+    record(database, project_id, "d", 5, within_quota=False)
+    assert used(database, project_id) == 105
+
+
+def test_the_last_bytes_are_given_once(database: Database, project_id: str) -> None:
+    results: list[object] = []
+
+    def take(name: str) -> None:
+        try:
+            results.append(record(database, project_id, name, 60))
+        except ServiceError as error:
+            results.append(error.status)
+
+    threads = [threading.Thread(target=take, args=(name,)) for name in "abcdef"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(map(str, results))[:5] == ["413"] * 5
+    assert used(database, project_id) == 60
+
+
+def test_forgetting_gives_the_space_back(database: Database, project_id: str) -> None:
+    for name in "abc":
+        record(database, project_id, name)
+    assert forget(database, now_us() - 3_600_000_000) == 0, "touched lately"
+    assert forget(database) == 3
+    assert used(database, project_id) == 0
+    assert forget(database) == 0
+
+
+def test_what_is_referred_to_is_never_forgotten(database: Database, project_id: str) -> None:
+    manifest, file, scene_file, checkpoint = (record(database, project_id, name) for name in "abcd")
+    with database.write() as session:
+        drive = Drive(
+            project_id=project_id,
+            name="d",
+            manifest_blob_id=manifest,
+            cameras=1,
+            frames=1,
+            files_expected=1,
+            has_gnss=False,
+        )
+        job = Job(project_id=project_id, kind="RECONSTRUCTION", drive_id="drv_0")
+        session.add_all([drive, job])
+        session.flush()
+        scene = Scene(project_id=project_id, job_id=job.id, drive_id=drive.id, name="s", fence=1, summary={})
+        session.add(scene)
+        session.flush()
+        session.add(DriveFile(drive_id=drive.id, path="a", role="image", blob_id=file))
+        session.add(SceneFile(scene_id=scene.id, path="a", blob_id=scene_file, media_type="x/y"))
+        session.add(Checkpoint(drive_id=drive.id, settings_sha256="0" * 64, name="n", blob_id=checkpoint))
+    record(database, project_id, "e")
+    assert forget(database) == 1
+    with database.read() as session:
+        assert set(session.scalars(select(Blob.id))) == {manifest, file, scene_file, checkpoint}
+    with database.write() as session:
+        session.delete(session.get_one(Drive, drive.id))
+    assert forget(database) == 3, "the drive's file and checkpoint went with it"
+    with database.write() as session:
+        session.delete(session.get_one(Scene, scene.id))
+    assert forget(database) == 1
+    assert used(database, project_id) == 0
+
+
+def test_a_content_that_is_found_is_not_forgotten_meanwhile(database: Database, project_id: str) -> None:
+    record(database, project_id, "a")
+    with database.write() as session:
+        session.execute(update(Blob).values(touched_us=1))
+    with database.write() as session:
+        assert blobs.find(session, project_id, "a" * 64) is not None
+    assert forget(database, now_us() - 3_600_000_000) == 0
+
+
+def test_many_store_one_content_at_once(database: Database, project_id: str) -> None:
+    found: list[str] = []
+    threads = [threading.Thread(target=lambda: found.append(record(database, project_id, "a"))) for _ in range(10)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 10
+    assert len(set(found)) == 1
+    assert used(database, project_id) == 10

@@ -1,0 +1,252 @@
+"""The files of a drive: sent once, whole, under the names of the manifest."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import threading
+from urllib.parse import quote
+
+import httpx
+import pytest
+
+from tests.service.live_api import Api, Client, forget_all, problem_of
+from tests.service.tiny_drive import TinyDrive, png, png_of, tiny_drive, zip_of
+
+
+def digest(data: bytes) -> str:
+    return f"sha-256=:{base64.b64encode(hashlib.sha256(data).digest()).decode()}:"
+
+
+@pytest.fixture
+def drive() -> TinyDrive:
+    return tiny_drive()
+
+
+@pytest.fixture
+def drive_id(client: Client, drive: TinyDrive) -> str:
+    return client.create(drive)
+
+
+def put(client: Client, drive_id: str, path: str, data: bytes, **options: str) -> httpx.Response:
+    headers = {"Content-Digest": options.pop("digest")} if "digest" in options else {}
+    return client.put(f"/v1/drives/{drive_id}/files/{quote(path)}", content=data, params=options, headers=headers)
+
+
+def test_a_file_is_stored_once(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    path, data = next(iter(drive.files.items()))
+    first = put(client, drive_id, path, data, digest=digest(data))
+    assert first.status_code == 201
+    assert first.json() == {
+        "path": path,
+        "role": "image",
+        "stored": True,
+        "size_bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    again = put(client, drive_id, path, data)
+    assert (again.status_code, again.json()) == (200, first.json())
+    shown = client.get(f"/v1/drives/{drive_id}").json()
+    assert (shown["files_stored"], shown["bytes_stored"]) == (1, len(data))
+    assert len(client.api.objects(client.project_id)) == 2, "the manifest and the file"
+
+
+def test_files_are_listed_by_path_and_by_being_there(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    here = sorted(drive.files)[2]
+    put(client, drive_id, here, drive.files[here])
+
+    def listed(**params: str) -> list[str]:
+        found, cursor = [], None
+        while True:
+            given = params | ({"cursor": cursor} if cursor else {}) | {"limit": "4"}
+            page = client.get(f"/v1/drives/{drive_id}/files", params=given).json()
+            found += [file["path"] for file in page["items"]]
+            cursor = page["next"]
+            if cursor is None:
+                return found
+
+    assert listed() == sorted(drive.files)
+    assert listed(stored="true") == [here]
+    assert listed(stored="false") == sorted(set(drive.files) - {here})
+
+
+def test_other_bytes_replace_only_when_asked_to(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    path, data = next(iter(drive.files.items()))
+    other = png(seed="other")
+    put(client, drive_id, path, data)
+    problem = problem_of(put(client, drive_id, path, other), 409, "file-exists")
+    assert hashlib.sha256(data).hexdigest() in problem["detail"]
+    assert len(client.api.objects(client.project_id)) == 2, "the refused bytes are not kept"
+    answer = put(client, drive_id, path, other, replace="true")
+    assert (answer.status_code, answer.json()["sha256"]) == (201, hashlib.sha256(other).hexdigest())
+
+
+def test_a_file_that_was_deleted_can_be_sent_again(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    path, data = next(iter(drive.files.items()))
+    put(client, drive_id, path, data)
+    url = f"/v1/drives/{drive_id}/files/{path}"
+    assert client.delete(url).status_code == 204
+    assert client.delete(url).status_code == 204, "repeating it changes nothing"
+    assert client.get(f"/v1/drives/{drive_id}").json()["files_stored"] == 0
+    assert put(client, drive_id, path, png(seed="other")).status_code == 201
+
+
+@pytest.mark.parametrize(
+    "path", ["no.png", "front/000000.PNG", "../000000.png", "front//000000.png", "a\0b", "ÿ\u2028.png"]
+)
+def test_a_name_that_the_manifest_does_not_have(client: Client, drive_id: str, path: str) -> None:
+    url = f"/v1/drives/{drive_id}/files/{quote(path).replace('..', '%2E%2E')}"
+    problem = problem_of(client.put(url, content=png()), 422, "not-in-manifest")
+    assert repr(path) in problem["detail"]
+    problem_of(client.delete(url), 422, "not-in-manifest")
+    assert client.api.spooled() == []
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"", "empty-file"),
+        (b"GIF89a", "not-an-image"),
+        (png()[:20], "damaged-image"),
+        (png_of(60_000, 60_000, b""), "image-too-large"),
+        (b"\x89PNG\r\n\x1a\n" + b"\xff" * 60, "damaged-image"),
+    ],
+)
+def test_what_is_no_image_of_a_camera(client: Client, drive: TinyDrive, drive_id: str, data: bytes, code: str) -> None:
+    path = next(iter(drive.files))
+    problem = problem_of(put(client, drive_id, path, data), 422, code)
+    assert path in problem["detail"]
+    assert client.api.spooled() == []
+    assert len(client.api.objects(client.project_id)) == 1, "only the manifest"
+
+
+def test_bytes_that_are_not_those_announced(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    path, data = next(iter(drive.files.items()))
+    problem_of(put(client, drive_id, path, data, digest=digest(b"other")), 422, "wrong-digest")
+    for malformed in ("sha-256=x", "sha-256=:AAAA:", ":", "sha-256=:%%%:"):
+        problem_of(put(client, drive_id, path, data, digest=malformed), 400, "malformed-digest")
+    assert client.get(f"/v1/drives/{drive_id}").json()["files_stored"] == 0
+    assert client.api.spooled() == []
+
+
+def test_a_known_content_need_not_be_sent_again(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    client.send_files(drive_id, drive)
+    again = client.create(tiny_drive("again"))
+    answer = client.post(f"/v1/drives/{again}/files:declare", json=drive.declaration)
+    assert answer.json() == {"stored": list(drive.files), "to_send": []}
+    assert client.post(f"/v1/drives/{again}:commit").status_code == 200
+
+
+def test_nothing_is_known_of_another_project(api: Api, client: Client, drive: TinyDrive, drive_id: str) -> None:
+    client.send_files(drive_id, drive)
+    other = api.client()
+    own = other.create(drive)
+    answer = other.post(f"/v1/drives/{own}/files:declare", json=drive.declaration)
+    assert answer.json() == {"stored": [], "to_send": list(drive.files)}
+    other.send_files(own, drive)
+    assert not set(api.objects(client.project_id)) & set(api.objects(other.project_id))
+
+
+def test_a_declaration_says_what_is_wrong_with_it(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    url = f"/v1/drives/{drive_id}/files:declare"
+    wrong_size = drive.declaration
+    client.send_files(drive_id, drive)
+    other = client.create(drive)
+    wrong_size["files"][0]["size_bytes"] += 1
+    answer = client.post(f"/v1/drives/{other}/files:declare", json=wrong_size).json()
+    assert answer["to_send"] == [wrong_size["files"][0]["path"]], "same digest, another size: not believed"
+    unknown = {"files": [{"path": "no.png", "size_bytes": 1, "sha256": "0" * 64}]}
+    problem_of(client.post(url, json=unknown), 422, "not-in-manifest")
+    for wrong in ({"files": []}, {"files": [{**unknown["files"][0], "sha256": "A" * 64}]}, {}, {"files": "x"}):
+        problem_of(client.post(url, json=wrong), 422, "invalid-document")
+    too_many = {"files": unknown["files"] * 10_001}
+    problem_of(client.post(url, json=too_many), 422, "invalid-document")
+
+
+def test_an_archive_brings_all_files(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    content = zip_of({f"top/{path}": data for path, data in {**drive.files, "drive.json": drive.raw}.items()})
+    answer = client.put(f"/v1/drives/{drive_id}/archive", content=content)
+    assert answer.json() == {"stored": 6, "files_stored": 6, "files_expected": 6}
+    again = client.put(f"/v1/drives/{drive_id}/archive", content=content, headers={"Content-Digest": digest(content)})
+    assert again.status_code == 200
+    assert client.api.spooled() == []
+
+
+def test_an_archive_with_one_conflict_changes_nothing(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    path = sorted(drive.files)[-1]
+    put(client, drive_id, path, png(seed="other"))
+    objects = client.api.objects(client.project_id)
+    answer = client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped())
+    assert path in problem_of(answer, 409, "file-exists")["detail"]
+    assert client.get(f"/v1/drives/{drive_id}").json()["files_stored"] == 1
+    assert client.api.objects(client.project_id) == objects
+    assert client.api.spooled() == []
+    replaced = client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped(), params={"replace": "true"})
+    assert replaced.json()["files_stored"] == 6
+
+
+def test_two_clients_write_one_file(api: Api, client: Client, drive: TinyDrive) -> None:
+    """Exactly one wins, the other is told so, and the file is one of the two."""
+    contents = [png(seed="a"), png(seed="b")]
+    path = next(iter(drive.files))
+    for _ in range(5):
+        drive_id = client.create(drive)
+        barrier = threading.Barrier(2)
+        answers: list[httpx.Response] = []
+
+        def write(data: bytes, drive_id: str = drive_id, barrier: threading.Barrier = barrier) -> None:
+            own = api.client_of(client.project_id, client.key)
+            barrier.wait()
+            answers.append(put(own, drive_id, path, data))  # noqa: B023 (joined below)
+
+        threads = [threading.Thread(target=write, args=(data,)) for data in contents]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(answer.status_code for answer in answers) == [201, 409]
+        (won,) = (answer.json()["sha256"] for answer in answers if answer.status_code == 201)
+        (shown,) = client.get(f"/v1/drives/{drive_id}/files", params={"stored": "true"}).json()["items"]
+        assert shown["sha256"] == won
+        (stored,) = (path for path in api.objects(client.project_id) if path.name.startswith(won))
+        assert stored.read_bytes() in contents
+        assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
+        api.context.artifacts.delete(forget_all(api))
+
+
+def test_many_clients_send_the_same_content_at_once(api: Api, client: Client, drive: TinyDrive) -> None:
+    """It is stored once, counted once, and every drive has it."""
+    path, data = next(iter(drive.files.items()))
+    drive_ids = [client.create(drive) for _ in range(8)]
+    used = api.project(client.project_id).used_bytes
+    statuses: list[int] = []
+
+    def write(drive_id: str) -> None:
+        own = api.client_of(client.project_id, client.key)
+        statuses.append(put(own, drive_id, path, data).status_code)
+
+    threads = [threading.Thread(target=write, args=(drive_id,)) for drive_id in drive_ids]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert statuses == [201] * 8
+    assert api.project(client.project_id).used_bytes == used + len(data)
+    sha256 = hashlib.sha256(data).hexdigest()
+    assert len([path for path in api.objects(client.project_id) if path.name.startswith(sha256)]) == 1
+
+
+def test_a_full_quota_refuses_and_deleting_frees_it(api: Api, drive: TinyDrive) -> None:
+    path, data = next(iter(drive.files.items()))
+    client = api.client(max_bytes=len(drive.raw) + len(data) - 1)
+    drive_id = client.create(drive)
+    problem = problem_of(put(client, drive_id, path, data), 413, "quota-full")
+    assert str(len(data)) in problem["detail"]
+    problem_of(client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped()), 413, "quota-full")
+    problem_of(client.post("/v1/drives", content=tiny_drive("second").raw * 1), 413, "quota-full")
+    assert len(api.objects(client.project_id)) == 1, "nothing of what was refused stays"
+    client.delete(f"/v1/drives/{drive_id}")
+    api.context.artifacts.delete(forget_all(api))
+    assert api.project(client.project_id).used_bytes == 0
+    assert api.objects(client.project_id) == []
+    client.create(drive)

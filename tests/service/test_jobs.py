@@ -1,0 +1,293 @@
+"""Jobs over HTTP: shown, listed, cancelled, retried, and told about as they go."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from schemas.api.problems import PROBLEM_TYPE, Problem
+from service.persistence import jobs
+from service.persistence.tables import Job, now_us
+from tests.service.conftest import StartApi
+from tests.service.live_api import Api, Client, problem_of, wait_until
+
+LEASE_US = 60_000_000
+BROKEN = Problem(type=PROBLEM_TYPE + "engine-abort", title="Aborted", detail="it", remedy="Look.", retryable=False)
+
+
+@pytest.fixture(scope="module")
+def drive_id(owner: Client) -> str:
+    return owner.committed()
+
+
+@pytest.fixture(scope="module")
+def owner(api: Api) -> Client:
+    return api.client()
+
+
+@pytest.fixture
+def job(owner: Client, drive_id: str) -> dict[str, Any]:
+    return owner.reconstruct(drive_id)
+
+
+def note(percent: float, stage: str = "matches") -> jobs.ProgressNote:
+    return jobs.ProgressNote(
+        stage=stage, done=1, total=2, unit="pairs", percent=percent, eta_low_s=1.0, eta_high_s=2.0, reused=("features",)
+    )
+
+
+def beat(client: Client, held: jobs.Claim, percent: float) -> bool:
+    with client.api.database.write() as session:
+        return jobs.heartbeat(session, held, lease_us=LEASE_US, note=note(percent))
+
+
+def fail(client: Client, held: jobs.Claim) -> None:
+    with client.api.database.write() as session:
+        jobs.fail(session, held, BROKEN, max_attempts=3, retry_delay_us=0)
+
+
+def test_a_new_job_waits_and_says_where_to_look(owner: Client, drive_id: str) -> None:
+    settings = {"use_gnss": False, "seed": 7}
+    answer = owner.post("/v1/reconstructions", json={"drive_id": drive_id, "settings": settings})
+    shown = answer.json()
+    assert answer.status_code == 202
+    assert answer.headers["location"] == f"/v1/jobs/{shown['id']}"
+    assert int(answer.headers["retry-after"]) > 0
+    assert (shown["state"], shown["kind"], shown["drive_id"]) == ("QUEUED", "RECONSTRUCTION", drive_id)
+    assert shown["settings"] == settings
+    assert owner.get(answer.headers["location"]).json() == shown
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"drive_id": "x", "settings": {"seed": -1}},
+        {"drive_id": "DRV!"},
+        {"drive_id": 5},
+        {"drive_id": "x", "other": 1},
+        {"drive_id": "x", "settings": {"max_keypoints": 1.5}},
+        {"drive_id": "x", "settings": {"use_gnss": "yes"}},
+        [],
+        None,
+    ],
+)
+def test_a_request_that_makes_no_sense(owner: Client, body: Any) -> None:
+    problem = problem_of(owner.post("/v1/reconstructions", json=body), 422, "invalid-document")
+    assert problem["errors"]
+
+
+def test_progress_is_shown_and_polling_costs_nothing_where_nothing_changed(owner: Client, job: dict[str, Any]) -> None:
+    url = f"/v1/jobs/{job['id']}"
+    first = owner.get(url)
+    assert first.headers["retry-after"]
+    assert owner.get(url, headers={"If-None-Match": first.headers["etag"]}).status_code == 304
+    held = owner.claim(job["id"])
+    second = owner.get(url, headers={"If-None-Match": first.headers["etag"]})
+    assert (second.status_code, second.json()["state"]) == (200, "RUNNING")
+    beat(owner, held, 33.5)
+    third = owner.get(url, headers={"If-None-Match": second.headers["etag"]})
+    progress = third.json()["progress"]
+    assert progress == {
+        "stage": "matches",
+        "done": 1,
+        "total": 2,
+        "unit": "pairs",
+        "percent": 33.5,
+        "eta_low_s": 1.0,
+        "eta_high_s": 2.0,
+        "reused_stages": ["features"],
+    }
+    unchanged = owner.get(url, headers={"If-None-Match": f'W/{third.headers["etag"]}, "x"'})
+    assert (unchanged.status_code, unchanged.content) == (304, b"")
+    assert third.json()["attempts"][0]["worker"] == "worker@test"
+
+
+def test_a_silent_job_is_shown_as_stalled(owner: Client, job: dict[str, Any]) -> None:
+    owner.claim(job["id"])
+    url = f"/v1/jobs/{job['id']}"
+    running = owner.get(url)
+    with owner.api.database.write() as session:
+        session.get_one(Job, job["id"]).heartbeat_us = now_us() - 3_600_000_000
+    stalled = owner.get(url, headers={"If-None-Match": running.headers["etag"]})
+    assert stalled.json()["state"] == "STALLED"
+    assert owner.get("/v1/status").json()["queue"]["stalled"] >= 1
+
+
+def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
+    client = api.client()
+    first, second = client.committed(), client.committed()
+    made = [client.reconstruct(first)["id"] for _ in range(3)]
+    client.reconstruct(second)
+    page = client.get("/v1/jobs", params={"drive_id": first, "limit": 2}).json()
+    rest = client.get("/v1/jobs", params={"drive_id": first, "limit": 10, "cursor": page["next"]}).json()
+    check = client.get(f"/v1/drives/{first}").json()["preflight_job_id"]
+    assert [shown["id"] for shown in (*page["items"], *rest["items"])] == [*made[::-1], check]
+    assert len(client.get("/v1/jobs").json()["items"]) == 6
+
+
+def test_cancelling_a_waiting_job_ends_it_with_no_worker(owner: Client, job: dict[str, Any]) -> None:
+    url = f"/v1/jobs/{job['id']}"
+    answer = owner.post(f"{url}:cancel")
+    assert (answer.status_code, answer.json()["state"]) == (202, "CANCELLED")
+    assert answer.json()["finished_at"] is not None
+    again = owner.post(f"{url}:cancel")
+    assert (again.status_code, again.json()["state"]) == (202, "CANCELLED")
+    assert "retry-after" not in owner.get(url).headers
+
+
+def test_cancelling_a_running_job_tells_its_worker(owner: Client, job: dict[str, Any]) -> None:
+    held = owner.claim(job["id"])
+    assert not beat(owner, held, 1.0)
+    answer = owner.post(f"/v1/jobs/{job['id']}:cancel").json()
+    assert (answer["state"], answer["cancel_requested"]) == ("RUNNING", True)
+    assert beat(owner, held, 2.0)
+    with owner.api.database.write() as session:
+        jobs.cancelled(session, held)
+    assert owner.get(f"/v1/jobs/{job['id']}").json()["state"] == "CANCELLED"
+
+
+def test_what_has_ended_is_not_cancelled(owner: Client, job: dict[str, Any]) -> None:
+    held = owner.claim(job["id"])
+    fail(owner, held)
+    problem_of(owner.post(f"/v1/jobs/{job['id']}:cancel"), 409, "job-ended")
+    shown = owner.get(f"/v1/jobs/{job['id']}").json()
+    assert shown["problem"]["type"] == BROKEN.type
+    assert shown["attempts"][0]["outcome"] == "engine-abort"
+
+
+def test_a_failed_job_is_retried_as_a_new_one(owner: Client, job: dict[str, Any], drive_id: str) -> None:
+    url = f"/v1/jobs/{job['id']}"
+    problem_of(owner.post(f"{url}:retry"), 409, "job-not-failed")
+    fail(owner, owner.claim(job["id"]))
+    answer = owner.post(f"{url}:retry")
+    new = answer.json()
+    assert (answer.status_code, new["state"], new["retry_of"]) == (202, "QUEUED", job["id"])
+    assert answer.headers["location"] == f"/v1/jobs/{new['id']}"
+    assert (new["drive_id"], new["settings"]) == (drive_id, job["settings"])
+    assert owner.get(url).json()["state"] == "FAILED"
+
+
+def test_a_job_whose_drive_is_gone_is_not_retried(owner: Client) -> None:
+    drive_id = owner.committed()
+    job = owner.reconstruct(drive_id)
+    owner.post(f"/v1/jobs/{job['id']}:cancel")
+    owner.delete(f"/v1/drives/{drive_id}")
+    problem_of(owner.post(f"/v1/jobs/{job['id']}:retry"), 409, "drive-deleted")
+
+
+def test_a_retried_job_is_kept_as_long_as_a_new_one(start_api: StartApi) -> None:
+    client = start_api(job_retention_days=1).client()
+    job = client.reconstruct(client.committed())
+    client.post(f"/v1/jobs/{job['id']}:cancel")
+    with client.api.database.write() as session:
+        session.get_one(Job, job["id"]).expires_us = now_us() + 1_000_000
+    new = client.post(f"/v1/jobs/{job['id']}:retry").json()
+    assert new["expires_at"][:10] > new["created_at"][:10]
+
+
+def test_the_quota_of_jobs(api: Api) -> None:
+    client = api.client(max_active_jobs=1)
+    drive_id = client.committed()
+    job = client.reconstruct(drive_id)
+    answer = client.post("/v1/reconstructions", json={"drive_id": drive_id})
+    problem_of(answer, 429, "too-many-jobs")
+    assert int(answer.headers["retry-after"]) > 0
+    client.post(f"/v1/jobs/{job['id']}:cancel")
+    client.reconstruct(drive_id)
+    problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 429, "too-many-jobs")
+
+
+def test_the_last_place_is_taken_once(api: Api) -> None:
+    client = api.client(max_active_jobs=1)
+    drive_id = client.committed()
+    statuses: list[int] = []
+
+    def ask() -> None:
+        own = api.client_of(client.project_id, client.key)
+        statuses.append(own.post("/v1/reconstructions", json={"drive_id": drive_id}).status_code)
+
+    threads = [threading.Thread(target=ask) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(statuses) == [202] + [429] * 7
+
+
+def events_of(answer: httpx.Response) -> Iterator[dict[str, Any]]:
+    """Server-sent events, as a browser reads them; comments are left out."""
+    event: dict[str, Any] = {}
+    for line in answer.iter_lines():
+        if line == "" and event:
+            yield event
+            event = {}
+        elif line and not line.startswith(":"):
+            name, _, value = line.partition(": ")
+            event[name] = json.loads(value) if name == "data" else value
+
+
+def read_all(client: Client, job_id: str, **headers: str) -> list[dict[str, Any]]:
+    with client.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as answer:
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        return list(events_of(answer))
+
+
+def test_events_tell_the_whole_story_and_go_on_where_a_reader_stopped(owner: Client, job: dict[str, Any]) -> None:
+    held = owner.claim(job["id"])
+    for percent in (10.0, 20.0):
+        beat(owner, held, percent)
+    scene_id = owner.publish(held, {"a": b"a"})
+    events = read_all(owner, job["id"])
+    assert [(e["event"], e["data"].get("state"), e["data"]["percent"]) for e in events] == [
+        ("state", "QUEUED", 0.0),
+        ("state", "RUNNING", 0.0),
+        ("progress", None, 10.0),
+        ("progress", None, 20.0),
+        ("state", "SUCCEEDED", 100.0),
+    ]
+    assert events[-1]["data"]["scene_id"] == scene_id
+    ids = [int(event["id"]) for event in events]
+    assert ids == sorted(set(ids))
+    for i, event in enumerate(events):
+        assert read_all(owner, job["id"], **{"Last-Event-ID": event["id"]}) == events[i + 1 :]
+
+
+def test_events_come_as_they_happen(owner: Client, job: dict[str, Any]) -> None:
+    seen: list[dict[str, Any]] = []
+
+    def read() -> None:
+        reader = owner.api.client_of(owner.project_id, owner.key)
+        with reader.stream("GET", f"/v1/jobs/{job['id']}/events") as answer:
+            for event in events_of(answer):
+                seen.append(event)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    wait_until(lambda: len(seen) == 1, "the first event")
+    held = owner.claim(job["id"])
+    wait_until(lambda: len(seen) == 2, "the claim's event")
+    owner.post(f"/v1/jobs/{job['id']}:cancel")
+    wait_until(lambda: len(seen) == 3, "the request's event")
+    assert thread.is_alive(), "the stream goes on while the job runs"
+    with owner.api.database.write() as session:
+        jobs.cancelled(session, held)
+    thread.join(30)
+    assert not thread.is_alive(), "the stream ends with the job"
+    assert [event["data"]["state"] for event in seen] == ["QUEUED", "RUNNING", "RUNNING", "CANCELLED"]
+    assert seen[2]["data"]["cancel_requested"] is True
+
+
+@pytest.mark.parametrize("last", ["x", "-1", "1.5", "99999999999999999999"])
+def test_an_event_id_of_another_making(owner: Client, job: dict[str, Any], last: str) -> None:
+    answer = owner.get(f"/v1/jobs/{job['id']}/events", headers={"Last-Event-ID": last})
+    problem_of(answer, 422, "invalid-request")
+
+
+def test_events_of_no_job(owner: Client) -> None:
+    problem_of(owner.get("/v1/jobs/job_0/events"), 404, "not-found")

@@ -1,0 +1,194 @@
+"""Is it alive, ready, well: what operators see."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import event, text
+
+from service.logs import JsonFormatter, log_fields
+from service.persistence import workers
+from service.settings import Settings
+from tests.service.conftest import StartApi
+from tests.service.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of
+
+QUICK_S = 10.0  # generous: a broker that hangs would cost much more
+
+
+def metrics_of(api: Api) -> dict[str, float]:
+    answer = httpx.get(f"{api.url}/metrics", timeout=60)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    samples = (sample for family in text_string_to_metric_families(answer.text) for sample in family.samples)
+    return {f"{sample.name}{json.dumps(sample.labels, sort_keys=True)}": sample.value for sample in samples}
+
+
+def test_alive_and_ready(api: Api) -> None:
+    assert httpx.get(f"{api.url}/livez").json() == {"status": "alive"}
+    assert httpx.get(f"{api.url}/readyz").json() == {"status": "ready"}
+
+
+def test_not_ready_without_the_artifact_store(start_api: StartApi) -> None:
+    api = start_api()
+    folder = api.settings.data_dir / "artifacts"
+    shutil.rmtree(folder)
+    folder.write_bytes(b"")
+    problem = problem_of(httpx.get(f"{api.url}/readyz"), 503, "not-ready")
+    assert "artifact store" in problem["detail"]
+    assert httpx.get(f"{api.url}/livez").status_code == 200
+
+
+def test_not_ready_with_another_schema(start_api: StartApi) -> None:
+    api = start_api()
+    with api.database.write() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = 'other'"))
+    problem = problem_of(httpx.get(f"{api.url}/readyz"), 503, "not-ready")
+    assert "mrasfm migrate" in problem["remedy"]
+
+
+def test_not_ready_where_the_database_lacks_a_table(start_api: StartApi) -> None:
+    api = start_api()
+    with api.database.write() as session:
+        session.execute(text("DROP TABLE workers"))
+    assert "database" in problem_of(httpx.get(f"{api.url}/readyz"), 503, "not-ready")["detail"]
+
+
+def test_not_ready_where_the_database_refuses_writes(database_settings: Settings) -> None:
+    with api_in_thread(database_settings) as api:
+        engine = api.context.database.engine
+        if engine.dialect.name == "postgresql":
+            name = engine.url.database
+            with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+                connection.execute(text(f'ALTER DATABASE "{name}" SET default_transaction_read_only = on'))
+        else:
+            event.listen(engine, "connect", lambda connection, record: connection.execute("PRAGMA query_only=ON"))
+        engine.dispose()  # connections that are opened from now on cannot write
+        assert "database" in problem_of(httpx.get(f"{api.url}/readyz"), 503, "not-ready")["detail"]
+
+
+def test_metrics_go_on_without_a_database(start_api: StartApi) -> None:
+    api = start_api()
+    assert metrics_of(api)["mrasfm_database_up{}"] == 1
+    with api.database.write() as session:
+        session.execute(text("DROP TABLE workers"))
+    metrics = metrics_of(api)
+    assert metrics["mrasfm_database_up{}"] == 0
+    assert any(name.startswith("mrasfm_http_requests_total") for name in metrics)
+
+
+def test_metrics_count(api: Api, client: Client) -> None:
+    before = metrics_of(api)
+    job = client.reconstruct(client.committed())
+    client.get(f"/v1/jobs/{job['id']}")
+    after = metrics_of(api)
+
+    def rise(name: str) -> float:
+        return after.get(name, 0) - before.get(name, 0)
+
+    assert rise('mrasfm_http_requests_total{"method": "GET", "route": "/v1/jobs/{job_id}", "status": "200"}') == 1
+    assert rise('mrasfm_http_request_seconds_count{"method": "POST", "route": "/v1/drives"}') == 1
+    assert rise('mrasfm_jobs{"state": "QUEUED"}') == 2
+    assert rise("mrasfm_received_bytes_total{}") > 1000
+    assert rise("mrasfm_stored_bytes{}") > 1000
+    assert job["id"] not in str(after), "ids are no labels"
+
+
+def test_the_status_says_what_is_missing_and_what_that_means(api: Api, client: Client) -> None:
+    shown = client.get("/v1/status").json()
+    assert (shown["status"], shown["broker"]) == ("degraded", False)
+    assert any("broker" in reason for reason in shown["reasons"])
+    assert any("no worker" in reason for reason in shown["reasons"])
+    with api.database.write() as session:
+        workers.report(session, name="w@test", queues=["checks", "reconstructions"], concurrency=2)
+    shown = client.get("/v1/status").json()
+    (worker,) = (worker for worker in shown["workers"] if worker["name"] == "w@test")
+    assert worker["online"] is True
+    assert not any("no worker" in reason for reason in shown["reasons"])
+
+
+def test_a_log_line_is_one_json_object_with_its_fields() -> None:
+    record = logging.LogRecord("mrasfm", logging.ERROR, "f", 1, "two\nlines %s", ("ü\x00",), None)
+    record.fields = {"attempt": 2}
+    with log_fields(job_id="job_1"):
+        (line,) = JsonFormatter().format(record).splitlines()
+    shown = json.loads(line)
+    assert (shown["message"], shown["job_id"], shown["attempt"], shown["level"]) == (
+        "two\nlines ü\0",
+        "job_1",
+        2,
+        "error",
+    )
+
+
+def test_an_error_of_ours_has_an_id_and_no_details(start_api: StartApi, caplog: pytest.LogCaptureFixture) -> None:
+    api = start_api()
+    client = api.client()
+    scene_id = client.scene({"points.ply": b"ply"})
+    drive_id = client.get(f"/v1/scenes/{scene_id}").json()["drive_id"]
+    for path in api.objects(client.project_id):
+        path.unlink()  # somebody meddled with the store
+    answer = client.get(f"/v1/drives/{drive_id}/manifest")
+    problem = problem_of(answer, 500, "internal-error")
+    assert answer.headers["x-request-id"].startswith("req_")
+    assert "FileNotFoundError" not in str(problem)
+    assert "FileNotFoundError" in caplog.text
+
+
+@contextmanager
+def black_hole() -> Iterator[int]:
+    """A port that accepts connections and never answers."""
+    with socket.socket() as listener:
+        listener.bind((HOST, 0))
+        listener.listen(100)
+        accepted: list[socket.socket] = []
+
+        def accept() -> None:
+            try:
+                while True:
+                    accepted.append(listener.accept()[0])
+            except OSError:
+                return
+
+        thread = threading.Thread(target=accept)
+        thread.start()
+        try:
+            yield listener.getsockname()[1]
+        finally:
+            listener.shutdown(socket.SHUT_RDWR)
+            thread.join()
+            for connection in accepted:
+                connection.close()
+
+
+def accepts_quickly(api: Api) -> None:
+    client = api.client()
+    drive_id = client.committed()
+    for _ in range(5):
+        started_s = time.monotonic()
+        job = client.reconstruct(drive_id)
+        assert time.monotonic() - started_s < QUICK_S
+        assert job["state"] == "QUEUED"
+    started_s = time.monotonic()
+    assert client.get("/v1/status").json()["broker"] is False
+    assert time.monotonic() - started_s < QUICK_S
+    assert httpx.get(f"{api.url}/readyz").status_code == 200, "uploads go on"
+    assert len(client.get("/v1/jobs").json()["items"]) == 6
+
+
+def test_a_broker_that_is_down_holds_nobody_up(start_api: StartApi) -> None:
+    accepts_quickly(start_api(redis_url=f"redis://{HOST}:{free_port()}/0"))
+
+
+def test_a_broker_that_hangs_holds_nobody_up(start_api: StartApi) -> None:
+    with black_hole() as port:
+        accepts_quickly(start_api(redis_url=f"redis://{HOST}:{port}/0"))

@@ -1,0 +1,164 @@
+"""Keys: who may see what, and that no secret is kept or said."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.persistence.database import migrate
+from service.persistence.keys import ensure_first_key, revoke_key
+from service.persistence.tables import ApiKey
+from tests.service.live_api import Api, Client, api_process, problem_of, settings_of
+from tests.service.tiny_drive import tiny_drive
+
+OPEN = {"/livez", "/readyz", "/metrics"}
+BODIES: dict[str, Any] = {
+    "/v1/drives": json.loads(tiny_drive().raw),
+    "/v1/drives/{drive_id}/files:declare": {"files": [{"path": "a", "size_bytes": 1, "sha256": "0" * 64}]},
+}
+
+
+def operations(api: Api) -> list[tuple[str, str]]:
+    """All methods and paths of the OpenAPI page: what is added later is tested too."""
+    page = httpx.get(f"{api.url}/openapi.json").json()
+    return [(method.upper(), path) for path, methods in page["paths"].items() for method in methods]
+
+
+def body_of(path: str, ids: dict[str, str]) -> Any:
+    if path == "/v1/reconstructions":
+        return {"drive_id": ids["drive_id"]}
+    return BODIES.get(path)
+
+
+@pytest.fixture(scope="module")
+def foreign(api: Api) -> dict[str, str]:
+    """Ids of another project's things, all of which exist."""
+    other = api.client()
+    scene_id = other.scene({"points.ply": b"secret"})
+    scene = other.get(f"/v1/scenes/{scene_id}").json()
+    return {"scene_id": scene_id, "drive_id": scene["drive_id"], "job_id": scene["job_id"], "path": "points.ply"}
+
+
+def test_no_route_answers_without_a_key(api: Api, foreign: dict[str, str]) -> None:
+    keyless = api.anonymous()
+    seen = set()
+    for method, path in operations(api):
+        answer = keyless.request(method, path.format(**foreign), json=body_of(path, foreign))
+        if path in OPEN:
+            assert answer.status_code == 200, path
+            seen.add(path)
+            continue
+        assert answer.status_code == 401, (method, path)
+        assert answer.headers["www-authenticate"].startswith("Bearer")
+        if method != "HEAD":
+            problem_of(answer, 401, "unauthorized")
+    assert seen == OPEN
+    for path in ("/docs", "/openapi.json"):
+        assert keyless.get(path).status_code == 200
+
+
+def test_foreign_ids_are_not_found_at_any_route(api: Api, client: Client, foreign: dict[str, str]) -> None:
+    tried = 0
+    for method, path in operations(api):
+        if "{" not in path and path != "/v1/reconstructions":
+            continue
+        tried += 1
+        mine = client.request(method, path.format(**foreign), json=body_of(path, foreign))
+        assert mine.status_code == 404, (method, path, mine.text)
+        unknown = {name: re.sub(r"[0-9a-f]{30}", "0" * 30, value) for name, value in foreign.items()}
+        other = client.request(method, path.format(**unknown), json=body_of(path, unknown))
+        assert other.status_code == 404
+        if method != "HEAD":
+            problem = problem_of(mine, 404, "not-found")
+            assert problem["title"] == other.json()["title"], "existing and missing look alike"
+    assert tried >= 18
+
+
+def test_lists_show_nothing_foreign(client: Client, foreign: dict[str, str]) -> None:
+    for path in ("/v1/drives", "/v1/jobs", "/v1/scenes"):
+        for params in ({}, {"drive_id": foreign["drive_id"]}):
+            assert client.get(path, params=params).json() == {"items": [], "next": None}
+
+
+@pytest.mark.parametrize("row_id", ["", "x", "..", "drv_", "%00", "drv_%00", "ÿ", "drv_" + "f" * 500, "' OR 1=1 --"])
+def test_ids_that_are_none(client: Client, row_id: str) -> None:
+    for path in ("drives", "jobs", "scenes"):
+        answer = client.get(f"/v1/{path}/{row_id}/")
+        assert answer.status_code in (307, 404), answer.text
+        assert client.get(f"/v1/{path}/x{row_id}").status_code == 404
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "",
+        "Bearer",
+        "Bearer wrong",
+        "Basic {key}",
+        "{key}",
+        "Bearer {key}x",
+        "Bearer {key} {key}",
+        "Bearer ÿ",
+        "Bearer " + "a" * 5000,
+    ],
+)
+def test_headers_that_open_nothing(api: Api, client: Client, value: str) -> None:
+    given = value.format(key=client.key).encode("latin-1")
+    answer = httpx.get(f"{api.url}/v1/drives", headers={"Authorization": given})
+    problem_of(answer, 401, "unauthorized")
+    assert client.key not in answer.text
+
+
+def test_a_revoked_key_opens_nothing(api: Api, client: Client) -> None:
+    assert client.get("/v1/drives").status_code == 200
+    with api.database.write() as session:
+        (key,) = session.query(ApiKey).filter_by(project_id=client.project_id)
+        assert revoke_key(session, key.id)
+        assert not revoke_key(session, "key_0")
+    problem_of(client.get("/v1/drives"), 401, "unauthorized")
+
+
+def test_a_key_in_the_address_opens_nothing(api: Api, client: Client) -> None:
+    for name in ("key", "token", "access_token", "api_key"):
+        problem_of(httpx.get(f"{api.url}/v1/drives", params={name: client.key}), 401, "unauthorized")
+
+
+def test_the_first_key_is_made_once(tmp_path: Path) -> None:
+    chosen = settings_of(tmp_path)
+    migrate(chosen)
+    secret = ensure_first_key(chosen)
+    assert secret is not None
+    assert len(secret) > 40
+    assert ensure_first_key(chosen) is None
+
+
+def test_secrets_are_neither_kept_nor_logged(tmp_path: Path) -> None:
+    with api_process(settings_of(tmp_path / "data"), tmp_path) as api:
+        client = api.client()
+        client.create()
+        client.get("/v1/drives/nothing")
+        httpx.get(f"{api.url}/v1/drives", headers={"Authorization": f"Basic {client.key}"})
+        httpx.get(f"{api.url}/v1/drives", headers={"Authorization": f"Bearer {client.key}x"})
+        secret = client.key
+        while_running = [path.read_bytes() for path in (tmp_path / "data").rglob("*") if path.is_file()]
+    kept = while_running + [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()]
+    assert any(b"api_keys" in content for content in kept), "the database is among them"
+    for content in kept:
+        assert secret.encode() not in content
+        assert secret.removeprefix("mrasfm_").encode() not in content
+    lines = [json.loads(line) for line in api.log.read_text().splitlines()]
+    requests = [line for line in lines if line["message"] == "request"]
+    assert {line["status"] for line in requests} >= {200, 201, 401, 404}
+    assert all(line["request_id"].startswith("req_") for line in requests)
+
+
+def test_what_is_stored_is_for_its_owner_alone(api: Api, client: Client) -> None:
+    client.filled()
+    for folder in (api.settings.data_dir / "artifacts", api.settings.spool_dir):
+        assert folder.stat().st_mode & 0o077 == 0, folder
+    assert all(path.stat().st_mode & 0o007 == 0 for path in api.objects(client.project_id))
