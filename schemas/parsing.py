@@ -11,7 +11,9 @@ from pydantic import BaseModel, ValidationError
 from schemas.drive import DriveManifest
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
-MAX_CONTAINERS = 4_000_000  # objects and lists; 100,000 frames of 8 cameras and a million GNSS samples have 3 million
+# 100,000 frames of 8 cameras and a million GNSS samples have 9 million values, in 3 million objects and lists.
+MAX_VALUES = 12_000_000
+MAX_CONTAINERS = 4_000_000
 MAX_PROBLEMS_SHOWN = 5
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -76,11 +78,12 @@ def parse_document(
         raise DocumentError([FieldProblem("", f"has {len(raw)} bytes, over the bound of {max_bytes}")])
     raw = raw.removeprefix(b"\xef\xbb\xbf")
     # An empty object is two bytes on the wire and a hundred in memory.
-    containers = raw.count(b"{") + raw.count(b"[")
-    if containers > MAX_CONTAINERS:
-        raise DocumentError(
-            [FieldProblem("", f"has {containers} objects and lists, over the bound of {MAX_CONTAINERS}")]
-        )
+    for what, count, bound in (
+        ("objects and lists", raw.count(b"{") + raw.count(b"["), MAX_CONTAINERS),
+        ("values", raw.count(b","), MAX_VALUES),
+    ):
+        if count > bound:
+            raise DocumentError([FieldProblem("", f"has {count} {what}, over the bound of {bound}")])
     if strict:
         parse_json(raw)
     try:

@@ -21,6 +21,7 @@ class Context:
     artifacts: ArtifactStore
     wakeups: Wakeups
     disk: anyio.CapacityLimiter  # uploads that write at one time
+    large_documents: anyio.CapacityLimiter  # that are parsed at one time
 
     @classmethod
     def open(cls, settings: Settings) -> Context:
@@ -31,4 +32,5 @@ class Context:
             artifacts=ArtifactStore(settings),
             wakeups=Wakeups(settings),
             disk=anyio.CapacityLimiter(settings.max_concurrent_writes),
+            large_documents=anyio.CapacityLimiter(1),
         )

@@ -82,7 +82,7 @@ class ArtifactStore:
         os.chmod(path, 0o440)
         os.utime(path, ns=(content_mtime_ns(sha256),) * 2)
         target = self._root / key
-        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        _make_durable_folder(target.parent)
         try:
             if not synced:
                 _sync(path)
@@ -214,6 +214,14 @@ def _options(url: str, settings: Settings) -> dict[str, Any]:
         options["endpoint"] = settings.s3_endpoint
         options["client_options"] = {"allow_http": settings.s3_endpoint.startswith("http://")}
     return options
+
+
+def _make_durable_folder(folder: Path) -> None:
+    """Make a folder, and its parents, so that a power cut does not take them."""
+    if not folder.is_dir():
+        _make_durable_folder(folder.parent)
+        folder.mkdir(exist_ok=True, mode=0o700)
+        _sync(folder.parent)
 
 
 def _sync(path: Path) -> None:

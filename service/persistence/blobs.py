@@ -92,8 +92,15 @@ def unused() -> ColumnElement[bool]:
     )
 
 
-def forget_unused(session: Session, *, untouched_since_us: int, limit: int = 500) -> list[str]:
+def forget_unused(
+    session: Session, *, untouched_since_us: int, project_id: str | None = None, limit: int = 500
+) -> list[str]:
     """Drop blobs that nothing refers to, and give their space back to their projects.
+
+    Parameters
+    ----------
+    project_id
+        Of this project only; by default of all.
 
     Returns
     -------
@@ -101,6 +108,8 @@ def forget_unused(session: Session, *, untouched_since_us: int, limit: int = 500
         Keys of objects to delete from the artifact store once this is committed.
     """
     ripe = unused() & (Blob.touched_us < untouched_since_us)
+    if project_id is not None:
+        ripe &= Blob.project_id == project_id
     keys = []
     for blob in session.scalars(select(Blob).where(ripe).limit(limit)).all():
         # Asked again: another transaction may have begun to use it.

@@ -6,6 +6,8 @@ A message only says that a job is waiting. It may be lost, and it may arrive twi
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +23,7 @@ from service.settings import Settings
 TASK = "mrasfm.run_job"
 QUEUES = {JobKind.PREFLIGHT: "checks", JobKind.RECONSTRUCTION: "reconstructions"}
 _ANSWER_WITHIN_S = 2
+_SILENT_FOR_S = 3.0  # a broker that did not answer is not asked again for so long: it would hold up every request
 
 
 def celery_options(settings: Settings) -> dict[str, Any]:
@@ -67,9 +70,12 @@ class Wakeups:
             "max_retries": 0,
         }
         self._url = self._celery.conf.broker_url
+        self._silent_until_s = -math.inf
 
     def send(self, jobs: list[Job]) -> None:
         """Wake a worker up for each of the jobs."""
+        if time.monotonic() < self._silent_until_s:
+            raise BrokerError("the broker did not answer a moment ago")
         try:
             with self._celery.connection_for_write() as connection:
                 connection.ensure_connection(max_retries=1, timeout=_ANSWER_WITHIN_S, interval_start=0)
@@ -84,6 +90,7 @@ class Wakeups:
                             retry=False,
                         )
         except Exception as error:  # kombu lets errors of redis, sockets and its own through
+            self._silent_until_s = time.monotonic() + _SILENT_FOR_S
             raise BrokerError(str(error)) from error
 
     def waiting(self) -> set[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from schemas.parsing import DocumentError, parse_document
 from service.errors import ServiceError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+_LARGE_BYTES = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,10 @@ def json_body(
     async def read(request: Request) -> Body[Model]:
         raw = await read_within(request, max_bytes(request))
         try:
-            return Body(await run_in_threadpool(parse_document, raw, model), raw)
+            # A large one takes ten times its size while it is parsed: these take turns.
+            turn = request.app.state.context.large_documents if len(raw) > _LARGE_BYTES else contextlib.nullcontext()
+            async with turn:
+                return Body(await run_in_threadpool(parse_document, raw, model), raw)
         except DocumentError as error:
             raise invalid(error, what="the request's body") from None
 

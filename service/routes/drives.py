@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, BackgroundTasks, Depends, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -15,6 +15,7 @@ from service.context import Context
 from service.errors import ServiceError
 from service.manifest_check import checked_manifest
 from service.persistence import drives
+from service.persistence.collecting import collect_unused
 from service.persistence.drives import Stored
 from service.persistence.idempotency import Answer
 from service.persistence.storing import StoredFile, Storing, storing
@@ -116,10 +117,14 @@ def get_manifest(drive_id: str, caller: CallerDep, context: ContextDep) -> Respo
 
 
 @router.delete("/{drive_id}", status_code=204, responses=problems(401, 404, 409))
-def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep) -> None:
-    """Delete a drive and its files. Scenes that were made of it stay."""
+def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
+    """Delete a drive and its files. Scenes that were made of it stay.
+
+    Bytes that nothing else needs leave the quota at once, or an hour after they were last used.
+    """
     with context.database.write() as session:
         drives.remove(session, drives.get(session, caller.project_id, drive_id, lock=True))
+    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 
 @router.post("/{drive_id}:commit", response_model=DriveResource, responses=problems(401, 404, 409, 422, 429, 503))

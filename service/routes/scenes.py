@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import delete, select, tuple_
 from sqlalchemy.orm import Session
@@ -14,6 +14,7 @@ from schemas.api.common import Page
 from schemas.api.scenes import SceneFileResource, SceneResource
 from service.context import Context
 from service.errors import not_found
+from service.persistence.collecting import collect_unused
 from service.persistence.owned import require
 from service.persistence.tables import Blob, Scene, SceneFile
 from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment, problems
@@ -66,11 +67,12 @@ def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneRes
 
 
 @router.delete("/{scene_id}", status_code=204, responses=problems(401, 404))
-def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> None:
+def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a scene and its files. Its drive stays."""
     with context.database.write() as session:
         require(session, Scene, caller.project_id, scene_id)
         session.execute(delete(Scene).where(Scene.id == scene_id))
+    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 
 @router.head(
