@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import hashlib
 import os
 import secrets
 import shutil
@@ -54,6 +55,7 @@ class ArtifactStore:
         url = settings.resolved_artifacts_url
         self._root: Path | None = None
         self._store: Any = None
+        self._safe_folders: set[Path] = set()
         if url.startswith("file://"):
             self._root = Path(unquote(urlsplit(url).path))
             self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -65,15 +67,14 @@ class ArtifactStore:
         """Where the objects lie on this machine, or None where they lie elsewhere."""
         return self._root
 
-    def adopt(self, path: Path, key: str, sha256: str, *, synced: bool = False) -> None:
+    def adopt(self, path: Path, key: str, sha256: str, *, durable: bool = True) -> None:
         """Make the file `path` the object `key`; the file is gone afterwards.
-
-        When this returns, the object survives a power cut.
 
         Parameters
         ----------
-        synced
-            Whether the file's bytes are on the disk already.
+        durable
+            Whether the object survives a power cut when this returns. In a folder that can wait for `sync`; elsewhere
+            it always does.
         """
         if self._root is None:
             obstore.put(self._store, key, path)
@@ -82,10 +83,8 @@ class ArtifactStore:
         os.chmod(path, 0o440)
         os.utime(path, ns=(content_mtime_ns(sha256),) * 2)
         target = self._root / key
-        _make_durable_folder(target.parent)
+        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         try:
-            if not synced:
-                _sync(path)
             path.replace(target)
         except OSError as error:
             if error.errno != errno.EXDEV:
@@ -93,12 +92,45 @@ class ArtifactStore:
             partial = target.with_name(f".{secrets.token_hex(8)}.partial")
             try:
                 shutil.copy2(path, partial)
-                _sync(partial)
                 partial.replace(target)
             finally:
                 partial.unlink(missing_ok=True)
             path.unlink()
-        _sync(target.parent)
+        if durable:
+            self.sync(key)
+
+    def sync(self, key: str) -> None:
+        """Return when the object survives a power cut.
+
+        Raises
+        ------
+        FileNotFoundError
+            Where the store has no such object.
+        """
+        if self._root is None:
+            return
+        path = self._root / key
+        _sync(path)
+        _sync(path.parent)
+        for folder in path.relative_to(self._root).parents[1:]:
+            if folder not in self._safe_folders:  # folders stay: once is enough for each
+                _sync(self._root / folder)
+                self._safe_folders.add(folder)
+
+    def sha256_of(self, key: str) -> str | None:
+        """Digest of the bytes that are in the store now, in hexadecimal; None where there is no such object."""
+        digest = hashlib.sha256()
+        try:
+            if self._root is not None:
+                with (self._root / key).open("rb") as file:
+                    while piece := file.read(_CHUNK_BYTES):
+                        digest.update(piece)
+            else:
+                for chunk in obstore.get(self._store, key).stream(min_chunk_size=_CHUNK_BYTES):
+                    digest.update(chunk)
+        except FileNotFoundError:
+            return None
+        return digest.hexdigest()
 
     def fetch(self, key: str, target: Path, sha256: str) -> None:
         """Put the object's bytes at `target`, read-only; without copying where the file system allows.
@@ -214,14 +246,6 @@ def _options(url: str, settings: Settings) -> dict[str, Any]:
         options["endpoint"] = settings.s3_endpoint
         options["client_options"] = {"allow_http": settings.s3_endpoint.startswith("http://")}
     return options
-
-
-def _make_durable_folder(folder: Path) -> None:
-    """Make a folder, and its parents, so that a power cut does not take them."""
-    if not folder.is_dir():
-        _make_durable_folder(folder.parent)
-        folder.mkdir(exist_ok=True, mode=0o700)
-        _sync(folder.parent)
 
 
 def _sync(path: Path) -> None:

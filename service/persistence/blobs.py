@@ -33,7 +33,14 @@ def find(session: Session, project_id: str, sha256: str) -> Blob | None:
 
 
 def record(
-    session: Session, *, project_id: str, sha256: str, size_bytes: int, key: str, within_quota: bool = True
+    session: Session,
+    *,
+    project_id: str,
+    sha256: str,
+    size_bytes: int,
+    key: str,
+    written_in_boot: str | None = None,
+    within_quota: bool = True,
 ) -> Blob:
     """The project's blob of a content that was just stored under `key`.
 
@@ -42,6 +49,8 @@ def record(
 
     Parameters
     ----------
+    written_in_boot
+        Where a power cut could still take the bytes: see `durability`.
     within_quota
         Whether the quota may refuse it. Results may exceed it: hours of work are not thrown away for it.
 
@@ -52,7 +61,8 @@ def record(
     """
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     values = {"id": new_id("blb"), "project_id": project_id, "sha256": sha256, "size_bytes": size_bytes, "key": key}
-    statement = insert(Blob).values(**values, touched_us=now_us()).on_conflict_do_nothing()
+    statement = insert(Blob).values(**values, written_in_boot=written_in_boot, touched_us=now_us())
+    statement = statement.on_conflict_do_nothing()
     if session.execute(statement.returning(Blob.id)).first() is not None:
         _take_space(session, project_id, size_bytes, within_quota=within_quota)
         return session.get_one(Blob, values["id"])
@@ -118,6 +128,16 @@ def forget_unused(
             session.execute(update(Project).where(Project.id == blob.project_id).values(used_bytes=freed))
             keys.append(blob.key)
     return keys
+
+
+def lose(session: Session, blob_id: str) -> None:
+    """Note that a file's bytes did not survive: no drive has the file any more, and its space is free.
+
+    What is left of the object is named by no blob then, and collected like all such.
+    """
+    session.execute(update(DriveFile).where(DriveFile.blob_id == blob_id).values(blob_id=None, stored_us=None))
+    session.execute(update(Blob).where(Blob.id == blob_id).values(touched_us=0))
+    forget_unused(session, untouched_since_us=1)
 
 
 def known_keys(session: Session, keys: list[str]) -> set[str]:

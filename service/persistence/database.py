@@ -50,15 +50,23 @@ class Database:
             yield session
 
     @contextmanager
-    def write(self) -> Iterator[Session]:
+    def write(self, *, durable: bool = True) -> Iterator[Session]:
         """One transaction: committed where the block ends, rolled back where it raises.
+
+        Parameters
+        ----------
+        durable
+            Whether it survives a power cut as soon as it is committed. If not, it does when the next durable one has
+            been committed; a crash of any process it survives in any case.
 
         In SQLite writers take turns from the start: a transaction that reads first and wants to write later would
         otherwise fail, at once, when another has written in between.
         """
         with self._sessions.begin() as session:
             if self.engine.dialect.name == "sqlite":
-                session.connection(execution_options={"mrasfm_begin": "IMMEDIATE"})
+                session.connection(execution_options={"mrasfm_begin": "IMMEDIATE", "mrasfm_durable": durable})
+            elif not durable:
+                session.execute(text("SET LOCAL synchronous_commit TO OFF"))
             yield session
 
     def close(self) -> None:
@@ -82,13 +90,15 @@ def _sqlite(url: str, patience_s: float) -> Engine:
         connection.isolation_level = None  # transactions begin where we say, not where the driver guesses
         connection.execute(f"PRAGMA busy_timeout={round(1000 * patience_s)}")
         _write_ahead(connection, patience_s)
-        connection.execute("PRAGMA synchronous=FULL")  # what was answered with 202 survives a power cut
         connection.execute("PRAGMA foreign_keys=ON")
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Any) -> None:
-        mode = connection.get_execution_options().get("mrasfm_begin", "DEFERRED")
-        connection.exec_driver_sql(f"BEGIN {mode}")
+        options = connection.get_execution_options()
+        # FULL waits for the disk at every commit, NORMAL leaves that to the next FULL one.
+        durable = options.get("mrasfm_durable", True)
+        connection.exec_driver_sql(f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}")
+        connection.exec_driver_sql(f"BEGIN {options.get('mrasfm_begin', 'DEFERRED')}")
 
     return engine
 

@@ -15,7 +15,7 @@ from schemas.api.jobs import JobKind
 from schemas.api.problems import ProblemItem
 from schemas.drive import DriveManifest
 from service.errors import ServiceError
-from service.persistence import blobs, jobs
+from service.persistence import blobs, durability, jobs
 from service.persistence.drive_files import MANIFEST_NAME
 from service.persistence.owned import require
 from service.persistence.storing import StoredFile
@@ -307,6 +307,15 @@ def commit(session: Session, drive: Drive, findings: Sequence[dict[str, Any]]) -
             f"{count} of {drive.files_expected} files have not been uploaded: {', '.join(paths[:3])}{more}",
             remedy="Upload them, then commit again.",
             errors=[ProblemItem(field=path, detail="has not been uploaded") for path in paths],
+        )
+    if durability.unsynced_of(session, drive.id, limit=1):
+        raise ServiceError(
+            409,
+            "drive-changing",
+            "The drive is being written",
+            f"files of drive {drive.id} came while it was being committed",
+            remedy="Wait until all uploads are done, then commit again.",
+            headers={"Retry-After": "1"},
         )
     job = jobs.create(
         session,

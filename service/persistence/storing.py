@@ -12,6 +12,7 @@ from typing import Any
 from service.persistence import blobs
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.database import Database
+from service.persistence.durability import boot_id
 from service.persistence.tables import Blob
 
 _CHUNK_BYTES = 1 << 20
@@ -25,11 +26,17 @@ class StoredFile:
     sha256: str
     size_bytes: int
     key: str
+    written_in_boot: str | None = None  # where a power cut could still take it
 
     @property
     def identity(self) -> dict[str, Any]:
         """Arguments of `blobs.record`."""
-        return {"sha256": self.sha256, "size_bytes": self.size_bytes, "key": self.key}
+        return {
+            "sha256": self.sha256,
+            "size_bytes": self.size_bytes,
+            "key": self.key,
+            "written_in_boot": self.written_in_boot,
+        }
 
 
 def file_sha256(path: Path) -> str:
@@ -49,7 +56,7 @@ def store_file(
     path: Path,
     sha256: str,
     size_bytes: int,
-    synced: bool = False,
+    durable: bool = True,
     started: Callable[[str], None] = lambda key: None,
 ) -> StoredFile:
     """Put a file into the artifact store, unless the project has its content already; the file is gone afterwards.
@@ -59,8 +66,8 @@ def store_file(
 
     Parameters
     ----------
-    synced
-        Whether the file's bytes are on the disk already.
+    durable
+        Whether the bytes survive a power cut when this returns; else `durability.secure_drive` has to follow.
     started
         Told the key of a new object before its bytes are there.
     """
@@ -70,8 +77,9 @@ def store_file(
         return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key)
     key = blobs.new_key(project_id, sha256)
     started(key)
-    artifacts.adopt(path, key, sha256, synced=synced)
-    return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key)
+    boot = None if durable or artifacts.folder is None else boot_id()
+    artifacts.adopt(path, key, sha256, durable=boot is None)
+    return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, written_in_boot=boot)
 
 
 def _find(database: Database, project_id: str, sha256: str) -> Blob | None:
@@ -84,12 +92,17 @@ def _find(database: Database, project_id: str, sha256: str) -> Blob | None:
 
 
 @contextlib.contextmanager
-def storing(database: Database, artifacts: ArtifactStore, *, project_id: str) -> Iterator[Storing]:
+def storing(database: Database, artifacts: ArtifactStore, *, project_id: str, durable: bool) -> Iterator[Storing]:
     """Store files that are recorded within the block, and take back what was not recorded at its end.
 
     A request that is refused after its bytes were stored, for a quota or a conflict, leaves nothing behind.
+
+    Parameters
+    ----------
+    durable
+        As of `store_file`.
     """
-    store = Storing(database, artifacts, project_id)
+    store = Storing(database, artifacts, project_id, durable=durable)
     try:
         yield store
     finally:
@@ -100,14 +113,15 @@ def storing(database: Database, artifacts: ArtifactStore, *, project_id: str) ->
 class Storing:
     """Stores files for one request."""
 
-    def __init__(self, database: Database, artifacts: ArtifactStore, project_id: str) -> None:
+    def __init__(self, database: Database, artifacts: ArtifactStore, project_id: str, *, durable: bool) -> None:
+        self._durable = durable
         self._database = database
         self._artifacts = artifacts
         self._project_id = project_id
         self._new: list[str] = []
 
     def __call__(self, path: Path, *, sha256: str, size_bytes: int) -> StoredFile:
-        """Store a file of the spool, whose bytes are on the disk, as `store_file` does."""
+        """Store a file of the spool as `store_file` does."""
         return store_file(
             self._database,
             self._artifacts,
@@ -115,7 +129,7 @@ class Storing:
             path=path,
             sha256=sha256,
             size_bytes=size_bytes,
-            synced=True,
+            durable=self._durable,
             started=self._new.append,
         )
 

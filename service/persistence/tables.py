@@ -98,6 +98,8 @@ class Blob(Base):
     sha256: Mapped[str] = mapped_column(_Sha256)
     size_bytes: Mapped[int]
     key: Mapped[str] = mapped_column(_Path, unique=True)
+    # The start of the machine in which it was written, until it is safe from a power cut: see `durability`.
+    written_in_boot: Mapped[str | None] = mapped_column(_Id)
     touched_us: Mapped[int] = mapped_column(default=now_us)  # collected only when unused and untouched for a while
 
 

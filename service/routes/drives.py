@@ -17,6 +17,7 @@ from service.manifest_check import checked_manifest
 from service.persistence import drives
 from service.persistence.collecting import collect_unused
 from service.persistence.drives import Stored
+from service.persistence.durability import secure_drive
 from service.persistence.idempotency import Answer
 from service.persistence.storing import StoredFile, Storing, storing
 from service.persistence.tables import Blob, Drive, now_us
@@ -54,7 +55,7 @@ async def create_drive(
     """Create a drive from its manifest, `drive.json`. Then upload the files that it names, and commit."""
 
     def create() -> Response:
-        with storing(context.database, context.artifacts, project_id=caller.project_id) as store:
+        with storing(context.database, context.artifacts, project_id=caller.project_id, durable=True) as store:
             stored = _store_manifest(context, store, body.raw)
 
             def effect(session: Session) -> Answer:
@@ -136,7 +137,10 @@ def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context: Conte
     with context.database.read() as session:
         drive = drives.get(session, caller.project_id, drive_id)
         key = session.get_one(Blob, drive.manifest_blob_id).key
-    found = checked_manifest(context, key) if drive.state == DriveState.OPEN else []
+    found: list[Finding] = []
+    if drive.state == DriveState.OPEN:
+        found = checked_manifest(context, key)
+        secure_drive(context.database, context.artifacts, drive_id)
 
     def effect(session: Session) -> Answer:
         drive = drives.get(session, caller.project_id, drive_id, lock=True)

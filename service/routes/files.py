@@ -207,9 +207,9 @@ def _keep(
     context: Context, project_id: str, drive_id: str, path: str, spooled: Spooled, replace: bool
 ) -> tuple[bool, DriveFileResource]:
     check_image(spooled.path, path)
-    with storing(context.database, context.artifacts, project_id=project_id) as store:
+    with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
         stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
-        with context.database.write() as session:
+        with context.database.write(durable=False) as session:  # the drive's commit makes it so
             drive = drives.get(session, project_id, drive_id, lock=True)
             new, file, blob = drives.attach(session, drive, path, stored, replace=replace)
         store.recorded(blob.key)
@@ -245,7 +245,7 @@ def _unpack(context: Context, project_id: str, drive_id: str, archive: Spooled, 
 def _keep_all(
     context: Context, project_id: str, drive_id: str, unpacked: list[tuple[str, Spooled]], replace: bool
 ) -> StoredFiles:
-    with storing(context.database, context.artifacts, project_id=project_id) as store:
+    with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
         stored = [
             (name, store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes))
             for name, spooled in unpacked

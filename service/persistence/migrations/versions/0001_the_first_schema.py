@@ -53,6 +53,7 @@ def upgrade() -> None:
         sa.Column("sha256", sa.String(length=64), nullable=False),
         sa.Column("size_bytes", sa.BigInteger(), nullable=False),
         sa.Column("key", sa.String(length=1024), nullable=False),
+        sa.Column("written_in_boot", sa.String(length=40), nullable=True),
         sa.Column("touched_us", sa.BigInteger(), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["projects.id"], name=op.f("fk_blobs_project_id_projects")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_blobs")),
