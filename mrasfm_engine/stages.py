@@ -24,7 +24,8 @@ from mrasfm_engine.correspondence.revisits import revisit_pairs
 from mrasfm_engine.correspondence.search import match_pairs
 from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.io.findings import as_json
-from mrasfm_engine.io.preflight import check_drive, require_sound
+from mrasfm_engine.io.preflight import require_sound
+from mrasfm_engine.io.preflight_content import inspect_drive
 from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
 from mrasfm_engine.registration import incremental, mapping_report
 from mrasfm_engine.registration.model import Model
@@ -86,8 +87,8 @@ class Run:
 
 
 def preflight(run: Run) -> None:
-    """Check the manifest and the files' headers; refuse what cannot work before any long work."""
-    findings = check_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"))
+    """Check manifest, files and a sample of the images; refuse what cannot work before any long work."""
+    findings = inspect_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"), cancel=run.cancel)
     run.report["findings"] = [as_json(finding) for finding in findings]
     require_sound(findings)
 

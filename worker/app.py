@@ -19,6 +19,7 @@ from worker.execution import Runner
 from worker.lease import RenewLeases, ReportPresence
 
 _PR_SET_PDEATHSIG = 1
+_POOL_START_S = 120.0  # a pool process first removes what others left behind; by default it would be killed after 4 s
 
 
 class ShutdownFlag:
@@ -44,7 +45,12 @@ def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
     """The application that `mrasfm worker` runs; its pool processes are forked from it."""
     app = Celery("mrasfm", set_as_current=False)
     app.conf.update(celery_options(settings))
-    app.conf.update(worker_hijack_root_logger=False, worker_redirect_stdouts=False, worker_send_task_events=False)
+    app.conf.update(
+        worker_hijack_root_logger=False,
+        worker_redirect_stdouts=False,
+        worker_send_task_events=False,
+        worker_proc_alive_timeout=_POOL_START_S,
+    )
     app.mrasfm_settings = settings  # type: ignore[attr-defined]
     app.steps["consumer"].add(RenewLeases)
     app.steps["consumer"].add(ReportPresence)

@@ -13,7 +13,8 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
 from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.findings import as_json, error
-from mrasfm_engine.io.preflight import UnsoundDriveError, check_drive, is_sound
+from mrasfm_engine.io.preflight import UnsoundDriveError, is_sound
+from mrasfm_engine.io.preflight_content import inspect_drive
 from mrasfm_engine.pipeline import reconstruct
 from worker.engine_settings import engine_config
 from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
@@ -79,9 +80,9 @@ def _reconstruct(
 def _preflight(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    """The findings of a reconstruction's first seconds: manifest, files, and whether the calibration is inverted."""
+    """The findings of a reconstruction's first seconds: manifest, files, images, and the calibration's direction."""
     run = stages.Run(read_drive(request.drive), config, stages.store_of(request.out), progress, cancelled)
-    findings = check_drive(run.drive, use_gnss=config.use_gnss, progress=run.step("preflight"))
+    findings = inspect_drive(run.drive, use_gnss=config.use_gnss, progress=run.step("preflight"), cancel=cancelled)
     if is_sound(findings):
         progress("calibration", 0, 1)
         try:

@@ -8,6 +8,7 @@ import os
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ class Runner:
                 attempt_folder(self._settings.scratch_dir, f"{held.job_id}.{held.fence}") as folder,
                 Heart(self._database, held, self._settings) as heart,
             ):
+                self.sweep_scratch()
                 self._do(held, AttemptFolder(folder), heart, meter)
         except jobs.FencedError:
             raise
@@ -106,7 +108,8 @@ class Runner:
         except SystemExit:
             # This process was told to end and not, or not only, the main one: by a cold shutdown, or by who signals
             # all of a service's processes at once.
-            self._release(held)
+            with suppress(jobs.FencedError):
+                self._release(held)
             raise
 
     def _do(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> None:
@@ -120,7 +123,9 @@ class Runner:
     def _attempt(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> Outcome:
         drive = folder.root / "drive"
         try:
-            materialise(self._database, self._artifacts, held.drive_id, drive, progress=self._counting(heart, meter, "fetch"))
+            materialise(
+                self._database, self._artifacts, held.drive_id, drive, progress=self._counting(heart, meter, "fetch")
+            )
         except DriveGoneError:
             return Failed(
                 code="drive-deleted",
@@ -217,7 +222,14 @@ class Runner:
         kept_days = self._settings.scene_retention_days
         expires_us = None if kept_days is None else now_us() + int(kept_days * 86400e6)
         with self._database.write() as session:
-            scene_id = scenes.publish(session, held, files=files, summary=_summary(done.report), expires_us=expires_us)
+            scene_id = scenes.publish(
+                session,
+                held,
+                files=files,
+                summary=_summary(done.report),
+                expires_us=expires_us,
+                reused=[stage["stage"] for stage in done.report["stages"] if stage["reused"]],
+            )
         log.info("published", extra={"fields": {"scene_id": scene_id}})
 
     def _store(self, held: jobs.Claim, path: Path) -> StoredFile:

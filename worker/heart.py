@@ -6,6 +6,7 @@ import contextvars
 import logging
 import threading
 import time
+from dataclasses import replace
 from types import TracebackType
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -75,11 +76,10 @@ class Heart:
         beat_s = time.monotonic()
         while not self._ended.wait(min(_TELL_EVERY_S, self._settings.heartbeat_seconds)):
             now_s = time.monotonic()
-            news = self._progress if self._progress != self._told else None
-            if news is None and now_s - beat_s < self._settings.heartbeat_seconds:
+            if not self._has_moved() and now_s - beat_s < self._settings.heartbeat_seconds:
                 continue
             try:
-                self._beat(news)
+                self._beat(self._progress if self._progress != self._told else None)
             except jobs.FencedError:
                 return
             except SQLAlchemyError:
@@ -88,6 +88,10 @@ class Heart:
                     return
             else:
                 beat_s, sure_until_s = now_s, now_s + _SURE_SHARE * self._settings.lease_seconds
+
+    def _has_moved(self) -> bool:
+        """Whether there is more to tell than a new guess at the time to the end."""
+        return replace(self._progress, eta_s=None) != replace(self._told, eta_s=None)
 
     def _beat(self, news: Progress | None) -> None:
         lease_us = int(self._settings.lease_seconds * 1e6)

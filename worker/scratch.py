@@ -76,8 +76,10 @@ def _lock(folder: Path) -> int | None:
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), os.stat(folder)):
+                return descriptor
         except OSError:
             os.close(descriptor)
             raise
-        return descriptor
+        os.close(descriptor)
     return None

@@ -15,7 +15,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.io.drive_bundle import MANIFEST_NAME, read_drive
 from mrasfm_engine.io.findings import Finding, as_json, error
-from mrasfm_engine.io.preflight import check_drive, check_manifest, is_sound
+from mrasfm_engine.io.preflight import check_manifest, is_sound
 from schemas import DriveManifest
 
 EXIT_UNSOUND = 2
@@ -65,7 +65,10 @@ def _check(path: Path, *, manifest_only: bool, use_gnss: bool) -> list[Finding]:
     """The findings; a drive or manifest that cannot be read is one too."""
     try:
         if not manifest_only:
-            return check_drive(read_drive(path), use_gnss=use_gnss)
+            # Loads the image libraries, which the check of a manifest does without.
+            from mrasfm_engine.io.preflight_content import inspect_drive
+
+            return inspect_drive(read_drive(path), use_gnss=use_gnss)
         return check_manifest(_read_manifest(path), use_gnss=use_gnss)
     except InputError as problem:
         return [error(problem.code, _by_name(problem.what, path), problem.remedy)]

@@ -22,6 +22,7 @@ import anyio
 from service.errors import ServiceError
 
 Result = TypeVar("Result")
+Part = bytes | bytearray | memoryview
 DiskLimiter = asyncio.Semaphore | anyio.CapacityLimiter
 
 BATCH_BYTES = 1 << 20  # written and hashed at a time: large enough that the switch to a thread costs nothing
@@ -91,21 +92,22 @@ class SpoolWriter:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
             self._descriptor: int | None = os.open(self.path, flags, 0o600)
 
-    def write(self, data: bytes | bytearray | memoryview) -> None:
+    def write(self, *parts: Part) -> None:
         """Append; nothing happens after `discard`."""
         with self._lock, _full_disk_is_507():
             if self._descriptor is None:
                 return
-            require_space(self._folder, len(data), min_free_bytes=self._min_free_bytes)
-            rest = memoryview(data)
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
-            self._hash.update(data)
-            self._size_bytes += len(data)
+            require_space(self._folder, sum(map(len, parts)), min_free_bytes=self._min_free_bytes)
+            for part in parts:
+                rest = memoryview(part)
+                while rest:
+                    rest = rest[os.write(self._descriptor, rest) :]
+                self._hash.update(part)
+                self._size_bytes += len(part)
 
-    def finish(self, data: bytes | bytearray = b"") -> Spooled:
+    def finish(self, *parts: Part) -> Spooled:
         """Append the last bytes. Whoever keeps the file for good sees to it that it survives a power cut."""
-        self.write(data)
+        self.write(*parts)
         with self._lock, _full_disk_is_507():
             self._close()
         return Spooled(self.path, self._size_bytes, self._hash.hexdigest())
@@ -158,17 +160,19 @@ async def receive(
         require_space(folder, expected_bytes, min_free_bytes=min_free_bytes)
     writer = _BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
     try:
-        received_bytes, batch = 0, bytearray()
+        received_bytes = batched_bytes = 0
+        batch: list[bytes] = []
         async for chunk in stream:
             received_bytes += len(chunk)
             if expected_bytes is not None and received_bytes > expected_bytes:
                 raise _wrong_length("more than", expected_bytes)
             if received_bytes > max_bytes:
                 raise _too_large(f"over {max_bytes}", max_bytes)
-            batch += chunk
-            if len(batch) >= BATCH_BYTES:
+            batch.append(chunk)
+            batched_bytes += len(chunk)
+            if batched_bytes >= BATCH_BYTES:
                 await writer.write(batch)
-                batch = bytearray()
+                batch, batched_bytes = [], 0
         if expected_bytes is not None and received_bytes < expected_bytes:
             raise _wrong_length(f"{received_bytes} of", expected_bytes)
         spooled = await writer.finish(batch)
@@ -230,11 +234,11 @@ class _BatchWriter:
         self._on_disk = on_disk
         self._writing: asyncio.Task[None] | None = None
 
-    async def write(self, batch: bytearray) -> None:
+    async def write(self, batch: list[bytes]) -> None:
         await self._written()
         self._writing = asyncio.create_task(self._off_the_loop(self._writer.write, batch))
 
-    async def finish(self, batch: bytearray) -> Spooled:
+    async def finish(self, batch: list[bytes]) -> Spooled:
         await self._written()
         return await self._off_the_loop(self._writer.finish, batch)
 
@@ -249,9 +253,9 @@ class _BatchWriter:
             writing, self._writing = self._writing, None
             await writing
 
-    async def _off_the_loop(self, function: Callable[[bytearray], Result], batch: bytearray) -> Result:
+    async def _off_the_loop(self, function: Callable[..., Result], batch: list[bytes]) -> Result:
         async with self._on_disk:
-            return await asyncio.to_thread(function, batch)
+            return await asyncio.to_thread(function, *batch)
 
 
 @contextmanager

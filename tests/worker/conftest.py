@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -13,6 +13,7 @@ import pytest
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from service.settings import Settings
+from tests.worker.service_world import World
 from worker.messages import Work
 from worker.progress import Progress, ProgressMeter
 from worker.stages import Verdict
@@ -27,6 +28,38 @@ def small_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = SynthOptions(cameras=2, units=6, seed=3, width=480, height=270, texture_px=256)
     (folder,) = render_drives(options, out)
     return folder
+
+
+@pytest.fixture(scope="session")
+def brief_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered drive of 2 cameras and 4 units, reconstructed in seconds. Tests only read it."""
+    out = tmp_path_factory.mktemp("rendered") / "drive"
+    options = SynthOptions(cameras=2, units=4, seed=3, width=320, height=180, texture_px=128)
+    (folder,) = render_drives(options, out)
+    return folder
+
+
+@pytest.fixture
+def make_world(tmp_path: Path) -> Iterator[Callable[..., World]]:
+    """A function that makes an installation with a broker and settings of the test's."""
+    worlds: list[World] = []
+
+    def make(**changed: object) -> World:
+        folder = tmp_path / f"world{len(worlds)}"
+        folder.mkdir()
+        worlds.append(World(folder, **changed))
+        worlds[-1].broker.start()
+        return worlds[-1]
+
+    yield make
+    for made in worlds:
+        made.close()
+
+
+@pytest.fixture
+def world(make_world: Callable[..., World]) -> World:
+    """An installation with a broker, and neither workers nor reconciler yet."""
+    return make_world()
 
 
 @pytest.fixture
