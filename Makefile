@@ -23,7 +23,7 @@ demo: setup ## render two drives of six cameras, send them through the service, 
 	$(BIN)/mrasfm demo --out demo
 
 test: setup ## the fast suite and one real drive
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
 
 check: setup ## lint, types, import contracts
 	$(BIN)/ruff check .

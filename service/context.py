@@ -8,6 +8,7 @@ import anyio
 
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.database import Database
+from service.persistence.keys import KeyRing
 from service.persistence.wakeups import Wakeups
 from service.settings import Settings
 
@@ -18,6 +19,7 @@ class Context:
 
     settings: Settings
     database: Database
+    keys: KeyRing
     artifacts: ArtifactStore
     wakeups: Wakeups
     disk: anyio.CapacityLimiter  # uploads that write at one time
@@ -26,9 +28,11 @@ class Context:
     @classmethod
     def open(cls, settings: Settings) -> Context:
         """Open everything that the settings name; the broker is not asked."""
+        database = Database.of(settings)
         return cls(
             settings=settings,
-            database=Database.of(settings),
+            database=database,
+            keys=KeyRing(database),
             artifacts=ArtifactStore(settings),
             wakeups=Wakeups(settings),
             disk=anyio.CapacityLimiter(settings.max_concurrent_writes),

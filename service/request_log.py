@@ -36,11 +36,12 @@ class RequestLog:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        request_id, started_s, status = new_id("req"), time.perf_counter(), 0
+        request_id, started_s, status, received_bytes = new_id("req"), time.perf_counter(), 0, 0
 
         async def counted_receive() -> Message:
+            nonlocal received_bytes
             message = await receive()
-            self._metrics.received_bytes.inc(len(message.get("body", b"")))
+            received_bytes += len(message.get("body", b""))
             return message
 
         async def send_with_id(message: Message) -> None:
@@ -59,6 +60,7 @@ class RequestLog:
                     raise  # the answer has begun: the server breaks the connection off
                 await self._failed()(scope, counted_receive, send_with_id)
             finally:
+                self._metrics.received_bytes.inc(received_bytes)
                 self._note(scope, status, time.perf_counter() - started_s)
 
     def _note(self, scope: Scope, status: int, elapsed_s: float) -> None:

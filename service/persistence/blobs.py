@@ -3,14 +3,38 @@
 from __future__ import annotations
 
 import secrets
+from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import ColumnElement, delete, select, update
+from sqlalchemy import ColumnElement, bindparam, delete, select, update
 from sqlalchemy import exists as sql_exists
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.errors import ServiceError
 from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Project, SceneFile, new_id, now_us
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """A blob's identity."""
+
+    id: str
+    key: str
+    size_bytes: int
+
+
+_INSERT: dict[str, Any] = {
+    name: dialect.insert(Blob).on_conflict_do_nothing().returning(Blob.id)
+    for name, dialect in (("postgresql", postgresql), ("sqlite", sqlite))
+}
+_TAKE_SPACE = (
+    update(Project)
+    .where(Project.id == bindparam("project"))
+    .values(used_bytes=Project.used_bytes + bindparam("size"))
+    .execution_options(synchronize_session=False)
+)
+_TAKE_SPACE_WITHIN_QUOTA = _TAKE_SPACE.where(Project.used_bytes + bindparam("size") <= Project.max_bytes)
 
 
 def new_key(project_id: str, sha256: str) -> str:
@@ -41,7 +65,7 @@ def record(
     key: str,
     written_in_boot: str | None = None,
     within_quota: bool = True,
-) -> Blob:
+) -> Recorded:
     """The project's blob of a content that was just stored under `key`.
 
     Where the content was there already the older blob is returned, whose key differs: the caller deletes what it
@@ -59,23 +83,27 @@ def record(
     ServiceError
         413 where the project's quota would be exceeded.
     """
-    insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
-    values = {"id": new_id("blb"), "project_id": project_id, "sha256": sha256, "size_bytes": size_bytes, "key": key}
-    statement = insert(Blob).values(**values, written_in_boot=written_in_boot, touched_us=now_us())
-    statement = statement.on_conflict_do_nothing()
-    if session.execute(statement.returning(Blob.id)).first() is not None:
+    values = {
+        "id": new_id("blb"),
+        "project_id": project_id,
+        "sha256": sha256,
+        "size_bytes": size_bytes,
+        "key": key,
+        "written_in_boot": written_in_boot,
+        "touched_us": now_us(),
+    }
+    connection = session.connection()
+    if connection.execute(_INSERT[connection.dialect.name], values).first() is not None:
         _take_space(session, project_id, size_bytes, within_quota=within_quota)
-        return session.get_one(Blob, values["id"])
+        return Recorded(id=str(values["id"]), key=key, size_bytes=size_bytes)
     blob = find(session, project_id, sha256)
     assert blob is not None
-    return blob
+    return Recorded(id=blob.id, key=blob.key, size_bytes=blob.size_bytes)
 
 
 def _take_space(session: Session, project_id: str, size_bytes: int, *, within_quota: bool) -> None:
-    statement = update(Project).where(Project.id == project_id)
-    if within_quota:
-        statement = statement.where(Project.used_bytes + size_bytes <= Project.max_bytes)
-    if session.execute(statement.values(used_bytes=Project.used_bytes + size_bytes)).rowcount:  # type: ignore[attr-defined]
+    statement = _TAKE_SPACE_WITHIN_QUOTA if within_quota else _TAKE_SPACE
+    if session.connection().execute(statement, {"project": project_id, "size": size_bytes}).rowcount:
         return
     project = session.get_one(Project, project_id)
     raise quota_full(project, size_bytes)

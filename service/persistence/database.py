@@ -96,8 +96,10 @@ def _sqlite(url: str, patience_s: float) -> Engine:
     def _begin(connection: Any) -> None:
         options = connection.get_execution_options()
         # FULL waits for the disk at every commit, NORMAL leaves that to the next FULL one.
-        durable = options.get("mrasfm_durable", True)
-        connection.exec_driver_sql(f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}")
+        level = "FULL" if options.get("mrasfm_durable", True) else "NORMAL"
+        if connection.info.get("synchronous") != level:
+            connection.exec_driver_sql(f"PRAGMA synchronous={level}")
+            connection.info["synchronous"] = level
         connection.exec_driver_sql(f"BEGIN {options.get('mrasfm_begin', 'DEFERRED')}")
 
     return engine

@@ -15,7 +15,7 @@ from schemas.api.jobs import JobKind
 from schemas.api.problems import ProblemItem
 from schemas.drive import DriveManifest
 from service.errors import ServiceError
-from service.persistence import blobs, durability, jobs
+from service.persistence import blobs, durability, jobs, slots
 from service.persistence.drive_files import MANIFEST_NAME
 from service.persistence.owned import require
 from service.persistence.storing import StoredFile
@@ -137,63 +137,6 @@ def stored_of(session: Session, drive_ids: Sequence[str]) -> dict[str, Stored]:
     return {drive_id: found.get(drive_id, Stored(0, 0)) for drive_id in drive_ids}
 
 
-def require_file(session: Session, drive: Drive, path: str) -> DriveFile:
-    """The record of a file that the drive's manifest names.
-
-    Raises
-    ------
-    ServiceError
-        422 where it does not name it.
-    """
-    file = None
-    if path.isprintable():  # databases refuse NUL in a parameter; no manifest holds such a name
-        file = session.get(DriveFile, (drive.id, path), populate_existing=True)
-    if file is None:
-        raise ServiceError(
-            422,
-            "not-in-manifest",
-            "The manifest does not name the file",
-            f"the manifest of drive {drive.id} names no file {path!r}",
-            remedy="Upload under exactly the names that the manifest gives, or create a drive with another manifest.",
-        )
-    return file
-
-
-def attach(
-    session: Session, drive: Drive, path: str, stored: StoredFile, *, replace: bool
-) -> tuple[bool, DriveFile, Blob]:
-    """Give a file of an open drive its bytes.
-
-    Returns
-    -------
-    new, file, blob
-        `new` is False where it had them already.
-
-    Raises
-    ------
-    ServiceError
-        409 where the drive is committed or another content is stored under the name; 413 where the quota is full.
-    """
-    file = require_file(session, drive, path)
-    present = None if file.blob_id is None else session.get_one(Blob, file.blob_id)
-    if present is not None and present.sha256 == stored.sha256:
-        return False, file, present
-    require_open(drive)
-    if present is not None and not replace:
-        raise ServiceError(
-            409,
-            "file-exists",
-            "Another content is stored under this name",
-            f"{path!r} is stored with SHA-256 {present.sha256}, these bytes have {stored.sha256}",
-            remedy="If these are the right ones, send them again with ?replace=true; if not, see who else writes this "
-            "drive.",
-        )
-    blob = blobs.record(session, project_id=drive.project_id, **stored.identity)
-    file.blob_id, file.stored_us = blob.id, now_us()
-    session.flush()
-    return True, file, blob
-
-
 def require_open(drive: Drive) -> None:
     """Refuse changes to a committed drive.
 
@@ -203,13 +146,7 @@ def require_open(drive: Drive) -> None:
         409.
     """
     if drive.state != DriveState.OPEN:
-        raise ServiceError(
-            409,
-            "drive-committed",
-            "The drive is committed",
-            f"drive {drive.id} was committed and does not change any more",
-            remedy="Reconstruct it as it is, or create a new drive: files that are stored need not be sent again.",
-        )
+        raise slots.drive_committed(drive.id)
 
 
 def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) -> tuple[list[str], list[str]]:
@@ -229,7 +166,7 @@ def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) ->
     present = _identities(session, drive, list(wanted))
     unknown = sorted(wanted.keys() - present.keys())
     if unknown:
-        require_file(session, drive, unknown[0])
+        raise slots.not_in_manifest(drive.id, unknown[0])
     known = _known_blobs(session, drive.project_id, sorted({file.sha256 for file in wanted.values()}))
     stored, to_send = [], []
     for path, file in wanted.items():
@@ -264,19 +201,6 @@ def _known_blobs(session: Session, project_id: str, digests: Sequence[str]) -> d
         session.execute(update(Blob).where(some).values(touched_us=now_us()))
         found.update((blob.sha256, blob) for blob in session.scalars(select(Blob).where(some)))
     return found
-
-
-def detach(session: Session, drive: Drive, path: str) -> None:
-    """Forget the bytes of a file of an open drive.
-
-    Raises
-    ------
-    ServiceError
-        409 where the drive is committed, 422 where the manifest does not name the file.
-    """
-    require_open(drive)
-    file = require_file(session, drive, path)
-    file.blob_id = file.stored_us = None
 
 
 def commit(session: Session, drive: Drive, findings: Sequence[dict[str, Any]]) -> Job:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import secrets
+import time
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -13,6 +14,7 @@ from service.persistence.tables import ApiKey, Project, now_us
 from service.settings import Settings
 
 FIRST_PROJECT = "default"
+_MAX_KNOWN = 10_000
 _PREFIX = "mrasfm_"  # lets secret scanners recognise a key that was pushed somewhere
 
 
@@ -61,6 +63,34 @@ def project_of(session: Session, secret: str) -> str | None:
     """The id of the project that a key opens; None where it opens none."""
     valid = (ApiKey.secret_sha256 == secret_sha256(secret)) & ApiKey.revoked_us.is_(None)
     return session.scalar(select(ApiKey.project_id).where(valid))
+
+
+class KeyRing:
+    """Remembers for some seconds which project a key opens: a client that sends files sends many with one key.
+
+    A key that is revoked ends within `KEPT_S`.
+    """
+
+    KEPT_S = 3.0
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._known: dict[str, tuple[str, float]] = {}  # by the secret's hash: project, and until when
+
+    def remembered(self, secret: str) -> str | None:
+        """The project's id if the key was looked up a moment ago; never waits."""
+        project_id, until_s = self._known.get(secret_sha256(secret), ("", 0.0))
+        return project_id if time.monotonic() < until_s else None
+
+    def look_up(self, secret: str) -> str | None:
+        """The project's id from the database; None where the key opens none."""
+        with self._database.read() as session:
+            project_id = project_of(session, secret)
+        if project_id is not None:
+            if len(self._known) >= _MAX_KNOWN:
+                self._known.clear()
+            self._known[secret_sha256(secret)] = (project_id, time.monotonic() + self.KEPT_S)
+        return project_id
 
 
 def ensure_first_key(settings: Settings) -> str | None:

@@ -16,6 +16,11 @@ _ID = re.compile(r"[a-z]{3}_[0-9a-f]{1,36}")
 _NAMES = {Drive: "drive", Job: "job", Scene: "scene"}
 
 
+def is_id(text: str) -> bool:
+    """Whether a text can be an id of ours; what cannot may hold what a database refuses in a parameter."""
+    return _ID.fullmatch(text) is not None
+
+
 def require(session: Session, table: type[Row], project_id: str, row_id: str, *, lock: bool = False) -> Row:
     """The project's row of this id.
 
@@ -30,7 +35,7 @@ def require(session: Session, table: type[Row], project_id: str, row_id: str, *,
         404, the same for what never was, what was deleted and what belongs to another project.
     """
     row = None
-    if _ID.fullmatch(row_id):  # what cannot be an id may hold what a database refuses in a parameter
+    if is_id(row_id):
         row = session.get(table, row_id, with_for_update=lock or None, populate_existing=lock)
     if row is None or row.project_id != project_id:
         raise not_found(_NAMES[table], row_id)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,34 +49,24 @@ def file_sha256(path: Path) -> str:
 
 
 def store_file(
-    database: Database,
-    artifacts: ArtifactStore,
-    *,
-    project_id: str,
-    path: Path,
-    sha256: str,
-    size_bytes: int,
-    durable: bool = True,
-    started: Callable[[str], None] = lambda key: None,
+    database: Database, artifacts: ArtifactStore, *, project_id: str, path: Path, sha256: str, size_bytes: int
 ) -> StoredFile:
     """Put a file into the artifact store, unless the project has its content already; the file is gone afterwards.
 
     The caller records the blob together with what refers to it, in one transaction, within the hour: what nothing
     refers to is collected then.
-
-    Parameters
-    ----------
-    durable
-        Whether the bytes survive a power cut when this returns; else `durability.secure_drive` has to follow.
-    started
-        Told the key of a new object before its bytes are there.
     """
     known = _find(database, project_id, sha256)
     if known is not None:
         path.unlink()
         return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key)
     key = blobs.new_key(project_id, sha256)
-    started(key)
+    return _adopt(artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=True)
+
+
+def _adopt(
+    artifacts: ArtifactStore, path: Path, key: str, *, sha256: str, size_bytes: int, durable: bool
+) -> StoredFile:
     boot = None if durable or artifacts.folder is None else boot_id()
     artifacts.adopt(path, key, sha256, durable=boot is None)
     return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, written_in_boot=boot)
@@ -100,7 +90,7 @@ def storing(database: Database, artifacts: ArtifactStore, *, project_id: str, du
     Parameters
     ----------
     durable
-        As of `store_file`.
+        Whether the bytes survive a power cut at once; else `durability.secure_drive` has to follow.
     """
     store = Storing(database, artifacts, project_id, durable=durable)
     try:
@@ -121,17 +111,14 @@ class Storing:
         self._new: list[str] = []
 
     def __call__(self, path: Path, *, sha256: str, size_bytes: int) -> StoredFile:
-        """Store a file of the spool as `store_file` does."""
-        return store_file(
-            self._database,
-            self._artifacts,
-            project_id=self._project_id,
-            path=path,
-            sha256=sha256,
-            size_bytes=size_bytes,
-            durable=self._durable,
-            started=self._new.append,
-        )
+        """Make a file of the spool an object; the file is gone afterwards.
+
+        Whether the project has the content already is not asked: clients declare what they have before they send it.
+        Where it has, recording it returns the older blob, and this object is taken back.
+        """
+        key = blobs.new_key(self._project_id, sha256)
+        self._new.append(key)
+        return _adopt(self._artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=self._durable)
 
     def recorded(self, key: str) -> None:
         """Note that a transaction that has committed names this object."""

@@ -14,7 +14,9 @@ from starlette.concurrency import run_in_threadpool
 
 from schemas.api.problems import ProblemItem
 from schemas.parsing import DocumentError, parse_document
+from service.context import Context
 from service.errors import ServiceError
+from service.settings import Settings
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -30,7 +32,7 @@ class Body(Generic[Model]):
 
 
 def json_body(
-    model: type[Model], max_bytes: Callable[[Request], int]
+    model: type[Model], max_bytes: Callable[[Settings], int]
 ) -> Callable[[Request], Coroutine[Any, Any, Body[Model]]]:
     """A dependency that reads a JSON body as `model`.
 
@@ -38,11 +40,11 @@ def json_body(
     """
 
     async def read(request: Request) -> Body[Model]:
-        raw = await read_within(request, max_bytes(request))
+        context: Context = request.app.state.context
+        raw = await read_within(request, max_bytes(context.settings))
         try:
             # A large one takes ten times its size while it is parsed: these take turns.
-            turn = request.app.state.context.large_documents if len(raw) > _LARGE_BYTES else contextlib.nullcontext()
-            async with turn:
+            async with context.large_documents if len(raw) > _LARGE_BYTES else contextlib.nullcontext():
                 return Body(await run_in_threadpool(parse_document, raw, model), raw)
         except DocumentError as error:
             raise invalid(error, what="the request's body") from None

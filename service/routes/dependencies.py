@@ -13,13 +13,13 @@ from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
 
 from schemas.api.problems import MEDIA_TYPE
 from service.context import Context
 from service.errors import ServiceError
 from service.persistence import jobs
 from service.persistence.idempotency import Answer, once
-from service.persistence.keys import project_of
 from service.persistence.tables import Job
 from service.persistence.wakeups import BrokerError
 from service.routes.bodies import request_sha256
@@ -30,7 +30,8 @@ log = logging.getLogger("mrasfm.api")
 _bearer = HTTPBearer(auto_error=False, description="An API key: `Authorization: Bearer mrasfm_...`")
 
 
-def get_context(request: Request) -> Context:
+# Dependencies that do not wait are coroutines: FastAPI would send each to a thread of its own.
+async def get_context(request: Request) -> Context:
     """The process's resources."""
     context: Context = request.app.state.context
     return context
@@ -46,7 +47,7 @@ class Caller:
     project_id: str
 
 
-def get_caller(
+async def get_caller(
     context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Caller:
     """Who calls.
@@ -58,8 +59,8 @@ def get_caller(
     """
     project_id = None
     if credentials is not None:
-        with context.database.read() as session:
-            project_id = project_of(session, credentials.credentials)
+        secret = credentials.credentials
+        project_id = context.keys.remembered(secret) or await run_in_threadpool(context.keys.look_up, secret)
     if project_id is None:
         given = "the API key is not valid" if credentials is not None else "the request carries no API key"
         raise ServiceError(
@@ -111,7 +112,7 @@ class Once:
         return JSONResponse(answer.body, status_code=answer.status, headers=headers, background=self.background)
 
 
-def get_once(
+async def get_once(
     context: ContextDep,
     caller: CallerDep,
     request: Request,

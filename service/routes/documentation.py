@@ -14,7 +14,6 @@ def add_documentation(app: FastAPI) -> None:
     """Serve Swagger UI at `/docs`."""
     app.mount(_FILES, StaticFiles(packages=[("fastapi_swagger", "resources")]), name="documentation")
 
-    @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> HTMLResponse:
         root = request.scope.get("root_path", "").rstrip("/")
         return get_swagger_ui_html(
@@ -24,3 +23,5 @@ def add_documentation(app: FastAPI) -> None:
             swagger_css_url=f"{root}{_FILES}/swagger-ui.css",
             swagger_favicon_url=f"{root}{_FILES}/favicon-32x32.png",
         )
+
+    app.add_route("/docs", docs, include_in_schema=False)

@@ -30,7 +30,6 @@ from service.routes.dependencies import (
     OnceDep,
     answer,
     expiry_us,
-    get_context,
     moment,
     problems,
 )
@@ -39,7 +38,7 @@ from service.uploads.spool import SpoolWriter
 
 router = APIRouter(prefix="/v1/drives", tags=["drives"])
 
-read_manifest = json_body(DriveManifest, lambda request: get_context(request).settings.max_manifest_bytes)
+read_manifest = json_body(DriveManifest, lambda settings: settings.max_manifest_bytes)
 
 
 @router.post(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, TypedDict
 
+import anyio
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -16,23 +17,24 @@ from schemas.api.common import Page
 from schemas.api.drives import DeclaredFiles, DeclareFiles, DriveFileResource, StoredFiles
 from service.context import Context
 from service.errors import ServiceError
-from service.persistence import drives
+from service.persistence import drives, slots
 from service.persistence.idempotency import Answer
 from service.persistence.storing import storing
 from service.persistence.tables import Blob, DriveFile
 from service.routes.bodies import Body, describe, describe_bytes, json_body
-from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, get_context, problems
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, problems
 from service.routes.paging import cursor_of, position_of
 from service.uploads.archive import unpack
 from service.uploads.archive_limits import ArchiveLimits
 from service.uploads.digests import parse_digest
 from service.uploads.images import check_image
-from service.uploads.spool import Spooled, receive
+from service.uploads.spool import Spooled, receive, receive_into
 
 router = APIRouter(prefix="/v1/drives/{drive_id}", tags=["files"])
 
 _DRAINED_BYTES = 16 << 20
-read_declaration = json_body(DeclareFiles, lambda request: get_context(request).settings.max_json_bytes)
+_LARGE_BYTES = 4 << 20  # from here on a file that is not wanted is refused before its bytes come
+read_declaration = json_body(DeclareFiles, lambda settings: settings.max_json_bytes)
 
 ContentDigest = Annotated[
     str | None,
@@ -117,13 +119,18 @@ async def put_file(
     """Store one file of an open drive, whole or not at all. Sending the same bytes again changes nothing."""
     stream = request.stream()
     try:
-        await run_in_threadpool(_require_wanted, context, caller.project_id, drive_id, path)
-        spooled = await _received(request, stream, context, context.settings.max_file_bytes, content_digest)
+        if int(request.headers.get("content-length", _LARGE_BYTES)) >= _LARGE_BYTES:
+            await run_in_threadpool(_require_wanted, context, caller.project_id, drive_id, path)
+        new, shown = await receive_into(
+            lambda spooled: _keep(context, caller.project_id, drive_id, path, spooled, replace),
+            stream,
+            context.settings.spool_dir,
+            max_bytes=context.settings.max_file_bytes,
+            **_announced(request, context, content_digest),
+        )
     except ServiceError:
         await _drain(request, stream)
         raise
-    with spooled:
-        new, shown = await run_in_threadpool(_keep, context, caller.project_id, drive_id, path, spooled, replace)
     response.status_code = 201 if new else 200
     return shown
 
@@ -132,7 +139,7 @@ async def put_file(
 def delete_file(drive_id: str, path: str, caller: CallerDep, context: ContextDep) -> None:
     """Forget the bytes of one file of an open drive."""
     with context.database.write() as session:
-        drives.detach(session, drives.get(session, caller.project_id, drive_id, lock=True), path)
+        slots.empty(session, slots.find(session, caller.project_id, drive_id, path, lock=True))
 
 
 @router.put(
@@ -154,7 +161,12 @@ async def put_archive(
     stream = request.stream()
     try:
         await run_in_threadpool(_require_open, context, caller.project_id, drive_id)
-        archive = await _received(request, stream, context, context.settings.max_archive_bytes, content_digest)
+        archive = await receive(
+            stream,
+            context.settings.spool_dir,
+            max_bytes=context.settings.max_archive_bytes,
+            **_announced(request, context, content_digest),
+        )
     except ServiceError:
         await _drain(request, stream)
         raise
@@ -162,19 +174,22 @@ async def put_archive(
         return await run_in_threadpool(_unpack, context, caller.project_id, drive_id, archive, replace)
 
 
-async def _received(
-    request: Request, stream: AsyncIterator[bytes], context: Context, max_bytes: int, content_digest: str | None
-) -> Spooled:
+class _Announced(TypedDict):
+    expected_bytes: int | None
+    expected_sha256: str | None
+    min_free_bytes: int
+    on_disk: anyio.CapacityLimiter
+
+
+def _announced(request: Request, context: Context, content_digest: str | None) -> _Announced:
+    """What is known of a body before it comes, and how it may be written."""
     length = request.headers.get("content-length")
-    return await receive(
-        stream,
-        context.settings.spool_dir,
-        max_bytes=max_bytes,
-        expected_bytes=None if length is None else int(length),
-        expected_sha256=parse_digest(content_digest),
-        min_free_bytes=context.settings.min_free_disk_bytes,
-        on_disk=context.disk,
-    )
+    return {
+        "expected_bytes": None if length is None else int(length),
+        "expected_sha256": parse_digest(content_digest),
+        "min_free_bytes": context.settings.min_free_disk_bytes,
+        "on_disk": context.disk,
+    }
 
 
 async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
@@ -194,8 +209,7 @@ async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
 def _require_wanted(context: Context, project_id: str, drive_id: str, path: str) -> None:
     """Refuse a file that would not be taken, before its bytes are."""
     with context.database.read() as session:
-        drive = drives.get(session, project_id, drive_id)
-        drives.require_file(session, drive, path)
+        slots.find(session, project_id, drive_id, path)
 
 
 def _require_open(context: Context, project_id: str, drive_id: str) -> None:
@@ -206,14 +220,21 @@ def _require_open(context: Context, project_id: str, drive_id: str) -> None:
 def _keep(
     context: Context, project_id: str, drive_id: str, path: str, spooled: Spooled, replace: bool
 ) -> tuple[bool, DriveFileResource]:
-    check_image(spooled.path, path)
+    try:
+        check_image(spooled.path, path)
+    except ServiceError:
+        _require_wanted(context, project_id, drive_id, path)  # that there is no such drive matters more
+        raise
     with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
         stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
         with context.database.write(durable=False) as session:  # the drive's commit makes it so
-            drive = drives.get(session, project_id, drive_id, lock=True)
-            new, file, blob = drives.attach(session, drive, path, stored, replace=replace)
-        store.recorded(blob.key)
-        return new, _shown(file, blob)
+            slot = slots.find(session, project_id, drive_id, path, lock=True)
+            blob = slots.fill(session, slot, stored, replace=replace)
+        if blob is not None:
+            store.recorded(blob.key)
+    return blob is not None, DriveFileResource.model_validate(
+        {"path": path, "role": slot.role, "stored": True, "size_bytes": stored.size_bytes, "sha256": stored.sha256}
+    )
 
 
 def _unpack(context: Context, project_id: str, drive_id: str, archive: Spooled, replace: bool) -> StoredFiles:
@@ -253,7 +274,8 @@ def _keep_all(
         with context.database.write() as session:
             drive = drives.get(session, project_id, drive_id, lock=True)
             for name, file in stored:
-                drives.attach(session, drive, name, file, replace=replace)
+                slot = slots.find(session, project_id, drive_id, name)
+                slots.fill(session, slot, file, replace=replace)
             count = drives.stored_of(session, [drive_id])[drive_id].files
             return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
 

@@ -15,13 +15,13 @@ from service.persistence import drives, jobs
 from service.persistence.idempotency import Answer
 from service.persistence.tables import now_us
 from service.routes.bodies import Body, describe, json_body
-from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us, get_context, problems
+from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us, problems
 from service.routes.drives import rejected
 from service.routes.job_views import RETRY_AFTER_S, shown
 
 router = APIRouter(prefix="/v1/reconstructions", tags=["jobs"])
 
-read_request = json_body(ReconstructionRequest, lambda request: get_context(request).settings.max_json_bytes)
+read_request = json_body(ReconstructionRequest, lambda settings: settings.max_json_bytes)
 
 
 @router.post(

@@ -97,13 +97,14 @@ class SpoolWriter:
         with self._lock, _full_disk_is_507():
             if self._descriptor is None:
                 return
-            require_space(self._folder, sum(map(len, parts)), min_free_bytes=self._min_free_bytes)
-            for part in parts:
-                rest = memoryview(part)
-                while rest:
-                    rest = rest[os.write(self._descriptor, rest) :]
-                self._hash.update(part)
-                self._size_bytes += len(part)
+            # In one piece: each call to write and hash hands Python's lock over and has to get it back.
+            data = parts[0] if len(parts) == 1 else b"".join(parts)
+            require_space(self._folder, len(data), min_free_bytes=self._min_free_bytes)
+            rest = memoryview(data)
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+            self._hash.update(data)
+            self._size_bytes += len(data)
 
     def finish(self, *parts: Part) -> Spooled:
         """Append the last bytes. Whoever keeps the file for good sees to it that it survives a power cut."""
@@ -134,12 +135,39 @@ async def receive(
     min_free_bytes: int,
     on_disk: DiskLimiter,
 ) -> Spooled:
+    """As `receive_into`; the file itself."""
+    return await receive_into(
+        lambda spooled: spooled,
+        stream,
+        folder,
+        max_bytes=max_bytes,
+        expected_bytes=expected_bytes,
+        expected_sha256=expected_sha256,
+        min_free_bytes=min_free_bytes,
+        on_disk=on_disk,
+    )
+
+
+async def receive_into(
+    keep: Callable[[Spooled], Result],
+    stream: AsyncIterator[bytes],
+    folder: Path,
+    *,
+    max_bytes: int,
+    expected_bytes: int | None,
+    expected_sha256: str | None,
+    min_free_bytes: int,
+    on_disk: DiskLimiter,
+) -> Result:
     """Write a request's body to a file of the spool folder, in constant memory and off the event loop.
 
     Whatever goes wrong, also a client that goes away and a cancelled task, nothing stays behind.
 
     Parameters
     ----------
+    keep
+        What becomes of the file. Called in the thread that wrote its last bytes, while it holds its place on the disk.
+        Where it raises, the file is removed.
     stream
         The body's chunks.
     expected_bytes, expected_sha256
@@ -175,9 +203,7 @@ async def receive(
                 batch, batched_bytes = [], 0
         if expected_bytes is not None and received_bytes < expected_bytes:
             raise _wrong_length(f"{received_bytes} of", expected_bytes)
-        spooled = await writer.finish(batch)
-        _check_digest(spooled.sha256, expected_sha256)
-        return spooled
+        return await writer.finish(batch, lambda spooled: keep(_checked(spooled, expected_sha256)))
     except BaseException:
         with anyio.CancelScope(shield=True):
             await writer.discard()
@@ -238,9 +264,9 @@ class _BatchWriter:
         await self._written()
         self._writing = asyncio.create_task(self._off_the_loop(self._writer.write, batch))
 
-    async def finish(self, batch: list[bytes]) -> Spooled:
+    async def finish(self, batch: list[bytes], keep: Callable[[Spooled], Result]) -> Result:
         await self._written()
-        return await self._off_the_loop(self._writer.finish, batch)
+        return await self._off_the_loop(lambda *parts: keep(self._writer.finish(*parts)), batch)
 
     async def discard(self) -> None:
         if self._writing is not None:
@@ -268,15 +294,16 @@ def _full_disk_is_507() -> Iterator[None]:
         raise
 
 
-def _check_digest(found: str, expected: str | None) -> None:
-    if expected is not None and found != expected.lower():
+def _checked(spooled: Spooled, expected_sha256: str | None) -> Spooled:
+    if expected_sha256 is not None and spooled.sha256 != expected_sha256.lower():
         raise ServiceError(
             422,
             "wrong-digest",
             "Wrong digest",
-            f"the bytes received have the SHA-256 {found}, announced is {expected.lower()}",
+            f"the bytes received have the SHA-256 {spooled.sha256}, announced is {expected_sha256.lower()}",
             remedy="Send the file again; if it was changed since the digest was taken, take it anew.",
         )
+    return spooled
 
 
 def _too_large(size: str, max_bytes: int) -> ServiceError:

@@ -9,6 +9,7 @@ import argparse
 import hashlib
 import json
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -82,7 +83,9 @@ def large_upload(api: ApiProcess, folder: Path, files: int) -> dict[str, Any]:
     """Send a drive of many files, and compare with a process that only hashes and writes the same bytes."""
     payload = Payload(os.urandom(FILE_BYTES - len(_PNG)))
     plain_s = _timed(lambda: _hash_and_write(payload, folder / "plain", files, durable=False))
+    _settled(folder / "plain")
     durable_s = _timed(lambda: _hash_and_write(payload, folder / "durable", files, durable=True))
+    _settled(folder / "durable")
     client = api.client()
     document = manifest("long", frames=files // len(CAMERAS))
     drive_id = client.post("/v1/drives", json=document).raise_for_status().json()["id"]
@@ -119,6 +122,12 @@ def _hash_and_write(payload: Payload, folder: Path, files: int, *, durable: bool
                 file.flush()
                 os.fsync(file.fileno())
         digest.hexdigest()
+
+
+def _settled(folder: Path) -> None:
+    """Nothing of what was measured before is still being written while the next is measured."""
+    shutil.rmtree(folder)
+    os.sync()
 
 
 def _send(client: Client, drive_id: str, paths: list[str], payload: Payload) -> None:

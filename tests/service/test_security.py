@@ -13,7 +13,7 @@ import pytest
 from service.persistence.database import migrate
 from service.persistence.keys import ensure_first_key, revoke_key
 from service.persistence.tables import ApiKey
-from tests.service.live_api import Api, Client, api_process, problem_of, settings_of
+from tests.service.live_api import Api, Client, api_process, problem_of, settings_of, wait_until
 from tests.service.tiny_drive import tiny_drive
 
 OPEN = {"/livez", "/readyz", "/metrics"}
@@ -120,6 +120,7 @@ def test_a_revoked_key_opens_nothing(api: Api, client: Client) -> None:
         (key,) = session.query(ApiKey).filter_by(project_id=client.project_id)
         assert revoke_key(session, key.id)
         assert not revoke_key(session, "key_0")
+    wait_until(lambda: client.get("/v1/drives").status_code == 401, "the end of the key")
     problem_of(client.get("/v1/drives"), 401, "unauthorized")
 
 

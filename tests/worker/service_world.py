@@ -16,7 +16,7 @@ import psutil
 from schemas.api.jobs import JobKind
 from schemas.parsing import parse_manifest
 from service import broker
-from service.persistence import drives, jobs
+from service.persistence import drives, jobs, slots
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.database import Database, migrate
 from service.persistence.keys import create_project
@@ -189,7 +189,7 @@ class World:
                 session, project_id=self.project_id, manifest=manifest, stored=stored, expires_us=None
             )
             for path, file in files.items():
-                drives.attach(session, drive, path, file, replace=False)
+                slots.fill(session, slots.find(session, self.project_id, drive.id, path), file, replace=False)
             return drive.id, drives.commit(session, drive, []).id
 
     def _store(self, path: Path) -> StoredFile:

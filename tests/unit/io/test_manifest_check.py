@@ -210,7 +210,7 @@ def test_monstrous_manifest_is_refused_in_bounded_memory(drive_document: Documen
     """Twelve megabytes that unpack to many hundred."""
     monstrous = copy.deepcopy(drive_document)
     monstrous["frames"] = []
-    text = json.dumps(monstrous).replace('"frames": []', '"frames": [' + ",".join(["{}"] * 4_000_000) + "]")
+    text = json.dumps(monstrous).replace('"frames": []', '"frames": [' + ",".join(["{}"] * 3_900_000) + "]")
     path = tmp_path / "drive.json"
     path.write_text(text, encoding="utf-8")
     result = command("--manifest-only", "--json", "--max-memory-mb", 200, path)
