@@ -194,7 +194,9 @@ class Frame(_Model):
     source_frame: Annotated[int, Field(ge=0, le=2**31 - 1, strict=True)] = Field(
         description="the frame's number in the recording it comes from; no two frames share one"
     )
-    images: dict[Name, FrameImage] = Field(description="by camera name; a camera may be missing")
+    images: dict[Name, FrameImage] = Field(
+        max_length=MAX_CAMERAS, description="by camera name; a camera may be missing"
+    )
 
 
 class GnssSample(_Model):

@@ -14,7 +14,11 @@ MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS 
 # 100,000 frames of 8 cameras and a million GNSS samples have 9 million values, in 3 million objects and lists.
 MAX_VALUES = 12_000_000
 MAX_CONTAINERS = 4_000_000
+# The widest object of any contract is a label map of 256 ids. Each unknown key costs a kilobyte to describe.
+MAX_KEYS = 256
+MAX_PROBLEMS = 100
 MAX_PROBLEMS_SHOWN = 5
+MAX_KEY_SHOWN = 80
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -33,14 +37,17 @@ class DocumentError(ValueError):
     Parameters
     ----------
     problems
-        All defects that were found, in document order; at least one.
+        The first defects that were found, in document order; at least one.
+    count
+        Of all defects, where there are more.
     """
 
-    def __init__(self, problems: list[FieldProblem]) -> None:
+    def __init__(self, problems: list[FieldProblem], *, count: int | None = None) -> None:
         self.problems = problems
         shown = [f"{p.path}: {p.what}" if p.path else p.what for p in problems[:MAX_PROBLEMS_SHOWN]]
-        if len(problems) > MAX_PROBLEMS_SHOWN:
-            shown.append(f"and {len(problems) - MAX_PROBLEMS_SHOWN} more")
+        more = (count or len(problems)) - len(shown)
+        if more:
+            shown.append(f"and {more} more")
         super().__init__("; ".join(shown))
 
 
@@ -65,41 +72,37 @@ def parse_document(
     raw
         UTF-8 text, at most `max_bytes`.
     strict
-        Whether types must match exactly (no numbers in strings, no true for 1) and keys may not repeat. Large tables of
-        published datasets are read faster without.
+        Whether types must match exactly (no numbers in strings, no true for 1) and keys may not repeat nor be more
+        than `MAX_KEYS` in one object. Large tables of published datasets are read faster without.
 
     Raises
     ------
     DocumentError
-        If the text is too large, no valid UTF-8 or JSON, holds NaN or Infinity or a key twice in one object, or does
-        not fit the model.
+        If the text is too large, no valid UTF-8 or JSON, holds NaN or Infinity, too many keys or one twice in one
+        object, or does not fit the model.
     """
-    if len(raw) > max_bytes:
-        raise DocumentError([FieldProblem("", f"has {len(raw)} bytes, over the bound of {max_bytes}")])
-    raw = raw.removeprefix(b"\xef\xbb\xbf")
-    # An empty object is two bytes on the wire and a hundred in memory.
-    for what, count, bound in (
-        ("objects and lists", raw.count(b"{") + raw.count(b"["), MAX_CONTAINERS),
-        ("values", raw.count(b","), MAX_VALUES),
-    ):
-        if count > bound:
-            raise DocumentError([FieldProblem("", f"has {count} {what}, over the bound of {bound}")])
     if strict:
-        parse_json(raw)
+        parse_json(raw, max_bytes=max_bytes)
+    else:
+        _require_bounded(raw, max_bytes)
     try:
-        return model.model_validate_json(raw, strict=strict)
+        return model.model_validate_json(raw.removeprefix(b"\xef\xbb\xbf"), strict=strict)
     except ValidationError as error:
-        raise DocumentError([_problem(dict(detail)) for detail in error.errors(include_url=False)]) from None
+        details = error.errors(include_url=False, include_context=False)
+        problems = [_problem(dict(detail)) for detail in details[:MAX_PROBLEMS]]
+        raise DocumentError(problems, count=len(details)) from None
 
 
-def parse_json(raw: bytes) -> Any:
+def parse_json(raw: bytes, *, max_bytes: int = MAX_MANIFEST_BYTES) -> Any:
     """The value of JSON bytes, without the extensions that Python's parser allows.
 
     Raises
     ------
     DocumentError
-        If the text is no valid UTF-8 or JSON, or holds NaN, Infinity or a key twice in one object.
+        If the text is too large, no valid UTF-8 or JSON, or holds NaN, Infinity, too many keys or one twice in one
+        object.
     """
+    _require_bounded(raw, max_bytes)
     try:
         text = raw.removeprefix(b"\xef\xbb\xbf").decode("utf-8")
     except UnicodeDecodeError as error:
@@ -117,13 +120,32 @@ def parse_json(raw: bytes) -> Any:
         raise DocumentError([FieldProblem("", f"is not valid JSON: {error}")]) from None
 
 
+def _require_bounded(raw: bytes, max_bytes: int) -> None:
+    if len(raw) > max_bytes:
+        raise DocumentError([FieldProblem("", f"has {len(raw)} bytes, over the bound of {max_bytes}")])
+    # An empty object is two bytes on the wire and a hundred in memory.
+    for what, count, bound in (
+        ("objects and lists", raw.count(b"{") + raw.count(b"["), MAX_CONTAINERS),
+        ("values", raw.count(b","), MAX_VALUES),
+    ):
+        if count > bound:
+            raise DocumentError([FieldProblem("", f"has {count} {what}, over the bound of {bound}")])
+
+
 def _object_without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result = dict(pairs)
-    if len(result) != len(pairs):
-        keys = [key for key, _ in pairs]
-        repeated = next(key for i, key in enumerate(keys) if key in keys[:i])
-        raise DocumentError([FieldProblem("", f"key {repeated!r} appears twice in one object")])
+    if len(pairs) > MAX_KEYS:
+        what = f"an object has {len(pairs)} keys, over the bound of {MAX_KEYS}; one is {_shortened(pairs[-1][0])}"
+        raise DocumentError([FieldProblem("", what)])
+    result: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in result:
+            raise DocumentError([FieldProblem("", f"key {_shortened(key)} appears twice in one object")])
+        result[key] = value
     return result
+
+
+def _shortened(key: str) -> str:
+    return repr(key if len(key) <= MAX_KEY_SHOWN else key[:MAX_KEY_SHOWN] + "...")
 
 
 def _refuse_constant(name: str) -> Never:

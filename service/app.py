@@ -12,6 +12,7 @@ from importlib.metadata import version
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from obstore.exceptions import BaseError
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
@@ -19,9 +20,10 @@ from starlette.requests import ClientDisconnect
 
 from schemas.api.problems import MEDIA_TYPE, ProblemItem
 from service.context import Context
-from service.errors import ServiceError
+from service.errors import ServiceError, store_unavailable
 from service.metrics import Metrics
 from service.openapi import allowed_methods, openapi_page
+from service.readiness import Readiness
 from service.request_log import RequestLog
 from service.routes import drives, files, jobs, operations, reconstructions, scenes
 from service.routes.documentation import add_documentation
@@ -64,6 +66,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="MRASfM", version=version("mrasfm"), description=_ABOUT, lifespan=lifespan, docs_url=None, redoc_url=None
     )
     app.state.context = context
+    app.state.readiness = Readiness(context)
     for module in (drives, files, reconstructions, jobs, scenes, operations):
         app.include_router(module.router)
     app.include_router(operations.metrics_route(metrics))
@@ -121,6 +124,11 @@ def _answer_errors(app: FastAPI) -> None:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return problem_response(_disk_full())
         raise error
+
+    @app.exception_handler(BaseError)
+    async def store(request: Request, error: BaseError) -> Response:
+        log.error("the artifact store does not answer", exc_info=error)
+        return problem_response(store_unavailable())
 
     @app.exception_handler(PoolTimeout)
     @app.exception_handler(InterfaceError)

@@ -12,6 +12,10 @@ from service.persistence.keys import KeyRing
 from service.persistence.wakeups import Wakeups
 from service.settings import Settings
 
+_LARGE_BODIES = 4
+_COMMITS = 2
+_UNPACKING = 2
+
 
 @dataclass(frozen=True, kw_only=True)
 class Context:
@@ -23,7 +27,11 @@ class Context:
     artifacts: ArtifactStore
     wakeups: Wakeups
     disk: anyio.CapacityLimiter  # uploads that write at one time
-    large_documents: anyio.CapacityLimiter  # that are parsed at one time
+    large_bodies: anyio.CapacityLimiter  # JSON bodies that are in memory at one time
+    large_documents: anyio.CapacityLimiter  # of these, what is parsed and recorded at one time
+    # Of their own, so that what takes minutes leaves the threads of all other requests alone.
+    commits: anyio.CapacityLimiter
+    unpacking: anyio.CapacityLimiter
 
     @classmethod
     def open(cls, settings: Settings) -> Context:
@@ -36,5 +44,8 @@ class Context:
             artifacts=ArtifactStore(settings),
             wakeups=Wakeups(settings),
             disk=anyio.CapacityLimiter(settings.max_concurrent_writes),
+            large_bodies=anyio.CapacityLimiter(_LARGE_BODIES),
             large_documents=anyio.CapacityLimiter(1),
+            commits=anyio.CapacityLimiter(_COMMITS),
+            unpacking=anyio.CapacityLimiter(_UNPACKING),
         )

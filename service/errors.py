@@ -56,6 +56,18 @@ class ServiceError(Exception):
         )
 
 
+def store_unavailable() -> ServiceError:
+    """503: the artifact store does not answer, or misses what it should hold."""
+    return ServiceError(
+        503,
+        "store-unavailable",
+        "The artifact store does not answer",
+        "the bytes could not be stored or read; the request had no effect",
+        remedy="Repeat it in some seconds; if it fails again, tell the operator.",
+        headers={"Retry-After": "5"},
+    )
+
+
 def not_found(what: str, name: str) -> ServiceError:
     """404, the same for what never was, what was deleted and what belongs to another project."""
     return ServiceError(

@@ -30,15 +30,17 @@ def openapi_page(app: FastAPI) -> dict[str, Any]:
         page["components"]["schemas"] |= extra["$defs"]
         for unused in ("HTTPValidationError", "ValidationError"):
             page["components"]["schemas"].pop(unused, None)
-        for operation in _operations(page):
+        for path, operation in _operations(page):
             _correct_invalid(operation)
+            if path.startswith("/v1/"):
+                operation["responses"].setdefault("503", problems(503)[503])
         app.openapi_schema = page
     return app.openapi_schema
 
 
-def _operations(page: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    for methods in page["paths"].values():
-        yield from (methods[name] for name in _METHODS if name in methods)
+def _operations(page: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for path, methods in page["paths"].items():
+        yield from ((path, methods[name]) for name in _METHODS if name in methods)
 
 
 def _correct_invalid(operation: dict[str, Any]) -> None:

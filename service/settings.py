@@ -6,16 +6,32 @@ Everything has a default that suits one machine; production sets `MRASFM_DATABAS
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
-from pydantic import Field, SecretStr
+from pydantic import Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 Bytes = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0, le=7 * 86400, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
+
+
+_FITS: Mapping[str, Callable[[float, float], bool]] = {
+    "at most half of": lambda first, second: 2 * first <= second,
+    "less than": operator.lt,
+    "at most": operator.le,
+}
+# Times of which each is fine, and which together would take jobs from workers that live.
+_IN_STEP = (
+    ("heartbeat_seconds", "at most half of", "lease_seconds"),
+    ("heartbeat_seconds", "less than", "stalled_seconds"),
+    ("visibility_renew_seconds", "at most half of", "visibility_timeout_seconds"),
+    ("terminate_after_seconds", "at most", "kill_after_seconds"),
+)
 
 
 class Settings(BaseSettings):
@@ -69,6 +85,19 @@ class Settings(BaseSettings):
     scene_retention_days: Annotated[float, Field(gt=0)] | None = None
     job_retention_days: Annotated[float, Field(gt=0)] | None = None
     idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
+
+    @field_validator(*{name for first, _, second in _IN_STEP for name in (first, second)})
+    @classmethod
+    def _is_in_step(cls, value: float, info: ValidationInfo) -> float:
+        """Checked with the later field of two, so that the error names a field; defaults are checked too."""
+        given = {**info.data, info.field_name or "": value}
+        for first, relation, second in _IN_STEP:
+            if info.field_name not in (first, second) or not {first, second} <= given.keys():
+                continue
+            if not _FITS[relation](given[first], given[second]):
+                names = f"MRASFM_{first.upper()}", f"MRASFM_{second.upper()}"
+                raise ValueError(f"{names[0]} ({given[first]:g}) must be {relation} {names[1]} ({given[second]:g})")
+        return value
 
     @property
     def resolved_database_url(self) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from obstore.exceptions import BaseError as StoreError
+from sqlalchemy.exc import SQLAlchemyError
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -32,6 +33,7 @@ from worker.messages import Work
 from worker.outcomes import Abandoned, Cancelled, Failed, Outcome, Succeeded
 from worker.progress import Progress, ProgressMeter
 from worker.scratch import attempt_folder, sweep
+from worker.settling import PATIENCE_S, patiently, settle
 from worker.stages import Attempt, AttemptFolder, Verdict, run_attempt
 
 log = logging.getLogger("mrasfm.worker")
@@ -44,6 +46,8 @@ _TITLES = {
     "storage": "The worker's files or the artifact store failed",
     "worker-error": "The worker failed",
 }
+
+_PARTING_PATIENCE_S = 5.0  # a process that was told to end does not wait long for the database
 
 Counting = Callable[[int, int], None]  # done, total
 
@@ -108,8 +112,8 @@ class Runner:
         except SystemExit:
             # This process was told to end and not, or not only, the main one: by a cold shutdown, or by who signals
             # all of a service's processes at once.
-            with suppress(jobs.FencedError):
-                self._release(held)
+            with suppress(jobs.FencedError, SQLAlchemyError):  # else the job's lease runs out
+                self._release(held, patience_s=_PARTING_PATIENCE_S)
             raise
 
     def _do(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> None:
@@ -170,25 +174,23 @@ class Runner:
     def _record(self, held: jobs.Claim, outcome: Outcome, progress: Counting) -> None:
         match outcome:
             case Succeeded() if held.kind is JobKind.PREFLIGHT:
-                with self._database.write() as session:
-                    jobs.record_findings(session, held, outcome.report["findings"], sound=outcome.report["sound"])
-                log.info("checked", extra={"fields": {"sound": outcome.report["sound"]}})
+                findings, sound = outcome.report["findings"], outcome.report["sound"]
+                settle(self._database, held, lambda s: jobs.record_findings(s, held, findings, sound=sound))
+                log.info("checked", extra={"fields": {"sound": sound}})
             case Succeeded():
                 self._publish(held, outcome, progress)
             case Failed():
                 self._fail(held, outcome)
             case Cancelled():
-                with self._database.write() as session:
-                    jobs.cancelled(session, held)
+                settle(self._database, held, lambda session: jobs.cancelled(session, held))
                 log.info("cancelled")
             case Abandoned(reason=StopReason.SHUT_DOWN):
                 self._release(held)
             case Abandoned():
                 raise jobs.FencedError
 
-    def _release(self, held: jobs.Claim) -> None:
-        with self._database.write() as session:
-            jobs.release(session, held)
+    def _release(self, held: jobs.Claim, *, patience_s: float = PATIENCE_S) -> None:
+        settle(self._database, held, lambda session: jobs.release(session, held), patience_s=patience_s)
         log.info("released: this worker stops")
 
     def _fail(self, held: jobs.Claim, failed: Failed) -> None:
@@ -203,33 +205,39 @@ class Runner:
             retryable=failed.retryable,
             job_id=held.job_id,
         )
-        with self._database.write() as session:
-            state = jobs.fail(
+        state = settle(
+            self._database,
+            held,
+            lambda session: jobs.fail(
                 session,
                 held,
                 problem,
                 max_attempts=self._settings.max_attempts,
                 retry_delay_us=int(self._settings.retry_delay_seconds * 1e6),
-            )
+            ),
+        )
         log.error("the attempt failed", extra={"fields": {"code": failed.code, "what": failed.what, "job": state}})
 
     def _publish(self, held: jobs.Claim, done: Succeeded, progress: Counting) -> None:
         found = sorted(_artifacts(done.out).items())
         files = {}
         for i, (name, path) in enumerate(found):
-            files[name] = self._store(held, path)
+            files[name] = patiently(lambda path=path: self._store(held, path))  # type: ignore[misc]
             progress(i + 1, len(found))
         kept_days = self._settings.scene_retention_days
         expires_us = None if kept_days is None else now_us() + int(kept_days * 86400e6)
-        with self._database.write() as session:
-            scene_id = scenes.publish(
+        scene_id = settle(
+            self._database,
+            held,
+            lambda session: scenes.publish(
                 session,
                 held,
                 files=files,
                 summary=_summary(done.report),
                 expires_us=expires_us,
                 reused=[stage["stage"] for stage in done.report["stages"] if stage["reused"]],
-            )
+            ),
+        )
         log.info("published", extra={"fields": {"scene_id": scene_id}})
 
     def _store(self, held: jobs.Claim, path: Path) -> StoredFile:

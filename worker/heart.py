@@ -19,7 +19,7 @@ from worker.stages import Verdict
 
 log = logging.getLogger("mrasfm.worker")
 
-_TELL_EVERY_S = 1.0  # progress that changes is told this often, and once a heartbeat otherwise
+_LOOK_EVERY_S = 1.0  # progress that changes is told this often, and so is a request to cancel looked for
 _SURE_SHARE = 0.8  # of the lease: after that without an answer, another worker may soon hold the job
 
 
@@ -74,12 +74,14 @@ class Heart:
     def _beat_until_ended(self) -> None:
         sure_until_s = time.monotonic() + _SURE_SHARE * self._settings.lease_seconds
         beat_s = time.monotonic()
-        while not self._ended.wait(min(_TELL_EVERY_S, self._settings.heartbeat_seconds)):
+        while not self._ended.wait(min(_LOOK_EVERY_S, self._settings.heartbeat_seconds)):
             now_s = time.monotonic()
-            if not self._has_moved() and now_s - beat_s < self._settings.heartbeat_seconds:
-                continue
+            news = self._news()
             try:
-                self._beat(self._progress if self._progress != self._told else None)
+                if news is None and now_s - beat_s < self._settings.heartbeat_seconds:
+                    self._look()
+                    continue
+                self._beat(news)
             except jobs.FencedError:
                 return
             except SQLAlchemyError:
@@ -89,9 +91,15 @@ class Heart:
             else:
                 beat_s, sure_until_s = now_s, now_s + _SURE_SHARE * self._settings.lease_seconds
 
-    def _has_moved(self) -> bool:
-        """Whether there is more to tell than a new guess at the time to the end."""
-        return replace(self._progress, eta_s=None) != replace(self._told, eta_s=None)
+    def _news(self) -> Progress | None:
+        """Progress to tell; None where there is no more than a new guess at the time to the end."""
+        progress = self._progress
+        return None if replace(progress, eta_s=None) == replace(self._told, eta_s=None) else progress
+
+    def _look(self) -> None:
+        """See whether somebody asked for the job's end: that does not wait for the next heartbeat."""
+        with self._database.read() as session:
+            self._cancel = jobs.cancel_requested(session, self._held)
 
     def _beat(self, news: Progress | None) -> None:
         lease_us = int(self._settings.lease_seconds * 1e6)

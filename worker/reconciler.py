@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable
-from itertools import islice
 
 from sqlalchemy import delete, select
 
 from service.logs import log_fields
-from service.persistence import blobs, jobs, workers
+from service.persistence import jobs, workers
 from service.persistence.artifacts import ArtifactStore
+from service.persistence.collecting import collect_orphans, collect_unused
 from service.persistence.database import Database
 from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, Scene, now_us
 from service.persistence.wakeups import BrokerError, Wakeups, task_id
@@ -21,9 +20,11 @@ from service.settings import Settings
 log = logging.getLogger("mrasfm.reconciler")
 
 _HOUR_US = 3600 * 1_000_000
-_GRACE_US = _HOUR_US  # an upload or a publication refers to its bytes within this time
-_ORPHAN_US = 24 * _HOUR_US  # an object that no blob names is left from something that was killed
 _SWEEP_EVERY_S = 600.0
+_ORPHANS_FIRST_S = 3600.0  # not with every restart: listing a store costs time and, in the cloud, money
+_ORPHANS_EVERY_S = 86_400.0
+_END_WITHIN_S = 5.0
+_BATCH = 500
 
 
 class Reconciler:
@@ -37,14 +38,30 @@ class Reconciler:
         self._broker_was_there = True
 
     def run(self, ended: threading.Event) -> None:
-        """Reconcile again and again until `ended`."""
-        swept_s = -_SWEEP_EVERY_S
+        """Reconcile again and again until `ended`.
+
+        Deleting takes its time, above all in the cloud: jobs of workers that died do not wait for it.
+        """
+        threads = [
+            threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
+            for task in (
+                ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
+                ("orphans", self.collect_orphans, _ORPHANS_EVERY_S, _ORPHANS_FIRST_S),
+            )
+        ]
+        for thread in threads:
+            thread.start()
+        self._repeat(ended, "jobs", self.reconcile_jobs, self._settings.reconcile_seconds, 0.0)
+        for thread in threads:
+            thread.join(_END_WITHIN_S)  # what is cut short is done by the next one
+
+    def _repeat(
+        self, ended: threading.Event, what: str, step: Callable[[], None], every_s: float, first_s: float
+    ) -> None:
+        ended.wait(first_s)
         while not ended.is_set():
-            self._try("jobs", self.reconcile_jobs)
-            if time.monotonic() - swept_s > _SWEEP_EVERY_S:
-                swept_s = time.monotonic()
-                self._try("sweep", self.sweep)
-            ended.wait(self._settings.reconcile_seconds)
+            self._try(what, step)
+            ended.wait(every_s)
 
     def _try(self, what: str, step: Callable[[], None]) -> None:
         try:
@@ -60,14 +77,14 @@ class Reconciler:
             with log_fields(job_id=job_id):
                 log.warning("the worker was not heard of any more")
         with self._database.read() as session:
-            due = jobs.due(session)
+            due = list(jobs.all_due(session))
         if not due:
             return
         try:
             known = self._wakeups.waiting()
             missing = [job for job in due if task_id(job) not in known]
-            if missing:
-                self._wakeups.send(missing)
+            for i in range(0, len(missing), _BATCH):
+                self._send(missing[i : i + _BATCH])
         except BrokerError as error:
             if self._broker_was_there:
                 log.warning("the broker does not answer", extra={"fields": {"why": str(error), "jobs": len(due)}})
@@ -76,14 +93,20 @@ class Reconciler:
         self._broker_was_there = True
         if missing:
             log.info("woke workers up", extra={"fields": {"jobs": len(missing)}})
-            with self._database.write() as session:
-                jobs.mark_enqueued(session, [job.id for job in missing])
+
+    def _send(self, missing: list[Job]) -> None:
+        self._wakeups.send(missing)
+        with self._database.write() as session:
+            jobs.mark_enqueued(session, [job.id for job in missing])
 
     def sweep(self) -> None:
         """Delete what has passed its retention date, and bytes that nothing needs."""
-        self._expire()
-        self._collect_blobs()
-        self._collect_orphans()
+        self._try("retention", self._expire)
+        _tell(collect_unused(self._database, self._artifacts))
+
+    def collect_orphans(self) -> None:
+        """Delete bytes that no record names: all of the store is listed for it."""
+        _tell(collect_orphans(self._database, self._artifacts))
 
     def _expire(self) -> None:
         now = now_us()
@@ -96,18 +119,7 @@ class Reconciler:
             session.execute(delete(IdempotencyKey).where(IdempotencyKey.created_us < now - kept_us))
             workers.forget(session, unseen_since_us=now - 30 * 24 * _HOUR_US)
 
-    def _collect_blobs(self) -> None:
-        while True:
-            with self._database.write() as session:
-                keys = blobs.forget_unused(session, untouched_since_us=now_us() - _GRACE_US)
-            if not keys:
-                return
-            self._artifacts.delete(keys)
-            log.info("deleted bytes that nothing needs", extra={"fields": {"objects": len(keys)}})
 
-    def _collect_orphans(self) -> None:
-        old = (o.key for o in self._artifacts.objects() if o.changed_us < now_us() - _ORPHAN_US)
-        while keys := list(islice(old, 500)):
-            with self._database.read() as session:
-                known = blobs.known_keys(session, keys)
-            self._artifacts.delete(set(keys) - known)
+def _tell(deleted: int) -> None:
+    if deleted:
+        log.info("deleted bytes that nothing needs", extra={"fields": {"objects": deleted}})

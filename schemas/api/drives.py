@@ -6,9 +6,9 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, FailFast, Field
 
-from schemas.api.common import Finding, RequestBody, Resource, Sha256, Times
+from schemas.api.resource import Finding, RequestBody, Resource, Sha256, Times
 from schemas.drive import RelativePath
 
 MAX_DECLARED_FILES = 10_000
@@ -132,7 +132,7 @@ class DeclareFiles(RequestBody):
         }
     )
 
-    files: Annotated[list[FileDeclaration], Field(min_length=1, max_length=MAX_DECLARED_FILES)]
+    files: Annotated[list[FileDeclaration], Field(min_length=1, max_length=MAX_DECLARED_FILES), FailFast()]
 
 
 class DeclaredFiles(Resource):

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, StringConstraints
 
-from schemas.api.common import RequestBody, Resource, Times
 from schemas.api.problems import Problem
+from schemas.api.resource import RequestBody, Resource, Times
 
 DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field
 
-from schemas.api.common import Resource, Sha256, Times
+from schemas.api.resource import Resource, Sha256, Times
 
 
 class SceneFileResource(Resource):

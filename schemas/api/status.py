@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from pydantic import ConfigDict, Field
 
-from schemas.api.common import Resource
+from schemas.api.resource import Resource
 
 
 class Health(StrEnum):

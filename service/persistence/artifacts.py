@@ -13,8 +13,9 @@ import hashlib
 import os
 import secrets
 import shutil
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -26,6 +27,17 @@ from service.settings import Settings
 
 _CHUNK_BYTES = 1 << 20
 _DELETE_BATCH = 500
+_PREFIX = "blobs"  # of all keys that are listed
+# A store that is silent must not hold the threads of all requests for minutes, as it does by default.
+_PATIENCE = {
+    "connect_timeout": timedelta(seconds=5),
+    "read_timeout": timedelta(seconds=30),  # without a byte of the answer; no request sends more than some MiB
+    "timeout": timedelta(minutes=15),  # to the last byte of a large object
+}
+_RETRIES = {"max_retries": 3, "retry_timeout": timedelta(seconds=15)}
+# Whether the store can be used is asked often, and a late answer is of no use.
+_PROBE_PATIENCE = {"connect_timeout": timedelta(seconds=3), "timeout": timedelta(seconds=3)}
+_PROBE_RETRIES = {"max_retries": 0}
 
 
 @dataclass(frozen=True)
@@ -55,12 +67,14 @@ class ArtifactStore:
         url = settings.resolved_artifacts_url
         self._root: Path | None = None
         self._store: Any = None
+        self._probed: Any = None
         self._safe_folders: set[Path] = set()
         if url.startswith("file://"):
             self._root = Path(unquote(urlsplit(url).path))
             self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
         else:
-            self._store = from_url(url, **_options(url, settings))
+            self._store = _open(url, settings, _PATIENCE, _RETRIES)
+            self._probed = _open(url, settings, _PROBE_PATIENCE, _PROBE_RETRIES)
 
     @property
     def folder(self) -> Path | None:
@@ -205,20 +219,20 @@ class ArtifactStore:
                 obstore.delete(self._store, wanted[i : i + _DELETE_BATCH])
 
     def objects(self) -> Iterator[StoredObject]:
-        """All objects, in no order."""
+        """What lies where blobs do, in no order; in a bucket that is shared not all of it is ours."""
         if self._root is not None:
-            for path in self._root.rglob("*"):
+            for path in (self._root / _PREFIX).rglob("*"):
                 with contextlib.suppress(FileNotFoundError):
                     status = path.stat()
                     if path.is_file():  # its mtime is made of its content, its ctime is not
                         yield StoredObject(path.relative_to(self._root).as_posix(), status.st_ctime_ns // 1000)
             return
-        for batch in obstore.list(self._store):
+        for batch in obstore.list(self._store, prefix=_PREFIX):
             for item in batch:
                 yield StoredObject(item["path"], int(item["last_modified"].timestamp() * 1e6))
 
     def require_writable(self) -> None:
-        """Write, read and remove a small object.
+        """Write and remove a small object, within seconds.
 
         Raises
         ------
@@ -234,18 +248,19 @@ class ArtifactStore:
             finally:
                 path.unlink(missing_ok=True)
         else:
-            obstore.put(self._store, key, b"probe")
-            obstore.delete(self._store, key)
+            obstore.put(self._probed, key, b"probe")
+            obstore.delete(self._probed, key)
 
 
-def _options(url: str, settings: Settings) -> dict[str, Any]:
-    if not url.startswith("s3"):
-        return {}
-    options: dict[str, Any] = {"region": settings.s3_region}
-    if settings.s3_endpoint:
-        options["endpoint"] = settings.s3_endpoint
-        options["client_options"] = {"allow_http": settings.s3_endpoint.startswith("http://")}
-    return options
+def _open(url: str, settings: Settings, patience: Mapping[str, Any], retries: Mapping[str, Any]) -> Any:
+    client = dict(patience)
+    options: dict[str, Any] = {"client_options": client, "retry_config": dict(retries)}
+    if url.startswith("s3"):
+        options["region"] = settings.s3_region
+        if settings.s3_endpoint:
+            options["endpoint"] = settings.s3_endpoint
+            client["allow_http"] = settings.s3_endpoint.startswith("http://")
+    return from_url(url, **options)
 
 
 def _sync(path: Path) -> None:

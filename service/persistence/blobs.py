@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import secrets
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +27,8 @@ class Recorded:
     size_bytes: int
 
 
+# A blob's object, or a copy of it that was begun.
+_KEY = re.compile(r"blobs/(prj_[0-9a-f]+)/[0-9a-f]{2}/(?:[0-9a-f]{64}-[0-9a-f]{8}|\.[0-9a-f]{16}\.partial)")
 _INSERT: dict[str, Any] = {
     name: dialect.insert(Blob).on_conflict_do_nothing().returning(Blob.id)
     for name, dialect in (("postgresql", postgresql), ("sqlite", sqlite))
@@ -34,12 +39,19 @@ _TAKE_SPACE = (
     .values(used_bytes=Project.used_bytes + bindparam("size"))
     .execution_options(synchronize_session=False)
 )
+_LOCK_PROJECT = select(Project.id).where(Project.id == bindparam("project")).with_for_update(key_share=True)
 _TAKE_SPACE_WITHIN_QUOTA = _TAKE_SPACE.where(Project.used_bytes + bindparam("size") <= Project.max_bytes)
 
 
 def new_key(project_id: str, sha256: str) -> str:
     """Where a content that is not stored yet goes in the artifact store."""
     return f"blobs/{project_id}/{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+
+
+def project_of(key: str) -> str | None:
+    """The project that a key was made for; None where it was not made by us."""
+    made = _KEY.fullmatch(key)
+    return None if made is None else made[1]
 
 
 def exists(session: Session, project_id: str, sha256: str) -> bool:
@@ -63,16 +75,20 @@ def record(
     sha256: str,
     size_bytes: int,
     key: str,
+    is_new: bool = True,
     written_in_boot: str | None = None,
     within_quota: bool = True,
 ) -> Recorded:
-    """The project's blob of a content that was just stored under `key`.
+    """The project's blob of a content that was stored under `key`.
 
     Where the content was there already the older blob is returned, whose key differs: the caller deletes what it
     stored.
 
     Parameters
     ----------
+    is_new
+        Whether the caller has stored the object. Else it was found, and must still be there: an object of a blob that
+        is gone is deleted.
     written_in_boot
         Where a power cut could still take the bytes: see `durability`.
     within_quota
@@ -81,8 +97,15 @@ def record(
     Raises
     ------
     ServiceError
-        413 where the project's quota would be exceeded.
+        413 where the project's quota would be exceeded, 503 where the object that was found has been collected since.
     """
+    connection = session.connection()
+    if connection.dialect.name == "postgresql":
+        # First of all: two transactions with the same contents in another order would otherwise wait for each other,
+        # one for the blob, one for the project's space.
+        connection.execute(_LOCK_PROJECT, {"project": project_id})
+    if not is_new:
+        return _recorded_before(session, project_id, sha256)
     values = {
         "id": new_id("blb"),
         "project_id": project_id,
@@ -92,13 +115,28 @@ def record(
         "written_in_boot": written_in_boot,
         "touched_us": now_us(),
     }
-    connection = session.connection()
     if connection.execute(_INSERT[connection.dialect.name], values).first() is not None:
         _take_space(session, project_id, size_bytes, within_quota=within_quota)
         return Recorded(id=str(values["id"]), key=key, size_bytes=size_bytes)
+    return _recorded_before(session, project_id, sha256)
+
+
+def _recorded_before(session: Session, project_id: str, sha256: str) -> Recorded:
     blob = find(session, project_id, sha256)
-    assert blob is not None
+    if blob is None:
+        raise _storage_changed(sha256)
     return Recorded(id=blob.id, key=blob.key, size_bytes=blob.size_bytes)
+
+
+def _storage_changed(sha256: str) -> ServiceError:
+    return ServiceError(
+        503,
+        "storage-changed",
+        "The storage changed meanwhile",
+        f"the bytes with SHA-256 {sha256} were there when this began, and have been deleted since as unused",
+        remedy="Repeat it from the start: the bytes are stored anew then.",
+        headers={"Retry-After": "1"},
+    )
 
 
 def _take_space(session: Session, project_id: str, size_bytes: int, *, within_quota: bool) -> None:
@@ -130,32 +168,52 @@ def unused() -> ColumnElement[bool]:
     )
 
 
-def forget_unused(
-    session: Session, *, untouched_since_us: int, project_id: str | None = None, limit: int = 500
-) -> list[str]:
+def find_unused(
+    session: Session, project_id: str, *, untouched_since_us: int, after_sha256: str = "", limit: int
+) -> list[Blob]:
+    """A project's blobs that nothing refers to, in the order of their contents; what `forget_unused` may be given.
+
+    Parameters
+    ----------
+    after_sha256
+        The last content of the page before.
+    """
+    page = select(Blob).where(Blob.project_id == project_id, Blob.sha256 > after_sha256, _ripe(untouched_since_us))
+    return list(session.scalars(page.order_by(Blob.sha256).limit(limit)))
+
+
+def forget_unused(session: Session, *, untouched_since_us: int, blob_ids: Sequence[str] | None = None) -> list[str]:
     """Drop blobs that nothing refers to, and give their space back to their projects.
 
     Parameters
     ----------
-    project_id
-        Of this project only; by default of all.
+    blob_ids
+        Of these only, some hundreds; by default of all.
 
     Returns
     -------
     list of str
         Keys of objects to delete from the artifact store once this is committed.
     """
-    ripe = unused() & (Blob.touched_us < untouched_since_us)
-    if project_id is not None:
-        ripe &= Blob.project_id == project_id
-    keys = []
-    for blob in session.scalars(select(Blob).where(ripe).limit(limit)).all():
-        # Asked again: another transaction may have begun to use it.
-        if session.execute(delete(Blob).where(Blob.id == blob.id, ripe)).rowcount:  # type: ignore[attr-defined]
-            freed = Project.used_bytes - blob.size_bytes
-            session.execute(update(Project).where(Project.id == blob.project_id).values(used_bytes=freed))
-            keys.append(blob.key)
-    return keys
+    ripe = _ripe(untouched_since_us)  # asked again: another transaction may have begun to use one
+    if blob_ids is not None:
+        ripe &= Blob.id.in_(blob_ids)
+    # The projects first, as in `record`, and always in one order.
+    owners = select(Project.id).where(Project.id.in_(select(Blob.project_id).where(ripe))).order_by(Project.id)
+    session.execute(owners.with_for_update(key_share=True))
+    dropped = delete(Blob).where(ripe).returning(Blob.project_id, Blob.size_bytes, Blob.key)
+    rows = session.execute(dropped.execution_options(synchronize_session=False)).all()
+    freed: Counter[str] = Counter()
+    for row in rows:
+        freed[row.project_id] += row.size_bytes
+    for project_id, size_bytes in freed.items():
+        left = Project.used_bytes - size_bytes
+        session.execute(update(Project).where(Project.id == project_id).values(used_bytes=left))
+    return [row.key for row in rows]
+
+
+def _ripe(untouched_since_us: int) -> ColumnElement[bool]:
+    return unused() & (Blob.touched_us < untouched_since_us)
 
 
 def lose(session: Session, blob_id: str) -> None:
@@ -165,9 +223,20 @@ def lose(session: Session, blob_id: str) -> None:
     """
     session.execute(update(DriveFile).where(DriveFile.blob_id == blob_id).values(blob_id=None, stored_us=None))
     session.execute(update(Blob).where(Blob.id == blob_id).values(touched_us=0))
-    forget_unused(session, untouched_since_us=1)
+    forget_unused(session, untouched_since_us=1, blob_ids=[blob_id])
 
 
 def known_keys(session: Session, keys: list[str]) -> set[str]:
     """Those of the keys that belong to a blob."""
     return set(session.scalars(select(Blob.key).where(Blob.key.in_(keys))))
+
+
+def orphans(session: Session, keys: Sequence[str]) -> set[str]:
+    """Those of the keys that were made for projects of this database, and that no blob names.
+
+    Others share the bucket or the folder: what is not certainly ours is not an orphan.
+    """
+    owner = {key: project_id for key in keys if (project_id := project_of(key)) is not None}
+    ours = set(session.scalars(select(Project.id).where(Project.id.in_(set(owner.values())))))
+    known = known_keys(session, list(owner))
+    return {key for key, project_id in owner.items() if project_id in ours} - known

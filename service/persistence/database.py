@@ -15,6 +15,7 @@ from sqlalchemy import Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.orm import Session, sessionmaker
 
+from service.persistence.tables import now_us
 from service.settings import Settings
 
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -30,7 +31,7 @@ class Database:
     url
         SQLAlchemy's.
     patience_s
-        How long to wait for a lock of SQLite's, or for a server to answer.
+        How long to wait for a lock of SQLite's, or for a server to answer; a statement gets four times as long.
     """
 
     def __init__(self, url: str, *, patience_s: float = 30.0) -> None:
@@ -47,6 +48,9 @@ class Database:
     def read(self) -> Iterator[Session]:
         """A session that sees one state of the database and writes nothing."""
         with self._sessions() as session:
+            if self.engine.dialect.name == "postgresql":
+                # Else each statement sees a state of its own. The pool gives connections out without it.
+                session.connection(execution_options={"isolation_level": "REPEATABLE READ"})
             yield session
 
     @contextmanager
@@ -56,8 +60,9 @@ class Database:
         Parameters
         ----------
         durable
-            Whether it survives a power cut as soon as it is committed. If not, it does when the next durable one has
-            been committed; a crash of any process it survives in any case.
+            Whether SQLite waits for the disk. If not, the transaction survives a crash of any process, but a power
+            cut only once the next durable one has been committed. PostgreSQL always waits: when its server crashes,
+            it loses what it did not wait for.
 
         In SQLite writers take turns from the start: a transaction that reads first and wants to write later would
         otherwise fail, at once, when another has written in between.
@@ -65,8 +70,6 @@ class Database:
         with self._sessions.begin() as session:
             if self.engine.dialect.name == "sqlite":
                 session.connection(execution_options={"mrasfm_begin": "IMMEDIATE", "mrasfm_durable": durable})
-            elif not durable:
-                session.execute(text("SET LOCAL synchronous_commit TO OFF"))
             yield session
 
     def close(self) -> None:
@@ -74,8 +77,29 @@ class Database:
         self.engine.dispose()
 
 
+def clock_us(session: Session) -> int:
+    """Microseconds since 1970, on the one clock that all users of a database share.
+
+    What one machine notes and another compares, as the end of a lease, is taken from here: their own clocks differ.
+    SQLite's users share a machine.
+    """
+    if session.get_bind().dialect.name == "sqlite":
+        return now_us()
+    return int(session.scalars(text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")).one())
+
+
 def _server(url: str, patience_s: float) -> Engine:
-    options = {"connect_timeout": max(2, min(10, round(patience_s)))}
+    chosen = make_url(url).query.get("options", "")  # the operator's come last: they win
+    options = {
+        "connect_timeout": max(2, min(10, round(patience_s))),
+        # A server that has vanished without a word is noticed within half a minute; else a thread waits for ever.
+        "keepalives": 1,
+        "keepalives_idle": 10,
+        "keepalives_interval": 5,
+        "keepalives_count": 3,
+        "tcp_user_timeout": 20_000,
+        "options": f"-c statement_timeout={round(4000 * patience_s)} {chosen}".rstrip(),
+    }
     return create_engine(url, pool_size=10, max_overflow=30, pool_pre_ping=True, connect_args=options)
 
 
@@ -130,6 +154,7 @@ def migrate(settings: Settings) -> None:
     try:
         with database.engine.connect().execution_options(**options) as connection, connection.begin():
             if connection.dialect.name == "postgresql":
+                connection.execute(text("SET LOCAL statement_timeout TO 0"))  # large tables take their time
                 connection.execute(text("SELECT pg_advisory_xact_lock(5240017)"))
             config.attributes["connection"] = connection
             command.upgrade(config, "head")

@@ -20,7 +20,9 @@ from service.errors import ServiceError
 from service.persistence.database import Database
 from service.persistence.tables import IdempotencyKey, Job, new_id, now_us
 
-_HELD_FOR_US = 60_000_000  # a request takes seconds; after this its process is believed dead
+# After this a request's process is believed dead. Most take seconds; a preparation has minutes.
+_HELD_FOR_US = 60_000_000
+_HELD_TO_PREPARE_US = 300_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +40,14 @@ Effect = Callable[[Session], Answer]
 
 
 def once(
-    database: Database, effect: Effect, *, project_id: str, key: str | None, request_sha256: str, keep_us: int
+    database: Database,
+    effect: Effect,
+    *,
+    project_id: str,
+    key: str | None,
+    request_sha256: str,
+    keep_us: int,
+    prepare: Callable[[], None] | None = None,
 ) -> Answer:
     """Run `effect` in one transaction, or replay the answer that it had under this key.
 
@@ -50,26 +59,38 @@ def once(
         Of method, path and body: the same key with another request is refused.
     keep_us
         How long answers are replayed.
+    prepare
+        Runs before the effect, outside its transaction, and not for a replay: what takes long must not keep other
+        writers waiting.
 
     Raises
     ------
     ServiceError
         409 while the first request is in flight, 422 where the key was used for another request, and all that the
-        effect raises: then the key is free again.
+        effect and its preparation raise: then the key is free again.
     """
     if key is None:
+        if prepare is not None:
+            prepare()
         with database.write() as session:
             return effect(session)
     holder = new_id("idk")
+    hold_us = _HELD_FOR_US if prepare is None else _HELD_TO_PREPARE_US
     with database.write() as session:
-        replay = _hold(session, project_id, key, holder=holder, request_sha256=request_sha256, keep_us=keep_us)
+        replay = _hold(
+            session, project_id, key, holder=holder, request_sha256=request_sha256, keep_us=keep_us, hold_us=hold_us
+        )
     if replay is not None:
         return replay
-    with _freed_on_error(database, project_id, key, holder), database.write() as session:
-        answer = effect(session)
-        values = {"status": answer.status, "headers": dict(answer.headers), "body": json.dumps(answer.body)}
-        if not session.execute(update(IdempotencyKey).where(*_mine(project_id, key, holder)).values(**values)).rowcount:  # type: ignore[attr-defined]
-            raise _in_flight(key)  # it took so long that another request took the key over
+    with _freed_on_error(database, project_id, key, holder):
+        if prepare is not None:
+            prepare()
+        with database.write() as session:
+            answer = effect(session)
+            values = {"status": answer.status, "headers": dict(answer.headers), "body": json.dumps(answer.body)}
+            mine = update(IdempotencyKey).where(*_mine(project_id, key, holder))
+            if not session.execute(mine.values(**values)).rowcount:  # type: ignore[attr-defined]
+                raise _in_flight(key)  # it took so long that another request took the key over
     return answer
 
 
@@ -78,7 +99,7 @@ def _mine(project_id: str, key: str, holder: str) -> tuple[Any, ...]:
 
 
 def _hold(
-    session: Session, project_id: str, key: str, *, holder: str, request_sha256: str, keep_us: int
+    session: Session, project_id: str, key: str, *, holder: str, request_sha256: str, keep_us: int, hold_us: int
 ) -> Answer | None:
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     now = now_us()
@@ -89,7 +110,7 @@ def _hold(
         key=key,
         request_sha256=request_sha256,
         holder=holder,
-        held_until_us=now + _HELD_FOR_US,
+        held_until_us=now + hold_us,
         created_us=now,
     )
     if session.execute(statement.on_conflict_do_nothing().returning(IdempotencyKey.holder)).first() is not None:
@@ -110,7 +131,7 @@ def _hold(
         return Answer(status=row.status, body=body, headers=headers, replayed=True)
     if row.held_until_us > now:
         raise _in_flight(key)
-    row.holder, row.held_until_us = holder, now + _HELD_FOR_US
+    row.holder, row.held_until_us = holder, now + hold_us
     return None
 
 

@@ -10,17 +10,18 @@ back writes nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, func, or_, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy import ColumnElement, Select, delete, func, or_, select, tuple_, update
+from sqlalchemy.orm import Session, load_only
 
 from schemas.api.drives import DriveState, PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.errors import ServiceError
+from service.persistence.database import clock_us
 from service.persistence.tables import (
     TERMINAL,
     Drive,
@@ -126,7 +127,7 @@ def claim(session: Session, job_id: str, *, owner: str, lease_us: int) -> Claim 
         None where there is nothing to do: another worker has it, it has ended, or it is not due yet. A message that
         leads here may be dropped; the reconciler sends another when the job is due.
     """
-    now = now_us()
+    now = clock_us(session)
     values = {
         "state": JobState.RUNNING,
         "fence": Job.fence + 1,
@@ -174,7 +175,7 @@ def heartbeat(session: Session, held: Claim, *, lease_us: int, note: ProgressNot
     FencedError
         Where the job is not this holder's any more.
     """
-    now = now_us()
+    now = clock_us(session)
     values: dict[str, Any] = {"lease_until_us": now + lease_us, "heartbeat_us": now}
     if note is not None:
         values |= {
@@ -190,14 +191,37 @@ def heartbeat(session: Session, held: Claim, *, lease_us: int, note: ProgressNot
     _require(_change(session, held.job_id, _held(held), values))
     job = session.get_one(Job, held.job_id, populate_existing=True)
     if note is not None:
+        _drop_progress(session, job.id)
         shown = ("stage", "done", "total", "unit", "percent", "eta_low_s", "eta_high_s")
         data = {"attempt": job.attempt, **{name: getattr(job, name) for name in shown}}
         session.add(JobEvent(job_id=job.id, kind="progress", data=data))
     return job.cancel_requested_us is not None
 
 
+def cancel_requested(session: Session, held: Claim) -> bool:
+    """Whether somebody asked to cancel the job; asked between heartbeats, and writes nothing.
+
+    Raises
+    ------
+    FencedError
+        Where the job is not this holder's any more.
+    """
+    row = session.execute(select(Job.cancel_requested_us).where(Job.id == held.job_id, _held(held))).one_or_none()
+    if row is None:
+        raise FencedError
+    return row.cancel_requested_us is not None
+
+
+def has_succeeded(session: Session, held: Claim) -> bool:
+    """Whether this holder, and no other, has ended the job as succeeded."""
+    by_holder = (Job.state == JobState.SUCCEEDED) & (Job.fence == held.fence)
+    return session.scalar(select(Job.id).where(Job.id == held.job_id, by_holder)) is not None
+
+
 def succeed(session: Session, held: Claim, *, scene_id: str | None = None, reused: Sequence[str] = ()) -> None:
     """End the job; what it made is written in the same session.
+
+    A job whose end was asked for ends so too: what was finished first wins.
 
     Parameters
     ----------
@@ -221,6 +245,8 @@ def succeed(session: Session, held: Claim, *, scene_id: str | None = None, reuse
 def fail(session: Session, held: Claim, problem: Problem, *, max_attempts: int, retry_delay_us: int) -> JobState:
     """End the attempt, and the job where another would not help, none is left or nobody wants it any more.
 
+    A job whose end was asked for ends as cancelled; what its last attempt failed of stays with the attempt.
+
     Raises
     ------
     FencedError
@@ -229,8 +255,11 @@ def fail(session: Session, held: Claim, problem: Problem, *, max_attempts: int, 
     described = problem.model_dump(mode="json", exclude_none=True)
     outcome = problem.type.removeprefix(PROBLEM_TYPE)
     job = _locked(session, held.job_id)
-    if problem.retryable and held.attempt < max_attempts and job.cancel_requested_us is None:
-        _requeue(session, held, outcome, described, not_before_us=now_us() + retry_delay_us)
+    if job.cancel_requested_us is not None:
+        _end(session, held, JobState.CANCELLED, outcome, {}, problem=described)
+        return JobState.CANCELLED
+    if problem.retryable and held.attempt < max_attempts:
+        _requeue(session, held, outcome, described, not_before_us=clock_us(session) + retry_delay_us)
         return JobState.QUEUED
     _end(session, held, JobState.FAILED, outcome, {"problem": described}, problem=described)
     return JobState.FAILED
@@ -264,7 +293,7 @@ def release(session: Session, held: Claim) -> None:
 
 
 def request_cancel(session: Session, job_id: str) -> None:
-    """Ask for the job's end. At once where no worker holds it; a worker that does sees it with its next heartbeat.
+    """Ask for the job's end. At once where no worker holds it; a worker that does sees it soon.
 
     Raises
     ------
@@ -272,7 +301,7 @@ def request_cancel(session: Session, job_id: str) -> None:
         409 where the job has ended otherwise.
     """
     job = _locked(session, job_id)  # else the job could pass from one state to the other between two conditions
-    now = now_us()
+    now = clock_us(session)
     unheld = or_(
         Job.state == JobState.QUEUED, (Job.state == JobState.RUNNING) & (func.coalesce(Job.lease_until_us, 0) < now)
     )
@@ -301,7 +330,8 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     Raises
     ------
     ServiceError
-        409 where the job has not ended, has succeeded or its drive was deleted; 429 as `create`.
+        409 where the job has not ended, has succeeded, its drive was deleted or needs no other check; 429 as
+        `create`.
     """
     if job.state not in (JobState.FAILED, JobState.CANCELLED):
         raise ServiceError(
@@ -311,7 +341,8 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
             f"job {job.id} is {job.state}: only a job that failed or was cancelled can be retried",
             remedy="Wait for its end, or ask for a new reconstruction.",
         )
-    if session.get(Drive, job.drive_id, with_for_update=True) is None:
+    drive = session.get(Drive, job.drive_id, with_for_update=True, populate_existing=True)
+    if drive is None:
         raise ServiceError(
             409,
             "drive-deleted",
@@ -320,6 +351,8 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
             remedy="Create the drive again and ask for its reconstruction.",
         )
     kind = JobKind(job.kind)
+    if kind is JobKind.PREFLIGHT:
+        _require_unchecked(session, drive)
     new = create(
         session,
         project_id=job.project_id,
@@ -335,6 +368,24 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     return new
 
 
+def _require_unchecked(session: Session, drive: Drive) -> None:
+    """Checks are not counted against a quota, so a drive has one at a time, and no other after its result."""
+    active = session.scalars(active_of_drive(drive.id).where(Job.kind == JobKind.PREFLIGHT)).first()
+    if active is not None:
+        what = f"drive {drive.id} is being checked already, by job {active.id}"
+    elif drive.preflight_state in (PreflightState.PASSED, PreflightState.REJECTED):
+        what = f"drive {drive.id} was checked already: it is {drive.preflight_state}"
+    else:
+        return
+    raise ServiceError(
+        409,
+        "check-active",
+        "The drive has its check",
+        what,
+        remedy="Look at the drive: it shows its findings, and the job that checks it.",
+    )
+
+
 def expire_leases(session: Session, *, max_attempts: int) -> list[str]:
     """Take jobs from workers that have not been heard of: queued again, or ended where no attempt is left.
 
@@ -343,7 +394,7 @@ def expire_leases(session: Session, *, max_attempts: int) -> list[str]:
     list of str
         The jobs taken.
     """
-    lost = select(Job).where(Job.state == JobState.RUNNING, Job.lease_until_us < now_us())
+    lost = select(Job).where(Job.state == JobState.RUNNING, Job.lease_until_us < clock_us(session))
     # A job that changes at this moment has a worker that lives, or is another reconciler's.
     lost = lost.with_for_update(skip_locked=True).execution_options(populate_existing=True)
     taken = []
@@ -381,10 +432,27 @@ def end_lease(session: Session, job_id: str, fence: int) -> bool:
     return _change(session, job_id, under_way, {"lease_until_us": 0})
 
 
-def due(session: Session, *, limit: int = 1000) -> list[Job]:
-    """Queued jobs that a worker may take now, oldest first."""
-    statement = select(Job).where(Job.state == JobState.QUEUED, Job.not_before_us <= now_us())
-    return list(session.scalars(statement.order_by(Job.created_us).limit(limit)))
+def due(session: Session, *, after: Job | None = None, limit: int = 1000) -> list[Job]:
+    """Queued jobs that a worker may take now, oldest first; only what their messages need is loaded.
+
+    Parameters
+    ----------
+    after
+        The last job of the page before.
+    """
+    statement = select(Job).where(Job.state == JobState.QUEUED, Job.not_before_us <= clock_us(session))
+    if after is not None:
+        statement = statement.where(tuple_(Job.created_us, Job.id) > (after.created_us, after.id))
+    shown = load_only(Job.id, Job.kind, Job.fence, Job.created_us, raiseload=True)
+    return list(session.scalars(statement.options(shown).order_by(Job.created_us, Job.id).limit(limit)))
+
+
+def all_due(session: Session) -> Iterator[Job]:
+    """All jobs that are due, page by page."""
+    page = due(session)
+    while page:
+        yield from page
+        page = due(session, after=page[-1])
 
 
 def mark_enqueued(session: Session, job_ids: Sequence[str]) -> None:
@@ -486,6 +554,11 @@ def _close_attempts(session: Session, job_id: str, outcome: str, problem: Mappin
     still_open = (JobAttempt.job_id == job_id) & JobAttempt.finished_us.is_(None)
     values = {"finished_us": now_us(), "outcome": outcome, "problem": None if problem is None else dict(problem)}
     session.execute(update(JobAttempt).where(still_open).values(**values))
+
+
+def _drop_progress(session: Session, job_id: str) -> None:
+    """Of progress only the newest is kept: a long job would else leave a row a second, and every reader get them."""
+    session.execute(delete(JobEvent).where(JobEvent.job_id == job_id, JobEvent.kind == "progress"))
 
 
 def _tell_state(session: Session, job_id: str) -> None:

@@ -26,6 +26,7 @@ class StoredFile:
     sha256: str
     size_bytes: int
     key: str
+    is_new: bool  # else it was there already, and may be collected before it is recorded
     written_in_boot: str | None = None  # where a power cut could still take it
 
     @property
@@ -35,6 +36,7 @@ class StoredFile:
             "sha256": self.sha256,
             "size_bytes": self.size_bytes,
             "key": self.key,
+            "is_new": self.is_new,
             "written_in_boot": self.written_in_boot,
         }
 
@@ -54,12 +56,12 @@ def store_file(
     """Put a file into the artifact store, unless the project has its content already; the file is gone afterwards.
 
     The caller records the blob together with what refers to it, in one transaction, within the hour: what nothing
-    refers to is collected then.
+    refers to is collected then, and recording it is refused.
     """
     known = _find(database, project_id, sha256)
     if known is not None:
         path.unlink()
-        return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key)
+        return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key, is_new=False)
     key = blobs.new_key(project_id, sha256)
     return _adopt(artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=True)
 
@@ -69,7 +71,7 @@ def _adopt(
 ) -> StoredFile:
     boot = None if durable or artifacts.folder is None else boot_id()
     artifacts.adopt(path, key, sha256, durable=boot is None)
-    return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, written_in_boot=boot)
+    return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, is_new=True, written_in_boot=boot)
 
 
 def _find(database: Database, project_id: str, sha256: str) -> Blob | None:

@@ -93,8 +93,10 @@ class Once:
     background: BackgroundTasks
     key: str | None
 
-    def __call__(self, effect: Callable[[Session], Answer], raw: bytes = b"") -> Response:
-        """Answer the request; `raw` is its body."""
+    def __call__(
+        self, effect: Callable[[Session], Answer], raw: bytes = b"", *, prepare: Callable[[], None] | None = None
+    ) -> Response:
+        """Answer the request; `raw` is its body, `prepare` what takes long and comes before the transaction."""
         answer = once(
             self.context.database,
             effect,
@@ -102,6 +104,7 @@ class Once:
             key=self.key,
             request_sha256=request_sha256(self.request, raw),
             keep_us=int(self.context.settings.idempotency_hours * 3600e6),
+            prepare=prepare,
         )
         headers = dict(answer.headers)
         if answer.replayed:
@@ -153,13 +156,14 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
         401: "No valid API key",
         404: "There is no such thing in this project",
         405: "The resource has no such method",
+        408: "The body came too slowly",
         409: "The resource is not in the right state; the problem says what to do",
         413: "Too large, or the storage quota is full",
         415: "The bytes are of no kind that is taken here",
         416: "The range lies outside the file",
         422: "The request or the drive is at fault; all defects are listed",
         429: "A quota is full; try later",
-        503: "Not ready",
+        503: "Database, artifact store or another part does not answer; try again",
         507: "The disk is full",
     }
     return {status: {"description": known[status], "content": content} for status in statuses}

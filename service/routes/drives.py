@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
+import anyio.to_thread
 from fastapi import APIRouter, BackgroundTasks, Depends, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.common import Finding, Page
 from schemas.api.drives import EXAMPLE_MANIFEST, DriveResource, DriveState, PreflightResource
+from schemas.api.resource import Finding, Page
 from schemas.drive import DriveManifest
 from service.context import Context
 from service.errors import ServiceError
@@ -45,7 +47,7 @@ read_manifest = json_body(DriveManifest, lambda settings: settings.max_manifest_
     "",
     status_code=201,
     response_model=DriveResource,
-    responses=problems(401, 409, 413, 422, 429, 507),
+    responses=problems(401, 408, 409, 413, 422, 429, 507),
     openapi_extra=describe(DriveManifest, EXAMPLE_MANIFEST),
 )
 async def create_drive(
@@ -128,18 +130,20 @@ def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, backgrou
 
 
 @router.post("/{drive_id}:commit", response_model=DriveResource, responses=problems(401, 404, 409, 422, 429, 503))
-def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
+async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
     """Freeze a drive whose files are all there, check its manifest, and start the check of its images.
 
     A drive whose manifest has errors stays open; nothing of it is lost.
     """
-    with context.database.read() as session:
-        drive = drives.get(session, caller.project_id, drive_id)
-        key = session.get_one(Blob, drive.manifest_blob_id).key
     found: list[Finding] = []
-    if drive.state == DriveState.OPEN:
-        found = checked_manifest(context, key)
-        secure_drive(context.database, context.artifacts, drive_id)
+
+    def prepare() -> None:
+        with context.database.read() as session:
+            drive = drives.get(session, caller.project_id, drive_id)
+            key = session.get_one(Blob, drive.manifest_blob_id).key
+        if drive.state == DriveState.OPEN:
+            found.extend(checked_manifest(context, key))
+            secure_drive(context.database, context.artifacts, drive_id)
 
     def effect(session: Session) -> Answer:
         drive = drives.get(session, caller.project_id, drive_id, lock=True)
@@ -148,7 +152,7 @@ def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context: Conte
         job = drives.commit(session, drive, [finding.model_dump() for finding in found])
         return answer(200, _shown(session, drive), waiting=(job,))
 
-    return once(effect)
+    return await anyio.to_thread.run_sync(partial(once, effect, prepare=prepare), limiter=context.commits)
 
 
 @router.get("/{drive_id}/preflight", responses=problems(401, 404))

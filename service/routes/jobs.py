@@ -12,8 +12,8 @@ from sqlalchemy import select, tuple_
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.common import Page
 from schemas.api.jobs import JobResource
+from schemas.api.resource import Page
 from service.context import Context
 from service.persistence import jobs
 from service.persistence.idempotency import Answer
@@ -126,7 +126,7 @@ async def stream_events(
         int | None, Header(ge=0, lt=2**62, description="go on after this event, as a browser does by itself")
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """The job's changes of state and its progress, from the beginning, until it has ended."""
+    """The job's changes of state, from the beginning, and its newest progress, until it has ended."""
     last = last_event_id or 0
     while True:
         ended, events = await run_in_threadpool(_news, context, job_id, last)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import shutil
 from importlib.metadata import version
 
-from fastapi import APIRouter, Response
-from sqlalchemy import delete, false, func, select
+from fastapi import APIRouter, Request, Response
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from schemas.api.status import DiskStatus, Health, QueueStatus, Ready, ServiceStatus, WorkerStatus
 from service.context import Context
-from service.errors import ServiceError
 from service.metrics import CONTENT_TYPE, ONLINE_US, Metrics
-from service.persistence.database import is_current
 from service.persistence.tables import Job, JobState, WorkerSeen, now_us
 from service.persistence.wakeups import QUEUES, BrokerError
+from service.readiness import Readiness
 from service.routes.dependencies import CallerDep, ContextDep, moment, problems
 
 router = APIRouter(tags=["operation"])
@@ -29,33 +28,11 @@ async def live() -> Ready:
 
 
 @router.get("/readyz", responses=problems(503))
-def ready(context: ContextDep) -> Ready:
+async def ready(request: Request) -> Ready:
     """Database and artifact store can be written. A broker that is down does not matter here: uploads go on."""
-    try:
-        current = is_current(context.database)
-        with context.database.write() as session:
-            session.execute(delete(WorkerSeen).where(false()))  # a standby or a read-only file refuses it
-    except Exception as error:
-        raise _not_ready("the database", error) from error
-    if not current:
-        raise _not_ready("the database's schema", None)
-    try:
-        context.artifacts.require_writable()
-    except Exception as error:
-        raise _not_ready("the artifact store", error) from error
+    readiness: Readiness = request.app.state.readiness
+    await readiness.require()
     return Ready(status="ready")
-
-
-def _not_ready(what: str, error: Exception | None) -> ServiceError:
-    why = "is not the one this version expects" if error is None else f"cannot be used ({type(error).__name__})"
-    return ServiceError(
-        503,
-        "not-ready",
-        "The service is not ready",
-        f"{what} {why}",
-        remedy="Run 'mrasfm migrate'." if error is None else "The operator has to look at its log and at its disk.",
-        headers={"Retry-After": "5"},
-    )
 
 
 @router.get("/v1/status", responses=problems(401))

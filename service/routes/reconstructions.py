@@ -7,9 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 from sqlalchemy.orm import Session
 
-from schemas.api.common import Finding
 from schemas.api.drives import DriveState, PreflightState
 from schemas.api.jobs import JobKind, JobResource, ReconstructionRequest
+from schemas.api.resource import Finding
 from service.errors import ServiceError
 from service.persistence import drives, jobs
 from service.persistence.idempotency import Answer
@@ -28,7 +28,7 @@ read_request = json_body(ReconstructionRequest, lambda settings: settings.max_js
     "",
     status_code=202,
     response_model=JobResource,
-    responses=problems(401, 404, 409, 413, 422, 429),
+    responses=problems(401, 404, 408, 409, 413, 422, 429),
     openapi_extra=describe(ReconstructionRequest),
 )
 def create_reconstruction(

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import delete, select, tuple_
 from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
 
-from schemas.api.common import Page
+from schemas.api.resource import Page
 from schemas.api.scenes import SceneFileResource, SceneResource
 from service.context import Context
-from service.errors import not_found
+from service.errors import not_found, store_unavailable
 from service.persistence.collecting import collect_unused
 from service.persistence.owned import require
 from service.persistence.tables import Blob, Scene, SceneFile
@@ -86,11 +88,9 @@ def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, backgrou
     response_class=Response,
     responses={**_DOWNLOADS, **problems(401, 404, 416)},
 )
-def download(scene_id: str, path: str, request: Request, caller: CallerDep, context: ContextDep) -> Response:
+async def download(scene_id: str, path: str, request: Request, caller: CallerDep, context: ContextDep) -> Response:
     """One file of a scene. `Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
-    with context.database.read() as session:
-        scene = require(session, Scene, caller.project_id, scene_id)
-        file, blob = _get_file(session, scene, path)
+    scene, file, blob = await run_in_threadpool(_look_up, context, caller.project_id, scene_id, path)
     etag = f'"{blob.sha256}"'
     headers = {
         "ETag": etag,
@@ -111,14 +111,31 @@ def download(scene_id: str, path: str, request: Request, caller: CallerDep, cont
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{blob.size_bytes}"
     if request.method == "HEAD":
         return Response(headers=headers, media_type=file.media_type)
-    return _streamed(context, blob, part, status=200 if asked is None else 206, headers=headers, kind=file.media_type)
+    pieces = await _begun(context.artifacts.stream(blob.key, start=part.start, stop=part.stop))
+    return StreamingResponse(
+        pieces, status_code=200 if asked is None else 206, headers=headers, media_type=file.media_type
+    )
 
 
-def _streamed(
-    context: Context, blob: Blob, part: Part, *, status: int, headers: dict[str, str], kind: str
-) -> StreamingResponse:
-    pieces = context.artifacts.stream(blob.key, start=part.start, stop=part.stop)
-    return StreamingResponse(pieces, status_code=status, headers=headers, media_type=kind)
+async def _begun(pieces: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """The pieces, the first of which is there: once an answer has begun, it cannot become an error any more."""
+    try:
+        first = await anext(pieces, b"")
+    except FileNotFoundError:
+        raise store_unavailable() from None
+
+    async def all_pieces() -> AsyncIterator[bytes]:
+        yield first
+        async for piece in pieces:
+            yield piece
+
+    return all_pieces()
+
+
+def _look_up(context: Context, project_id: str, scene_id: str, path: str) -> tuple[Scene, SceneFile, Blob]:
+    with context.database.read() as session:
+        scene = require(session, Scene, project_id, scene_id)
+        return scene, *_get_file(session, scene, path)
 
 
 def _download_name(scene: Scene, path: str) -> str:
@@ -127,10 +144,11 @@ def _download_name(scene: Scene, path: str) -> str:
 
 
 def _get_file(session: Session, scene: Scene, path: str) -> tuple[SceneFile, Blob]:
-    file = session.get(SceneFile, (scene.id, path)) if path.isprintable() else None
-    if file is None:
+    statement = select(SceneFile, Blob).join(Blob, SceneFile.blob_id == Blob.id).where(SceneFile.scene_id == scene.id)
+    found = session.execute(statement.where(SceneFile.path == path)).first() if path.isprintable() else None
+    if found is None:
         raise not_found(f"file in scene {scene.id} named", path)
-    return file, session.get_one(Blob, file.blob_id)
+    return found[0], found[1]
 
 
 def _shown_file(file: SceneFile, blob: Blob) -> SceneFileResource:

@@ -8,12 +8,16 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import boto3
 import pytest
+from obstore.exceptions import BaseError
 
+from service.persistence import artifacts
 from service.persistence.artifacts import ArtifactStore, content_mtime_ns
 from service.settings import Settings
 from tests.service.live_api import HOST, free_port, settings_of, wait_until
@@ -151,3 +155,58 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     store.folder.write_bytes(b"a file in its place")
     with pytest.raises(OSError, match="directory"):
         store.require_writable()
+
+
+def test_only_what_lies_where_blobs_do_is_listed(stored: ArtifactStore, tmp_path: Path) -> None:
+    for key in ("report.pdf", "backups/blobs/a", "blobs2/a"):
+        put(stored, tmp_path / "foreign", b"foreign", key)
+    assert [item.key for item in stored.objects()] == [KEY]
+    stored.delete([KEY])
+    assert list(stored.objects()) == []
+
+
+@pytest.fixture
+def store_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], ArtifactStore]:
+    """A function that makes a store in S3 at a port of this machine."""
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+
+    def make(port: int) -> ArtifactStore:
+        endpoint = f"http://{HOST}:{port}"
+        return ArtifactStore(settings_of(tmp_path / "data", artifacts_url="s3://bucket", s3_endpoint=endpoint))
+
+    return make
+
+
+@pytest.fixture
+def silent_port() -> Iterator[int]:
+    """A server that takes connections and never says anything."""
+    with socket.create_server((HOST, 0), backlog=64) as server:
+        yield server.getsockname()[1]
+
+
+def fails_within_s(step: Callable[[], object]) -> float:
+    begin_s = time.monotonic()
+    with pytest.raises(BaseError):
+        step()
+    return time.monotonic() - begin_s
+
+
+def test_a_store_that_is_away(store_at: Callable[[int], ArtifactStore]) -> None:
+    """By default it would be tried for minutes, and the thread with it."""
+    store = store_at(free_port())
+    assert fails_within_s(lambda: store.read(KEY)) < 20
+    assert fails_within_s(store.require_writable) < 7
+
+
+def test_a_silent_store_is_no_ready_store(store_at: Callable[[int], ArtifactStore], silent_port: int) -> None:
+    assert fails_within_s(store_at(silent_port).require_writable) < 7
+
+
+def test_a_silent_store_is_given_up(
+    store_at: Callable[[int], ArtifactStore], silent_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert artifacts._PATIENCE["read_timeout"].total_seconds() <= 30
+    monkeypatch.setitem(artifacts._PATIENCE, "read_timeout", timedelta(milliseconds=300))
+    store = store_at(silent_port)
+    assert fails_within_s(lambda: store.read(KEY)) < 20

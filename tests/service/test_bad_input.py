@@ -23,6 +23,7 @@ import httpx
 import psutil
 import pytest
 
+from service.routes import bodies
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, api_in_thread, api_process, problem_of, settings_of, wait_until
 from tests.service.tiny_drive import TinyDrive, manifest, png, png_of, tiny_drive, zip_of
@@ -343,3 +344,15 @@ def test_a_kill_in_the_middle_of_an_upload(tmp_path: Path) -> None:
         for path, data in drive.files.items():
             assert client.put(f"/v1/drives/{drive_id}/files/{path}", content=data).status_code in (200, 201)
         assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+
+
+def test_a_large_body_that_comes_too_slowly(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bodies, "_LARGE_WITHIN_S", 0.3)
+    host, port = client.base_url.host, client.base_url.port
+    head = (
+        f"POST /v1/drives HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {client.key}\r\nContent-Length: 9000000\r\n\r\n"
+    )
+    with socket.create_connection((host, port), timeout=30) as connection:
+        connection.sendall(head.encode() + b" " * 1000)
+        assert connection.recv(100).startswith(b"HTTP/1.1 408 ")
+    wait_until(lambda: client.api.context.large_bodies.borrowed_tokens == 0, "the turn's end")

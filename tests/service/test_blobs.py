@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
+import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -140,3 +143,128 @@ def test_many_store_one_content_at_once(database: Database, project_id: str) -> 
     assert len(found) == 10
     assert len(set(found)) == 1
     assert used(database, project_id) == 10
+
+
+def in_threads(*steps: Callable[[], object]) -> list[Exception]:
+    """Run all at the same time; what they raised."""
+    raised: list[Exception] = []
+
+    def run(step: Callable[[], object]) -> None:
+        try:
+            step()
+        except Exception as error:
+            raised.append(error)
+
+    threads = [threading.Thread(target=run, args=(step,)) for step in steps]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return raised
+
+
+def test_the_same_contents_in_another_order_at_once(database: Database, project_id: str) -> None:
+    """Neither waits for the other while the other waits for it."""
+    both = threading.Barrier(2)
+
+    def store(first: str, second: str) -> None:
+        with database.write() as session:
+            for name in (first, second):
+                key = blobs.new_key(project_id, name * 64)
+                blobs.record(session, project_id=project_id, sha256=name * 64, size_bytes=1, key=key)
+                if name == first:
+                    meet(both)
+
+    assert in_threads(lambda: store("a", "b"), lambda: store("b", "a")) == []
+    assert used(database, project_id) == 2
+
+
+def meet(both: threading.Barrier) -> None:
+    """Wait for the other, unless it cannot come: where writers take turns only one is here."""
+    with contextlib.suppress(threading.BrokenBarrierError):
+        both.wait(1.0)
+
+
+def test_recording_while_others_are_forgotten(database: Database, project_id: str) -> None:
+    """Both take the project first, so that neither holds a blob that the other one needs."""
+    record(database, project_id, "a")
+    both = threading.Barrier(2)
+
+    def store() -> None:
+        with database.write() as session:
+            for name in "ba":
+                key = blobs.new_key(project_id, name * 64)
+                blobs.record(session, project_id=project_id, sha256=name * 64, size_bytes=10, key=key)
+                if name == "b":
+                    meet(both)
+                    time.sleep(0.5)  # for the other to take what it wants first
+
+    def forget_it() -> None:
+        meet(both)
+        forget(database)
+
+    assert in_threads(store, forget_it) == []
+    with database.read() as session:
+        left = session.scalars(select(Blob.sha256)).all()
+    assert used(database, project_id) == 10 * len(left)
+
+
+def test_a_content_that_was_found_and_is_gone(database: Database, project_id: str) -> None:
+    """Its object is deleted: no row may name it again."""
+    found: dict[str, Any] = {"project_id": project_id, "sha256": "a" * 64, "size_bytes": 10, "is_new": False}
+    record(database, project_id, "a")
+    with database.write() as session:
+        (key,) = blobs.forget_unused(session, untouched_since_us=EVER_US)
+    with pytest.raises(ServiceError) as refused, database.write() as session:
+        blobs.record(session, key=key, **found)
+    assert (refused.value.status, refused.value.code) == (503, "storage-changed")
+    assert refused.value.problem.remedy
+    with database.read() as session:
+        assert session.scalars(select(Blob.key)).all() == []
+    anew = record(database, project_id, "a")
+    with database.write() as session:
+        again = blobs.record(session, key=key, **found)
+    assert again.id == anew
+    assert again.key != key
+
+
+def test_only_the_blobs_that_are_named_are_forgotten(database: Database, project_id: str) -> None:
+    first, second, _ = (record(database, project_id, name, 7) for name in "abc")
+    with database.write() as session:
+        assert len(blobs.forget_unused(session, untouched_since_us=EVER_US, blob_ids=[first, second])) == 2
+    assert used(database, project_id) == 7
+
+
+def test_unused_blobs_are_found_page_by_page(database: Database, project_id: str) -> None:
+    for name in "edcba":
+        record(database, project_id, name)
+    pages: list[str] = []
+    last = ""
+    while True:
+        with database.read() as session:
+            page = blobs.find_unused(session, project_id, untouched_since_us=EVER_US, after_sha256=last, limit=2)
+        if not page:
+            break
+        last = page[-1].sha256
+        pages.append("".join(blob.sha256[0] for blob in page))
+    assert pages == ["ab", "cd", "e"]
+
+
+@pytest.mark.parametrize(
+    ("key", "project"),
+    [
+        (f"blobs/prj_0a/ab/{'ab' * 32}-01234567", "prj_0a"),
+        ("blobs/prj_0a/ab/.0123456789abcdef.partial", "prj_0a"),
+        (f"blobs/prj_0a/ab/{'ab' * 32}-0123456", None),
+        (f"blobs/prj_0a/ab/{'ab' * 32}-01234567.bak", None),
+        (f"old/blobs/prj_0a/ab/{'ab' * 32}-01234567", None),
+        (f"blobs/team/ab/{'ab' * 32}-01234567", None),
+        ("blobs/report.pdf", None),
+    ],
+)
+def test_keys_say_whose_they_are(key: str, project: str | None) -> None:
+    assert blobs.project_of(key) == project
+
+
+def test_a_new_key_says_whose_it_is(project_id: str) -> None:
+    assert blobs.project_of(blobs.new_key(project_id, "ab" * 32)) == project_id

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
-from schemas.api.common import Finding
+from schemas.api.resource import Finding
+from service import manifest_check
 from service.persistence import jobs
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, problem_of
+from tests.service.live_api import Api, Client, problem_of, wait_until
 from tests.service.tiny_drive import manifest, tiny_drive
 
 MISSING_ID = "drv_" + "0" * 30
@@ -201,3 +206,99 @@ def test_names_that_no_folder_can_hold_are_refused(client: Client, image: str, m
     assert problem["errors"][0]["field"] == named
     assert client.get("/v1/drives").json()["items"] == []
     assert client.api.objects(client.project_id) == [], "nothing of it stays"
+
+
+LARGE = tiny_drive(frames=20_000).raw
+
+
+@pytest.mark.parametrize(("bound", "value"), [("_MEMORY_MB", 1), ("_TIMEOUT_S", 0.05)])
+def test_a_manifest_whose_check_costs_too_much_has_to_be_split(
+    client: Client, monkeypatch: pytest.MonkeyPatch, bound: str, value: float
+) -> None:
+    monkeypatch.setattr(manifest_check, bound, value)
+    drive_id = client.post("/v1/drives", content=LARGE).json()["id"]
+    problem = problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 422, "manifest-too-large")
+    assert "Split the drive" in problem["remedy"]
+    assert client.get(f"/v1/drives/{drive_id}").json()["state"] == "OPEN"
+    assert client.api.spooled() == []
+
+
+@pytest.mark.parametrize("command", [("/no/such/python",), (sys.executable, "-c", "raise SystemExit(1)")])
+def test_a_check_that_cannot_run_is_the_services_fault(
+    client: Client, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    drive_id = client.filled()
+    with monkeypatch.context() as broken:
+        broken.setattr(manifest_check, "_COMMAND", command)
+        problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 503, "check-failed")
+    assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+
+
+def test_the_check_runs_nothing_of_the_working_directory_and_knows_no_secret(
+    client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    planted = tmp_path / "mrasfm_engine"
+    planted.mkdir()
+    (planted / "__init__.py").write_text("raise SystemExit('planted')")
+    told = tmp_path / "environment"
+    folder = tmp_path / "site"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(
+        f"import json, os; open({str(told)!r}, 'w').write(json.dumps([os.getcwd(), dict(os.environ)]))"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    for secret in ("MRASFM_DATABASE_URL", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(secret, "secret")
+    client.committed()
+    where, environment = json.loads(told.read_text())
+    assert where == str(client.api.settings.spool_dir)
+    assert "secret" not in environment.values()
+
+
+def test_slow_checks_leave_the_api_to_others(client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """More commits at once than the API has threads."""
+    go_on = tmp_path / "go on"
+    slow = f"import os, time\nwhile not os.path.exists({str(go_on)!r}): time.sleep(0.05)\nprint('{{\"findings\": []}}')"
+    monkeypatch.setattr(manifest_check, "_COMMAND", (sys.executable, "-c", slow))
+    drive_id = client.filled()
+    statuses: list[int] = []
+
+    def commit() -> None:
+        own = client.api.client_of(client.project_id, client.key)
+        statuses.append(own.post(f"/v1/drives/{drive_id}:commit").status_code)
+
+    threads = [threading.Thread(target=commit) for _ in range(45)]
+    for thread in threads:
+        thread.start()
+    try:
+        wait_until(lambda: client.api.context.commits.statistics().tasks_waiting == 43, "the commits")
+        assert client.get(f"/v1/drives/{drive_id}", timeout=20).json()["state"] == "OPEN"
+    finally:
+        go_on.touch()
+        for thread in threads:
+            thread.join()
+    assert sorted(statuses) == [200] + [409] * 44
+
+
+def test_a_commit_is_replayed_after_the_drive_is_gone(client: Client) -> None:
+    drive_id = client.filled()
+    key = {"Idempotency-Key": "commit"}
+    first = client.post(f"/v1/drives/{drive_id}:commit", headers=key)
+    assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
+    again = client.post(f"/v1/drives/{drive_id}:commit", headers=key)
+    assert (again.status_code, again.content) == (200, first.content)
+    assert again.headers["idempotent-replayed"] == "true"
+    problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 404, "not-found")
+
+
+def test_a_large_manifest_keeps_its_turn_until_it_is_recorded(client: Client) -> None:
+    limiter = client.api.context.large_documents
+    raw = tiny_drive().raw + b" " * 2_000_000
+    with ThreadPoolExecutor(1) as pool:
+        with client.api.database.write():  # the writers' lock: it is parsed and stored, and waits to be recorded
+            answer = pool.submit(client.post, "/v1/drives", content=raw)
+            wait_until(lambda: len(client.api.objects(client.project_id)) == 1, "the manifest")
+            assert limiter.borrowed_tokens == 1
+        assert answer.result().status_code == 201
+    wait_until(lambda: limiter.borrowed_tokens == 0, "the turn's end")

@@ -6,16 +6,50 @@ import os
 from pathlib import Path
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import make_url, select, text, update
 
 from service.errors import ServiceError
 from service.persistence import drives
+from service.persistence.database import Database
 from service.persistence.durability import boot_id
 from service.persistence.tables import Blob, DriveFile
 from tests.service.live_api import Api, Client, problem_of
 from tests.service.tiny_drive import tiny_drive
 
 pytestmark = pytest.mark.skipif(boot_id() is None, reason="this system does not name its starts")
+
+
+@pytest.mark.parametrize("durable", [True, False])
+def test_a_server_always_waits_for_its_disk(postgres_url: str, durable: bool) -> None:
+    """It forgets what it did not wait for when it crashes, and not only when the power fails."""
+    database = Database(postgres_url)
+    with database.write(durable=durable) as session:
+        assert session.scalar(text("SHOW synchronous_commit")) == "on"
+    database.close()
+
+
+@pytest.mark.parametrize(
+    ("patience_s", "chosen", "timeout"), [(30.0, "", "2min"), (2.0, "", "8s"), (30.0, "-c statement_timeout=5s", "5s")]
+)
+def test_a_server_that_hangs_is_given_up(postgres_url: str, patience_s: float, chosen: str, timeout: str) -> None:
+    url = make_url(postgres_url)
+    if chosen:
+        url = url.update_query_dict({"options": chosen})
+    database = Database(url.render_as_string(hide_password=False), patience_s=patience_s)
+    with database.read() as session:
+        assert session.scalar(text("SHOW statement_timeout")) == timeout
+        raw = session.connection().connection.driver_connection
+        assert raw is not None
+        given = raw.info.get_parameters()
+    database.close()
+    named = ("keepalives", "keepalives_idle", "keepalives_interval", "keepalives_count", "tcp_user_timeout")
+    assert {name: given[name] for name in named} == {
+        "keepalives": "1",
+        "keepalives_idle": "10",
+        "keepalives_interval": "5",
+        "keepalives_count": "3",
+        "tcp_user_timeout": "20000",
+    }
 
 
 def _blobs(api: Api, drive_id: str) -> dict[str, Blob]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import threading
 from urllib.parse import quote
 
@@ -250,3 +251,33 @@ def test_a_full_quota_refuses_and_deleting_frees_it(api: Api, drive: TinyDrive) 
     assert api.project(client.project_id).used_bytes == 0
     assert api.objects(client.project_id) == []
     client.create(drive)
+
+
+def test_the_manifest_in_an_archive_may_be_written_in_another_way(client: Client, drive: TinyDrive) -> None:
+    indented = json.dumps(drive.manifest, indent=1).encode()
+    for written in (indented, indented + b" " * 3_000_000):
+        drive_id = client.create(drive)
+        assert client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped(**{"drive.json": written})).is_success
+    assert client.api.context.large_documents.borrowed_tokens == 0
+
+
+@pytest.mark.parametrize("what", ["key twice", "many keys", "deep", "too large"])
+def test_the_manifest_in_an_archive_is_read_within_bounds(
+    client: Client, drive: TinyDrive, drive_id: str, what: str
+) -> None:
+    same = drive.raw.decode()
+    written = {
+        "key twice": same.replace('"version": 1', '"version": 1, "version": 1'),
+        "many keys": "{" + ",".join(f'"k{i}":1' for i in range(300_000)) + "}",
+        "deep": '{"a":' * 100_000,
+        "too large": same + " " * client.api.settings.max_json_bytes,
+    }[what]
+    answer = client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped(**{"drive.json": written.encode()}))
+    assert "drive.json" in problem_of(answer, 422, "other-manifest")["detail"]
+    assert client.api.spooled() == []
+
+
+def test_the_very_bytes_of_a_large_manifest_are_the_manifest(client: Client, drive: TinyDrive) -> None:
+    raw = drive.raw + b" " * client.api.settings.max_json_bytes
+    drive_id = client.post("/v1/drives", content=raw).json()["id"]
+    assert client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped(**{"drive.json": raw})).is_success

@@ -189,6 +189,30 @@ def test_the_answer_and_the_effect_are_one_transaction(database: Database, proje
     assert effects(database, project) == 1
 
 
+def test_a_preparation_runs_under_the_key_and_outside_the_transaction(database: Database, project: Project) -> None:
+    prepared: list[int] = []
+
+    def prepare() -> None:
+        with database.write() as session:  # would wait for ever within the transaction
+            held = session.get_one(IdempotencyKey, (project.id, "k"))
+            prepared.append(held.held_until_us - now_us())
+        if len(prepared) == 1:
+            raise not_found("drive", "x")
+
+    def effect(session: Session) -> Answer:
+        return Answer(status=200, body={})
+
+    def run_prepared() -> Answer:
+        request = {"project_id": project.id, "key": "k", "request_sha256": "r"}
+        return once(database, effect, **request, keep_us=24 * HOUR_US, prepare=prepare)
+
+    with pytest.raises(ServiceError):
+        run_prepared()
+    assert [run_prepared().replayed for _ in range(2)] == [False, True]
+    assert len(prepared) == 2
+    assert min(prepared) > 120e6, "longer than any preparation takes"
+
+
 def test_an_error_frees_the_key_for_any_request(database: Database, project: Project, run: Run) -> None:
     def refused(session: Session) -> None:
         raise not_found("drive", "x")
@@ -230,14 +254,14 @@ def test_an_old_key_is_new_again(database: Database, project: Project, run: Run)
 
 
 def test_a_kill_between_hold_and_effect(tmp_path: Path) -> None:
-    """The writer's lock, held here, keeps the API between the two; then it is killed."""
+    """The check of the manifest keeps the API between the two; then it is killed."""
     with api_process(settings_of(tmp_path / "data"), tmp_path) as api:
         client = api.client()
         drive_id = client.filled()
         thread = threading.Thread(target=_post_until_killed, args=(client, f"/v1/drives/{drive_id}:commit"))
         held = _held_keys(api.database)
         thread.start()
-        # The check of the manifest runs before the key is held, so that the hold is seen here as soon as it is there.
+        # The hold is seen here as soon as it is there: the check of the manifest comes after it.
         while not held():
             assert thread.is_alive(), "answered before it was killed"
         api.kill()

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
-from sqlalchemy import func, select
+from sqlalchemy import func, select, text
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
@@ -274,10 +274,99 @@ def test_a_lost_worker_of_a_cancelled_job(database: Database, job_id: str) -> No
     assert job_of(database, job_id).state == JobState.CANCELLED
 
 
-def test_a_cancelled_job_that_fails_is_not_tried_again(database: Database, job_id: str) -> None:
+@pytest.mark.parametrize("retryable", [True, False])
+def test_a_cancelled_job_that_fails_ends_as_cancelled(database: Database, job_id: str, retryable: bool) -> None:
     held = claimed(database, job_id)
     cancel(database, job_id)
-    assert fail(database, held, retryable=True) == JobState.FAILED
+    assert fail(database, held, retryable=retryable) == JobState.CANCELLED
+    job = job_of(database, job_id)
+    assert (job.state, job.problem) == (JobState.CANCELLED, None)
+    with database.read() as session:
+        attempt = session.get_one(JobAttempt, (job_id, held.fence))
+    assert attempt.outcome == "out-of-memory", "what happened stays with the attempt"
+    assert attempt.problem is not None
+
+
+def test_a_cancelled_job_that_is_finished_all_the_same_keeps_its_result(database: Database, job_id: str) -> None:
+    held = claimed(database, job_id)
+    cancel(database, job_id)
+    assert publish(database, held) == job_of(database, job_id).scene_id
+
+
+def test_machines_whose_clocks_differ(database: Database, job_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reconciler, an API and a worker that are an hour off take no job from a worker that lives."""
+    if database.engine.dialect.name == "sqlite":
+        pytest.skip("its users share a machine")
+    held = claimed(database, job_id)
+    for off_us in (3_600_000_000, -3_600_000_000):
+        monkeypatch.setattr("service.persistence.jobs.now_us", lambda off_us=off_us: now_us() + off_us)
+        monkeypatch.setattr("service.persistence.database.now_us", lambda off_us=off_us: now_us() + off_us)
+        assert expire(database) == []
+        with database.write() as session:
+            jobs.heartbeat(session, held, lease_us=LEASE_US)
+        assert abs((job_of(database, job_id).lease_until_us or 0) - LEASE_US - now_us()) < LEASE_US // 2
+    cancel(database, job_id)
+    assert job_of(database, job_id).state == JobState.RUNNING, "its worker lives and is asked to stop"
+
+
+def test_a_retry_is_due_by_the_database_s_clock(
+    database: Database, job_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if database.engine.dialect.name == "sqlite":
+        pytest.skip("its users share a machine")
+    held = claimed(database, job_id)
+    monkeypatch.setattr("service.persistence.jobs.now_us", lambda: now_us() + 3_600_000_000)
+    fail(database, held, retryable=True)
+    monkeypatch.undo()
+    assert claim(database, job_id) is not None
+
+
+def test_a_holder_asks_whether_it_is_wanted(database: Database, job_id: str) -> None:
+    held = claimed(database, job_id)
+    with database.read() as session:
+        assert not jobs.cancel_requested(session, held)
+    cancel(database, job_id)
+    with database.read() as session:
+        assert jobs.cancel_requested(session, held)
+    with database.write() as session:
+        jobs.cancelled(session, held)
+    with pytest.raises(jobs.FencedError), database.read() as session:
+        jobs.cancel_requested(session, held)
+
+
+def test_progress_leaves_one_event(database: Database, job_id: str) -> None:
+    held = claimed(database, job_id)
+    ids = []
+    for done in range(5):
+        note = jobs.ProgressNote(
+            stage="a", done=done, total=5, unit=None, percent=float(done), eta_low_s=None, eta_high_s=None
+        )
+        with database.write() as session:
+            jobs.heartbeat(session, held, lease_us=LEASE_US, note=note)
+        with database.read() as session:
+            ids.append(jobs.events_after(session, job_id, 0)[-1].id)
+    with database.read() as session:
+        told = jobs.events_after(session, job_id, 0)
+        assert [event.kind for event in told] == ["state", "state", "progress"]
+        assert told[-1].data["done"] == 4
+        assert [event.id for event in jobs.events_after(session, job_id, ids[1])] == ids[-1:], "after one that is gone"
+
+
+def test_a_reader_sees_one_state(database: Database, job_id: str) -> None:
+    with database.read() as session:
+        assert session.scalar(select(Job.state).where(Job.id == job_id)) == JobState.QUEUED
+        claimed(database, job_id)
+        assert session.scalar(select(Job.state).where(Job.id == job_id)) == JobState.QUEUED
+    assert job_of(database, job_id).state == JobState.RUNNING
+    with database.write() as session:  # its connection has been a reader's
+        job = session.get_one(Job, job_id, with_for_update=True)
+        other = Database(database.engine.url.render_as_string(hide_password=False), patience_s=0.1)
+        with other.read() as elsewhere:
+            assert elsewhere.scalar(select(Job.state).where(Job.id == job_id)) == JobState.RUNNING
+        other.close()
+        if database.engine.dialect.name == "postgresql":
+            assert session.scalar(text("SHOW transaction_isolation")) == "read committed"
+        job.stage = "x"
 
 
 def test_releasing_and_cancelling_at_once_leaves_no_job_behind(database: Database, project_id: str) -> None:

@@ -203,6 +203,49 @@ def test_the_quota_of_jobs(api: Api) -> None:
     problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 429, "too-many-jobs")
 
 
+def check_of(client: Client, drive_id: str) -> dict[str, Any]:
+    shown: dict[str, Any] = client.get(f"/v1/drives/{drive_id}").json()
+    return shown
+
+
+def test_a_drive_has_one_check_at_a_time(api: Api) -> None:
+    client = api.client(max_active_jobs=1)
+    drive_id = client.committed()
+    first = check_of(client, drive_id)["preflight_job_id"]
+    client.post(f"/v1/jobs/{first}:cancel")
+    statuses: list[int] = []
+
+    def retry() -> None:
+        own = api.client_of(client.project_id, client.key)
+        statuses.append(own.post(f"/v1/jobs/{first}:retry").status_code)
+
+    threads = [threading.Thread(target=retry) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(statuses) == [202, 409, 409, 409]
+    again = problem_of(client.post(f"/v1/jobs/{first}:retry"), 409, "check-active")
+    second = check_of(client, drive_id)["preflight_job_id"]
+    assert second in again["detail"]
+    client.post(f"/v1/jobs/{second}:cancel")
+    assert client.post(f"/v1/jobs/{first}:retry").status_code == 202
+
+
+@pytest.mark.parametrize(("sound", "result"), [(True, "PASSED"), (False, "REJECTED")])
+def test_a_drive_that_was_checked_is_not_checked_again(api: Api, sound: bool, result: str) -> None:
+    client = api.client()
+    drive_id = client.committed()
+    first = check_of(client, drive_id)["preflight_job_id"]
+    client.post(f"/v1/jobs/{first}:cancel")
+    second = client.post(f"/v1/jobs/{first}:retry").json()["id"]
+    held = client.claim(second)
+    with api.database.write() as session:
+        jobs.record_findings(session, held, [], sound=sound)
+    problem = problem_of(client.post(f"/v1/jobs/{first}:retry"), 409, "check-active")
+    assert result in problem["detail"]
+
+
 def test_the_last_place_is_taken_once(api: Api) -> None:
     client = api.client(max_active_jobs=1)
     drive_id = client.committed()
@@ -247,7 +290,6 @@ def test_events_tell_the_whole_story_and_go_on_where_a_reader_stopped(owner: Cli
     assert [(e["event"], e["data"].get("state"), e["data"]["percent"]) for e in events] == [
         ("state", "QUEUED", 0.0),
         ("state", "RUNNING", 0.0),
-        ("progress", None, 10.0),
         ("progress", None, 20.0),
         ("state", "SUCCEEDED", 100.0),
     ]
@@ -256,6 +298,17 @@ def test_events_tell_the_whole_story_and_go_on_where_a_reader_stopped(owner: Cli
     assert ids == sorted(set(ids))
     for i, event in enumerate(events):
         assert read_all(owner, job["id"], **{"Last-Event-ID": event["id"]}) == events[i + 1 :]
+
+
+def test_a_reader_goes_on_after_progress_that_is_not_kept(owner: Client, job: dict[str, Any]) -> None:
+    held = owner.claim(job["id"])
+    beat(owner, held, 10.0)
+    with owner.api.database.read() as session:
+        last = jobs.events_after(session, job["id"], 0)[-1].id
+    beat(owner, held, 20.0)
+    owner.publish(held, {"a": b"a"})
+    events = read_all(owner, job["id"], **{"Last-Event-ID": str(last)})
+    assert [(e["event"], e["data"]["percent"]) for e in events] == [("progress", 20.0), ("state", 100.0)]
 
 
 def test_events_come_as_they_happen(owner: Client, job: dict[str, Any]) -> None:

@@ -21,6 +21,7 @@ from service.persistence import workers
 from service.settings import Settings
 from tests.service.conftest import StartApi
 from tests.service.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of
+from tests.service.tiny_drive import tiny_drive
 
 QUICK_S = 10.0  # generous: a broker that hangs would cost much more
 
@@ -192,3 +193,13 @@ def test_a_broker_that_is_down_holds_nobody_up(start_api: StartApi) -> None:
 def test_a_broker_that_hangs_holds_nobody_up(start_api: StartApi) -> None:
     with black_hole() as port:
         accepts_quickly(start_api(redis_url=f"redis://{HOST}:{port}/0"))
+
+
+def test_a_store_that_is_away_is_said_so(start_api: StartApi, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "nobody")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "nothing")
+    api = start_api(artifacts_url="s3://bucket", s3_endpoint=f"http://127.0.0.1:{free_port()}")
+    client = api.client()
+    problem_of(client.post("/v1/drives", content=tiny_drive().raw), 503, "store-unavailable")
+    problem_of(client.get("/readyz"), 503, "not-ready")
+    assert client.get("/v1/drives").json()["items"] == []

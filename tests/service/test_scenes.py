@@ -182,3 +182,10 @@ def test_a_publication_of_an_old_holder_is_not_seen(client: Client) -> None:
     (scene,) = client.get("/v1/scenes").json()["items"]
     assert scene["id"] == scene_id
     assert client.get(f"/v1/scenes/{scene_id}/files/a").content == b"new"
+
+
+def test_bytes_that_are_gone_are_an_error_not_a_broken_answer(api: Api, client: Client) -> None:
+    scene_id = client.scene({"gone.ply": b"gone"})
+    (stored,) = [path for path in api.objects(client.project_id) if path.read_bytes() == b"gone"]
+    stored.unlink()
+    problem_of(client.get(f"/v1/scenes/{scene_id}/files/gone.ply"), 503, "store-unavailable")

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import json
 import logging
+import sqlite3
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from pydantic import SecretStr
+from sqlalchemy import insert, text
+from sqlalchemy.exc import IntegrityError, OperationalError
+from sqlalchemy.orm import Session
 
 from mrasfm_engine.cli import main
 from schemas.api.problems import PROBLEM_TYPE
 from service.persistence import jobs
-from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Job
-from tests.worker.service_world import World, is_gone
+from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Job, SceneFile
+from tests.worker.service_world import World, is_gone, wait_until
 from worker.execution import Runner
+from worker.heart import Heart
+from worker.progress import Progress
 from worker.scratch import attempt_folder
+from worker.settling import settle
+from worker.stages import Verdict
 
 
 @pytest.fixture
@@ -153,6 +162,166 @@ def test_shutting_down(world: World, brief_drive: Path) -> None:
     assert (job.state, job.attempt, job.fence) == ("QUEUED", 0, 1)
     assert world.outcomes(job_id) == ["released"]
     assert world.children() == []
+
+
+def break_endings(
+    runner: Runner, job_id: str, monkeypatch: pytest.MonkeyPatch, *, times: int, answer_lost: bool = False
+) -> list[str]:
+    """Make the database fail as transactions that end the job are committed; the states they would have made."""
+    dialect = runner._database.engine.dialect
+    commit = dialect.do_commit
+    broken: list[str] = []
+
+    def do_commit(connection: object) -> None:
+        cursor = connection.cursor()  # type: ignore[attr-defined]
+        (state,) = cursor.execute("SELECT state FROM jobs WHERE id = ?", (job_id,)).fetchone()
+        cursor.close()
+        if state == "RUNNING" or len(broken) == times:
+            commit(connection)  # type: ignore[arg-type]
+            return
+        broken.append(state)
+        if answer_lost:
+            commit(connection)  # type: ignore[arg-type]
+        raise sqlite3.OperationalError("the connection is lost")
+
+    monkeypatch.setattr(dialect, "do_commit", do_commit)
+    return broken
+
+
+@pytest.mark.parametrize("answer_lost", [False, True])
+def test_database_that_is_away_when_the_scene_is_published(
+    world: World,
+    brief_drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    answer_lost: bool,
+) -> None:
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    runner = Runner(world.settings)
+    times = 1 if answer_lost else 3
+    broken = break_endings(runner, job_id, monkeypatch, times=times, answer_lost=answer_lost)
+    with caplog.at_level(logging.INFO, "mrasfm.worker"):
+        runner.run(job_id)
+    assert "published" in caplog.messages, "the worker knows that it was itself"
+    assert broken == ["SUCCEEDED"] * times
+    job = world.job(job_id)
+    assert (job.state, job.attempt) == ("SUCCEEDED", 1)
+    assert world.outcomes(job_id) == ["succeeded"]
+    (scene,) = world.scenes()
+    assert scene.id == job.scene_id
+    with world.database.read() as session:
+        keys = [session.get_one(Blob, file.blob_id).key for file in session.query(SceneFile)]
+    assert keys
+    assert all(world.artifacts.read(key) is not None for key in keys)
+
+
+def test_database_that_is_away_when_a_check_ends(
+    world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive_id, job_id = world.add_unchecked_drive(brief_drive)
+    runner = Runner(world.settings)
+    broken = break_endings(runner, job_id, monkeypatch, times=2)
+    runner.run(job_id)
+    assert broken == ["SUCCEEDED"] * 2
+    assert (world.job(job_id).attempt, world.drive(drive_id).preflight_state) == (1, "PASSED")
+
+
+def end_by_failing(world: World, job_id: str) -> None:
+    with world.database.write() as session:
+        session.delete(session.get_one(Drive, world.job(job_id).drive_id))
+
+
+def end_by_cancelling(world: World, job_id: str) -> None:
+    def cancel() -> None:
+        world.wait_for_begin(job_id)
+        world.cancel(job_id)
+
+    threading.Thread(target=cancel).start()
+
+
+@pytest.mark.parametrize(
+    ("end", "stops", "states", "outcome"),
+    [
+        (end_by_failing, False, "FAILED", "drive-deleted"),
+        (end_by_cancelling, False, "CANCELLED", "cancelled"),
+        (lambda world, job_id: None, True, "QUEUED", "released"),
+    ],
+)
+def test_database_that_is_away_when_an_attempt_ends(
+    world: World,
+    brief_drive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    end: Callable[[World, str], None],
+    stops: bool,
+    states: str,
+    outcome: str,
+) -> None:
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    asked: list[bool] = []
+    runner = Runner(world.settings, shutting_down=lambda: stops and (asked.append(True) or len(asked) > 2))  # type: ignore[func-returns-value]
+    broken = break_endings(runner, job_id, monkeypatch, times=2)
+    end(world, job_id)
+    runner.run(job_id)
+    assert broken == [states] * 2
+    assert (world.job(job_id).state, world.outcomes(job_id)) == (states, [outcome])
+
+
+def test_what_is_not_the_databases_fault_is_not_tried_again(world: World, brief_drive: Path) -> None:
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    held = claimed(world, job_id)
+    tries: list[bool] = []
+
+    def wrong(session: Session) -> None:
+        tries.append(True)
+        session.execute(insert(Job).values(id=job_id, project_id=None, kind="x", drive_id="x"))
+
+    with pytest.raises(IntegrityError):
+        settle(world.database, held, wrong)
+    assert tries == [True]
+
+
+def test_database_that_stays_away(world: World, brief_drive: Path) -> None:
+    held = claimed(world, world.ask(world.add_drive(brief_drive), wake=False))
+
+    def fails(session: Session) -> None:
+        session.execute(text("SELECT * FROM nowhere"))
+
+    with pytest.raises(OperationalError):
+        settle(world.database, held, fails, patience_s=0.5)
+
+
+def claimed(world: World, job_id: str) -> jobs.Claim:
+    with world.database.write() as session:
+        held = jobs.claim(session, job_id, owner="w", lease_us=3600 * 1_000_000)
+    assert held is not None
+    return held
+
+
+def test_request_to_cancel_is_seen_between_heartbeats(world: World, brief_drive: Path) -> None:
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    rarely = world.settings.model_copy(update={"heartbeat_seconds": 600.0, "lease_seconds": 3600.0})
+    held = claimed(world, job_id)
+    with Heart(world.database, held, rarely) as heart:
+        assert heart.tell(Progress()) is Verdict.GO_ON
+        world.cancel(job_id)
+        wait_until(lambda: heart.tell(Progress()) is Verdict.CANCEL, "the heart's look")
+        with world.database.write() as session:
+            jobs.cancelled(session, held)
+        wait_until(lambda: heart.tell(Progress()) is Verdict.FENCED, "the heart's end")
+
+
+def test_new_guess_at_the_end_is_no_news(world: World, brief_drive: Path) -> None:
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    often = world.settings.model_copy(update={"heartbeat_seconds": 0.05})
+    with Heart(world.database, claimed(world, job_id), often) as heart:
+        heart.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 2.0)))
+        wait_until(lambda: world.events(job_id)[-1].kind == "progress", "the first progress")
+        first, beaten_us = world.events(job_id)[-1], world.job(job_id).heartbeat_us or 0
+        for guess_s in range(5):
+            heart.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 3.0 + guess_s)))
+            time.sleep(0.1)
+        wait_until(lambda: (world.job(job_id).heartbeat_us or 0) > beaten_us, "another heartbeat")
+    assert world.events(job_id)[-1].id == first.id
 
 
 def test_job_that_was_taken_away(world: World, brief_drive: Path, caplog: pytest.LogCaptureFixture) -> None:

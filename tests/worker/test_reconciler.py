@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import redis
+from sqlalchemy import insert
 
 import worker.reconciler
-from service.persistence import jobs
+from service.persistence import collecting, jobs
 from service.persistence.storing import file_sha256, store_file
-from service.persistence.tables import Blob, Drive, Job, JobEvent, Project, Scene, now_us
+from service.persistence.tables import Blob, Drive, Job, JobEvent, Project, Scene, new_id, now_us
 from service.persistence.wakeups import QUEUES, Wakeups
 from tests.worker.service_world import World, wait_until
 from worker.reconciler import Reconciler
@@ -64,6 +66,54 @@ def test_jobs_that_need_no_message(world: World, brief_drive: Path) -> None:
         assert jobs.claim(session, runs, owner="a worker", lease_us=HOUR_US)
     Reconciler(world.settings).reconcile_jobs()
     assert queued(world) == 0
+
+
+def test_many_jobs_wait(world: World) -> None:
+    """All of them get a message, whatever waits in front."""
+    count = 2300
+    with world.database.write() as session:
+        row = {"project_id": world.project_id, "drive_id": "drv_0"}
+        kinds = ("PREFLIGHT", "RECONSTRUCTION")
+        # Many came at the same moment.
+        rows = [{**row, "id": new_id("job"), "kind": kinds[i % 2], "created_us": 1 + i // 700} for i in range(count)]
+        session.execute(insert(Job), rows)
+    reconciler = Reconciler(world.settings)
+    for _ in range(2):
+        reconciler.reconcile_jobs()
+        assert queued(world) == count
+    assert Wakeups(world.settings).waiting() == {f"{row['id']}.1" for row in rows}
+    with world.database.read() as session:
+        assert session.query(Job).filter(Job.enqueued_us.is_(None)).count() == 0
+
+
+def test_jobs_do_not_wait_for_the_sweep(world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker that died during a long sweep is noticed; the end of the process does not wait for it either."""
+    sweeping, go_on, listed = threading.Event(), threading.Event(), threading.Event()
+
+    def sweep_for_long() -> None:
+        sweeping.set()
+        go_on.wait()
+
+    reconciler = Reconciler(world.settings)
+    monkeypatch.setattr(reconciler, "sweep", sweep_for_long)
+    monkeypatch.setattr(reconciler, "collect_orphans", listed.set)
+    monkeypatch.setattr(worker.reconciler, "_END_WITHIN_S", 0.1)
+    ended = threading.Event()
+    thread = threading.Thread(target=reconciler.run, args=(ended,))
+    thread.start()
+    try:
+        assert sweeping.wait(60)
+        job_id = world.ask(world.add_drive(brief_drive), wake=False)
+        with world.database.write() as session:
+            assert jobs.claim(session, job_id, owner="a worker", lease_us=0)
+        wait_until(lambda: queued(world) == 1, "the job's message")
+        assert not listed.is_set(), "the store is not listed with every start"
+    finally:
+        ended.set()
+        thread.join(60)
+        stopped = not thread.is_alive()
+        go_on.set()
+    assert stopped
 
 
 def test_delivered_message_is_not_sent_again(world: World, brief_drive: Path) -> None:
@@ -188,11 +238,11 @@ def test_objects_that_no_record_names(world: World, brief_drive: Path, monkeypat
     )
     (unnamed,) = objects(world) - named
     reconciler = Reconciler(world.settings)
-    reconciler.sweep()
+    reconciler.collect_orphans()
     assert unnamed in objects(world)
     tomorrow: Callable[[], int] = lambda: now_us() + DAY_US + HOUR_US  # noqa: E731
-    monkeypatch.setattr(worker.reconciler, "now_us", tomorrow)
-    reconciler.sweep()
+    monkeypatch.setattr(collecting, "now_us", tomorrow)
+    reconciler.collect_orphans()
     assert objects(world) == named
     assert world.drive(drive_id).state == "COMMITTED"
 

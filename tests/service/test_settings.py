@@ -1,0 +1,50 @@
+"""Settings that do not fit together are refused by their names."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from service.settings import Settings
+
+
+def test_the_defaults_fit_together() -> None:
+    assert Settings().heartbeat_seconds < Settings().lease_seconds
+
+
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        (
+            {"MRASFM_HEARTBEAT_SECONDS": "30", "MRASFM_STALLED_SECONDS": "40"},
+            r"MRASFM_HEARTBEAT_SECONDS \(30\) must be at most half of MRASFM_LEASE_SECONDS \(45\)",
+        ),
+        (
+            {"MRASFM_STALLED_SECONDS": "5"},
+            r"MRASFM_HEARTBEAT_SECONDS \(5\) must be less than MRASFM_STALLED_SECONDS \(5\)",
+        ),
+        (
+            {"MRASFM_VISIBILITY_TIMEOUT_SECONDS": "29"},
+            r"MRASFM_VISIBILITY_RENEW_SECONDS \(15\) must be at most half of MRASFM_VISIBILITY_TIMEOUT_SECONDS \(29\)",
+        ),
+        (
+            {"MRASFM_TERMINATE_AFTER_SECONDS": "31"},
+            r"MRASFM_TERMINATE_AFTER_SECONDS \(31\) must be at most MRASFM_KILL_AFTER_SECONDS \(30\)",
+        ),
+    ],
+)
+def test_times_that_contradict_each_other(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], words: str
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ValidationError, match=words) as caught:
+        Settings()
+    assert all(problem["loc"] for problem in caught.value.errors()), "the error names a field"
+
+
+def test_a_time_that_is_no_number_is_the_only_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MRASFM_HEARTBEAT_SECONDS", "soon")
+    with pytest.raises(ValidationError) as caught:
+        Settings()
+    assert [problem["loc"] for problem in caught.value.errors()] == [("heartbeat_seconds",)]
