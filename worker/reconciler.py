@@ -111,8 +111,10 @@ class Reconciler:
     def _expire(self) -> None:
         now = now_us()
         with self._database.write() as session:
+            # Locked first: a job that is asked for at this moment has been recorded then, or finds no drive.
+            expired = session.scalars(select(Drive.id).where(Drive.expires_us < now).with_for_update()).all()
             active = select(Job.drive_id).where(Job.state.not_in(TERMINAL))
-            session.execute(delete(Drive).where(Drive.expires_us < now, Drive.id.not_in(active)))
+            session.execute(delete(Drive).where(Drive.id.in_(expired), Drive.id.not_in(active)))
             session.execute(delete(Scene).where(Scene.expires_us < now))
             session.execute(delete(Job).where(Job.expires_us < now, Job.state.in_(TERMINAL)))
             kept_us = int(self._settings.idempotency_hours * _HOUR_US)

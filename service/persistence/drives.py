@@ -203,13 +203,17 @@ def _known_blobs(session: Session, project_id: str, digests: Sequence[str]) -> d
     return found
 
 
-def commit(session: Session, drive: Drive, findings: Sequence[dict[str, Any]]) -> Job:
+def commit(
+    session: Session, drive: Drive, findings: Sequence[dict[str, Any]], *, job_expires_us: int | None = None
+) -> Job:
     """Freeze a complete drive, and ask for the check of its images.
 
     Parameters
     ----------
     findings
         Of the manifest's check, all of them warnings.
+    job_expires_us
+        When the record of the images' check is deleted.
 
     Raises
     ------
@@ -246,7 +250,7 @@ def commit(session: Session, drive: Drive, findings: Sequence[dict[str, Any]]) -
         project_id=drive.project_id,
         kind=JobKind.PREFLIGHT,
         drive_id=drive.id,
-        expires_us=drive.expires_us,
+        expires_us=job_expires_us,
     )
     drive.state, drive.committed_us = DriveState.COMMITTED, now_us()
     drive.findings = list(findings)

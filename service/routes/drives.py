@@ -149,7 +149,12 @@ async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context:
         drive = drives.get(session, caller.project_id, drive_id, lock=True)
         if any(finding.severity == "error" for finding in found):
             raise rejected(drive_id, found)
-        job = drives.commit(session, drive, [finding.model_dump() for finding in found])
+        job = drives.commit(
+            session,
+            drive,
+            [finding.model_dump() for finding in found],
+            job_expires_us=expiry_us(now_us(), context.settings.job_retention_days),
+        )
         return answer(200, _shown(session, drive), waiting=(job,))
 
     return await anyio.to_thread.run_sync(partial(once, effect, prepare=prepare), limiter=context.commits)
