@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from service.errors import ServiceError
@@ -330,22 +331,23 @@ def test_files_that_are_no_images(unpacked: Unpacker, pack: Pack, data: bytes, c
     unpacked.refused(pack([("front/1.png", png()), ("front/0.png", data)]), code, word, "image front/0.png ")
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"PK",
-        b"7z\xbc\xaf\x27\x1c" + bytes(1000),
-        b"Rar!\x1a\x07\x00" + bytes(1000),
-        png(),
-        os.urandom(5000),
-        gzip.compress(b"no tar"),
-        gzip.compress(os.urandom(5000)),
-        bz2.compress(os.urandom(5000)),
-        lzma.compress(os.urandom(5000)),
-        gzip.compress(zip_of([("front/0.png", png())])),
-    ],
-)
+NOISE = np.random.default_rng(0).bytes(5000)
+NO_ARCHIVES = {
+    "nothing": b"",
+    "two bytes of a zip": b"PK",
+    "7z": b"7z\xbc\xaf\x27\x1c" + bytes(1000),
+    "rar": b"Rar!\x1a\x07\x00" + bytes(1000),
+    "an image": png(),
+    "noise": NOISE,
+    "gzip of a text": gzip.compress(b"no tar"),
+    "gzip of noise": gzip.compress(NOISE),
+    "bzip2 of noise": bz2.compress(NOISE),
+    "xz of noise": lzma.compress(NOISE),
+    "gzip of a zip": gzip.compress(zip_of([("front/0.png", png())])),
+}
+
+
+@pytest.mark.parametrize("data", NO_ARCHIVES.values(), ids=NO_ARCHIVES.keys())
 def test_what_is_no_archive(unpacked: Unpacker, data: bytes) -> None:
     error = unpacked.refused(data, "not-an-archive", status=415)
     assert "tar" in error.problem.remedy
