@@ -97,11 +97,18 @@ def _standalone(folder: Path) -> Iterator[tuple[str, Path]]:
     with (folder / "log").open("wb") as log:
         process = subprocess.Popen(argv, cwd=REPOSITORY, env=environment, stdout=log, stderr=log)
     try:
-        wait_until(lambda: httpx.get(f"{url}/readyz").is_success, "the service's start")
+        wait_until(lambda: _is_ready(url), "the service's start")
         yield url, key_file
     finally:
         process.terminate()
         process.wait(timeout=120)
+
+
+def _is_ready(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/readyz").is_success
+    except httpx.TransportError:
+        return False  # nobody listens yet
 
 
 def _figures_of(module: str, *arguments: str) -> dict[str, Any]:
