@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic import objects
 from mrasfm_engine.synthetic.light import Light, ShadowMap, cast_shadows
 from mrasfm_engine.synthetic.materials import Materials
@@ -21,6 +22,7 @@ from mrasfm_engine.synthetic.world import StaticWorld
 Floats = NDArray[np.float64]
 
 _UNDERGROUND_M = -500.0  # where things wait that are not there
+_COLLISION_STEP_S = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +102,18 @@ def parked_cars(options: SynthOptions, world: StaticWorld, drive: int, rng: np.r
     return result
 
 
+def _collide(a: Mover, b: Mover) -> bool:
+    """Whether two movers are in one place at any time at which `b` is there: one would drive through the other."""
+    for time_s in np.arange(b.begin_s, b.end_s, _COLLISION_STEP_S):
+        pose_a, pose_b = a.pose(float(time_s)), b.pose(float(time_s))
+        if pose_a is None or pose_b is None:
+            continue
+        apart = np.abs((se3.inverse(pose_b) @ pose_a)[:2, 3])
+        if (apart < (np.array(a.size_m[:2]) + np.array(b.size_m[:2])) / 2).all():
+            return True
+    return False
+
+
 def build_scene(
     options: SynthOptions,
     world: StaticWorld,
@@ -122,19 +136,20 @@ def build_scene(
         )
         for motion in traffic(options, world.layout, drive, rng)
     ]
-    for camera in rig:
-        if camera.name in options.occluded_cameras:
-            movers.append(
-                Mover(
-                    mesh=objects.truck(world.materials, rng=rng),
-                    motion=own,
-                    motion_from_mover=place_truck(camera, rig),
-                    size_m=objects.TRUCK_SIZE_M,
-                    is_truck=True,
-                    begin_s=0.25 * options.units / RATE_HZ - 0.05,
-                    end_s=0.75 * options.units / RATE_HZ - 0.05,
-                )
-            )
+    lorries = [
+        Mover(
+            mesh=objects.truck(world.materials, rng=rng),
+            motion=own,
+            motion_from_mover=place_truck(camera, rig),
+            size_m=objects.TRUCK_SIZE_M,
+            is_truck=True,
+            begin_s=0.25 * options.units / RATE_HZ - 0.05,
+            end_s=0.75 * options.units / RATE_HZ - 0.05,
+        )
+        for camera in rig
+        if camera.name in options.occluded_cameras
+    ]
+    movers = [mover for mover in movers if not any(_collide(mover, lorry) for lorry in lorries)] + lorries
     return SceneInTime(
         materials=world.materials,
         light=light,
