@@ -27,7 +27,7 @@ from mrasfm_engine.io.findings import as_json
 from mrasfm_engine.io.preflight import require_sound
 from mrasfm_engine.io.preflight_content import inspect_drive
 from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
-from mrasfm_engine.registration import incremental, mapping_report
+from mrasfm_engine.registration import incremental, mapping_report, wrong_camera
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
@@ -266,6 +266,9 @@ def scene(
     )
     if refinement.placement is not None:
         run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
+    run.report["findings"] += [
+        as_json(wrong_camera.finding(run.drive.cameras[wrong.camera].name, wrong)) for wrong in refinement.wrong_cameras
+    ]
     run.report["stages"].append(
         {
             "stage": "refinement",
