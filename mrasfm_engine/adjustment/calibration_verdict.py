@@ -27,7 +27,9 @@ class Observability:
     """Which directions of `rig_from_cam` a drive observes, about and along the rig's axes."""
 
     observed: Bools  # (c, 6) rotations, then translations, of a camera among the others
-    ratio: Floats  # (c, 6) posterior over prior sigma of the same; NaN where nothing of the direction is the camera's own
+    ratio: (
+        Floats  # (c, 6) posterior over prior sigma of the same; NaN where nothing of the direction is the camera's own
+    )
     scale_observed: bool  # whether positions know the size of the rig better than its prior does
     sigma_scale: float  # posterior, relative, of the cameras' distances
     prior_sigma_scale: float  # by the priors of the cameras' places; infinite where these are one

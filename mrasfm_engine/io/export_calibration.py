@@ -26,7 +26,9 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
     verdict = scene.calibration_verdict
     return {
         "version": 1,
-        **({} if verdict is None else {"adjusted": verdict.adjusted, "why": verdict.reason, "common": _common(verdict)}),
+        **(
+            {} if verdict is None else {"adjusted": verdict.adjusted, "why": verdict.reason, "common": _common(verdict)}
+        ),
         "axes": "rotation_vector_deg, translation_m, sigmas and observed are about and along the rig's x, y, z",
         "cameras": {camera.name: _camera(camera, refined) for camera, refined in cameras},
     }

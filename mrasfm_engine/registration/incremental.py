@@ -125,6 +125,8 @@ def map_units(
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
     model = Model(drive, keypoints, build_tracks(keypoints, near), config)
+    if prior_world_from_rig is not None:
+        model.motion.follow_prior(prior_world_from_rig)
     log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
     # Only the poses of all cameras together tell what moves along, so the scene grows before it is cleaned.
     moving = find_moving_along(model, near)
@@ -151,7 +153,8 @@ def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:
     """The model's poses and calibration with tracks from other matches, and points from these."""
     result = Model(model.drive, model.keypoints, build_tracks(model.keypoints, pairs), model.config)
     result.state = replace(model.state, points_m=result.state.points_m)
-    result.registered = model.registered
+    result.registered, result.motion = model.registered, model.motion
+    result.renew_motion()
     result.triangulate()
     return result
 
@@ -166,10 +169,12 @@ def _register_next(model: Model, log: MappingLog) -> Registration | None:
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue
+        model.motion.predict(model.state, model.registered, unit)
         registration = register_unit(model, unit)
         if registration.world_from_rig is not None:
             log.failures.pop(unit, None)
             model.set_pose(unit, registration.world_from_rig)
+            model.renew_motion(np.array([unit]))
             return registration
         log.failures[unit] = registration
     return None
