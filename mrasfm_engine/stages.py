@@ -242,6 +242,9 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             "registered": model.registered,
             "solved": model.solved,
             "kept": model.kept,
+            "missing": model.missing,
+            "has_own_pose": model.motion.own_poses[0],
+            "unit_from_image": model.motion.own_poses[1],
             **{name: getattr(model.state, name) for name in STATE_ARRAYS},
         }
         return arrays, mapping_report.describe(model, log)
@@ -251,6 +254,9 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     model = Model(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
     model.registered, model.solved, model.kept = arrays["registered"], arrays["solved"], arrays["kept"]
     model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
+    model.missing = arrays["missing"]
+    for image in np.flatnonzero(arrays["has_own_pose"]):
+        model.set_image_pose(int(image), arrays["unit_from_image"][image])
     return model
 
 

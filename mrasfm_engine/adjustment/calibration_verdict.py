@@ -1,11 +1,11 @@
 """What the drive says of the cameras' poses in the rig, and what is only their prior.
 
-Two motions of the cameras change no image, whatever the drive: all cameras moved by one transform (the units move by its
-inverse), and all moved away from their mean place by one factor (units and points move along). The adjustment holds the
-first; the second, the scale, is as good as the baselines' prior and positions make it. Neither says anything about one
-camera among the others, so a camera's direction is judged with both held: it is observed where the posterior standard
-deviation is well below what the prior alone would leave. Where a direction is nothing but such a motion (the baseline of
-two cameras is their scale), it is not observed.
+Two motions of the cameras change no image, whatever the drive: all cameras moved by one transform (the units move by
+its inverse), and all moved away from their mean place by one factor (units and points move along). The adjustment holds
+the first; the second, the scale, is as good as the baselines' prior and positions make it. Neither says anything about
+one camera among the others, so a camera's direction is judged with both held: it is observed where the posterior
+standard deviation is well below what the prior alone would leave. Where a direction is nothing but such a motion (the
+baseline of two cameras is their scale), it is not observed.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ def judge_directions(
     sigma = np.repeat(np.stack([sigma_rotation_rad, sigma_translation_m], 1), 3, axis=1)
     posterior = covariance / np.outer(sigma.ravel(), sigma.ravel())
     # The mean that is held is one of whitened corrections, so in these all common motions are alike.
-    prior = np.kron(np.eye(cameras) - 1.0 / cameras, np.eye(6))
+    prior = np.asarray(np.kron(np.eye(cameras) - 1.0 / cameras, np.eye(6)), dtype=np.float64)
     growth = np.zeros((cameras, 6))
     growth[:, 3:] = (position_m - position_m.mean(0)) / sigma[:, 3:]
-    functional = prior @ growth.ravel()
+    functional: Floats = prior @ growth.ravel()
     known = float(functional @ functional)
-    prior_scale = posterior_scale = np.inf
+    prior_scale = posterior_scale = float("inf")
     scale_observed = False
     if known > 1e-6:
-        prior_scale = 1.0 / np.sqrt(known)
-        posterior_scale = float(np.sqrt(max(functional @ posterior @ functional, 0.0))) / known
+        prior_scale = 1.0 / float(np.sqrt(known))
+        posterior_scale = float(np.sqrt(max(float(functional @ posterior @ functional), 0.0))) / known
         scale_observed = posterior_scale < OBSERVED_RATIO * prior_scale
         if not scale_observed:
             prior, posterior = _given(prior, functional), _given(posterior, functional)
@@ -82,7 +82,7 @@ def judge_directions(
         ratio=ratio,
         scale_observed=scale_observed,
         sigma_scale=posterior_scale,
-        prior_sigma_scale=float(prior_scale),
+        prior_sigma_scale=prior_scale,
     )
 
 

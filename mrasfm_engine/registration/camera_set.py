@@ -8,7 +8,7 @@ pose from the unit, also those that see too little to be registered alone, or no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pycolmap
@@ -41,6 +41,9 @@ class Registration:
     voted_out: tuple[str, ...] = ()  # cameras with a well supported pose of their own that is another one
     unclear: tuple[str, ...] = ()  # cameras that see enough points, but no pose fits these: they had no vote
     reason: str = ""
+    # Where images are registered one by one: poses of cameras that are apart from the unit's, and cameras without any.
+    own_poses: dict[int, Floats] = field(default_factory=dict)
+    missing: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +86,13 @@ class Eyes:
 
 def register_unit(model: Model, unit: int) -> Registration:
     """Find the pose of a unit from the points of its tracks."""
-    return register_seen(model, unit, _points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
+    return register_seen(model, unit, points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
 
 
 def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_vote: bool = True) -> Registration:
     """Find the pose of a unit from given correspondences; `by_vote` also by the cameras' own poses."""
     if len(seen.camera) < min_inliers:
-        return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {min_inliers} are needed")
+        return failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {min_inliers} are needed")
     sample = seen.of(_spread(len(seen.camera), MAX_CORRESPONDENCES))
     pose = _joint_pose(model, sample)
     inlier = np.zeros(len(seen.camera), dtype=np.bool_)
@@ -99,7 +102,7 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_v
     method = "joint"
     votes: list[Vote] = []
     if by_vote and (pose is None or disagreeing or inlier.mean() < model.config.mapping.min_pnp_inlier_ratio):
-        votes = _votes(model, sample)
+        votes = camera_votes(model, sample)
         average = consensus(votes)
         if average is not None:
             agreeing = _errors_px(model, average.world_from_rig, seen) < MAX_ERROR_PX
@@ -107,7 +110,7 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_v
                 pose, inlier, method = average.world_from_rig, agreeing, "vote"
     count = int(inlier.sum())
     if pose is None or count < min_inliers or count < model.config.mapping.min_pnp_inlier_ratio * len(inlier):
-        return _failed(unit, seen, count, f"only {count} of {len(inlier)} points agree with one pose")
+        return failed(unit, seen, count, f"only {count} of {len(inlier)} points agree with one pose")
     return Registration(
         unit=unit,
         world_from_rig=pose,
@@ -119,7 +122,8 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_v
     )
 
 
-def _failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
+def failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
+    """A unit without a pose, and why."""
     return Registration(
         unit=unit,
         world_from_rig=None,
@@ -130,7 +134,8 @@ def _failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
     )
 
 
-def _points_seen(model: Model, unit: int) -> Seen:
+def points_seen(model: Model, unit: int) -> Seen:
+    """Keypoints of a unit whose tracks have a point, and these points."""
     rows = model.rows_of_unit[unit]
     tracks = model.tracks.of_keypoint[rows]
     known = model.solved[tracks]
@@ -236,7 +241,7 @@ def _others(model: Model, votes: list[Vote], pose: Floats) -> tuple[str, ...]:
     return tuple(name for name, agrees in zip(_names(model, votes), same, strict=True) if not agrees)
 
 
-def _votes(model: Model, seen: Seen) -> list[Vote]:
+def camera_votes(model: Model, seen: Seen) -> list[Vote]:
     """Poses of the unit, each from one camera's own PnP, of the cameras for which that succeeds."""
     votes = []
     rig_from_eye = _rig_from_cameras(model, seen)

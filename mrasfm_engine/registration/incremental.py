@@ -22,6 +22,7 @@ from mrasfm_engine.registration.initialise import Initialisation, initialise
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.moving_along import find_moving_along, without_keypoints
+from mrasfm_engine.registration.single_images import register_images_singly, retry_missing, take_over
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
@@ -101,6 +102,8 @@ def register_all(
             at_global = int(model.registered.sum())
         if progress is not None:
             progress(int(model.registered.sum()), len(model.registered))
+    if not config.mapping.camera_set_registration:
+        retry_missing(model)
 
 
 def map_units(
@@ -153,7 +156,7 @@ def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:
     """The model's poses and calibration with tracks from other matches, and points from these."""
     result = Model(model.drive, model.keypoints, build_tracks(model.keypoints, pairs), model.config)
     result.state = replace(model.state, points_m=result.state.points_m)
-    result.registered, result.motion = model.registered, model.motion
+    result.registered, result.missing, result.motion = model.registered, model.missing, model.motion
     result.renew_motion()
     result.triangulate()
     return result
@@ -170,11 +173,13 @@ def _register_next(model: Model, log: MappingLog) -> Registration | None:
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue
         model.motion.predict(model.state, model.registered, unit)
-        registration = register_unit(model, unit)
+        register = register_unit if model.config.mapping.camera_set_registration else register_images_singly
+        registration = register(model, unit)
         if registration.world_from_rig is not None:
             log.failures.pop(unit, None)
             model.set_pose(unit, registration.world_from_rig)
             model.renew_motion(np.array([unit]))
+            take_over(model, registration)
             return registration
         log.failures[unit] = registration
     return None

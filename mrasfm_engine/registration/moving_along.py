@@ -90,22 +90,23 @@ def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools)
 def _flows(model: Model, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
     """Of every pair of one camera's images: keypoints of both, and by how much each must and does move, pixels."""
     keypoints = model.keypoints
-    world_from_rig, rig_from_cam = model.state.world_from_rig, model.state.rig_from_cam
+    rig_from_cam = model.state.rig_from_cam
+    posed = model.registered[model.image_unit] & ~model.missing
+    world_from_image = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
     for pair in pairs:
         unit_a, unit_b = int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])
         camera = int(model.image_camera[pair.image_a])
         if unit_a == unit_b or camera != model.image_camera[pair.image_b]:
             continue
-        if not (model.registered[unit_a] and model.registered[unit_b]):
+        if not (posed[pair.image_a] and posed[pair.image_b]):
             continue
         a, b = model.matched_keypoints(pair, unit_a)
-        cam_b_from_cam_a = se3.inverse(world_from_rig[unit_b] @ rig_from_cam[camera]) @ (
-            world_from_rig[unit_a] @ rig_from_cam[camera]
-        )
+        world_from_a = world_from_image[pair.image_a] @ rig_from_cam[camera]
+        world_from_b = world_from_image[pair.image_b] @ rig_from_cam[camera]
         least_px = _least_flow_px(
             keypoints.rays[a],
             keypoints.xy_px[a],
-            cam_b_from_cam_a,
+            se3.inverse(world_from_b) @ world_from_a,
             up=rig_from_cam[camera, 2, :3],
             kind=int(model.camera_kind[camera]),
             params=model.state.camera_params[camera],

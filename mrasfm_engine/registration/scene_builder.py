@@ -27,7 +27,8 @@ def build_scene(
     *,
     notes: Sequence[str] = (),
 ) -> Scene:
-    """Everything that is exported, as arrays. All images of a registered unit are part of the scene."""
+    """Everything that is exported, as arrays. All images of a registered unit are part of the scene, unless
+    images were registered one by one."""
     rows = model.observation_rows()
     tracks, point = np.unique(model.tracks.of_keypoint[rows], return_inverse=True)
     errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
@@ -44,7 +45,7 @@ def build_scene(
     return Scene(
         drive=model.drive,
         unit_registered=model.registered.copy(),
-        image_registered=model.registered[model.image_unit],
+        image_registered=model.registered[model.image_unit] & ~model.missing,
         world_from_rig=poses,
         sigma_position_m=sigma,
         calibration=_calibrations(model, refinement),
