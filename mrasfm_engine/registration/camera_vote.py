@@ -39,11 +39,11 @@ class Consensus:
 
 
 def consensus(votes: list[Vote]) -> Consensus | None:
-    """The average of the best supported group of votes; None without votes.
+    """The average of the largest group of votes, of equally large ones the better supported; None without votes.
 
     The L1 average of all votes comes first (MRASfM, eq. 6): while most cameras are right it is near them. Without a
     majority (two cameras against two) it lies in between and is right for nobody, so the votes themselves are tried as
-    well; of all the one counts that has most inliers behind it.
+    well. Cameras count first, as one that sees much texture knows no better where it is mounted.
     """
     if not votes:
         return None
@@ -51,7 +51,7 @@ def consensus(votes: list[Vote]) -> Consensus | None:
     inliers = np.array([vote.inliers for vote in votes], dtype=np.float64)
     average = se3.transform(robust_mean_rotation(poses[:, :3, :3]), geometric_median(poses[:, :3, 3]))
     groups = [agree(poses, centre) for centre in (average, *poses)]
-    group = groups[int(np.argmax([inliers[g].sum() for g in groups]))]
+    group = max(groups, key=lambda g: (g.sum(), inliers[g].sum()))
     weights = inliers[group]
     return Consensus(
         world_from_rig=se3.transform(

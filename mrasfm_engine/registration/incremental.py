@@ -21,7 +21,7 @@ from mrasfm_engine.registration.camera_set import Registration, register_unit
 from mrasfm_engine.registration.initialise import Initialisation, initialise
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.moving_along import find_moving_along, without_keypoints
+from mrasfm_engine.registration.moving_along import find_moving_along, units_to_doubt, without_keypoints
 from mrasfm_engine.registration.single_images import register_images_singly, retry_missing, take_over
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
@@ -136,9 +136,10 @@ def map_units(
     if moving.any:
         log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}
         near, far = (without_keypoints(p, keypoints.first, moving.keypoint) for p in (near, far))
+        model.forget(units_to_doubt(model, moving.covered))
         model = _with_tracks_of(model, near)
-        adjust_globally(model, log, cancel)
         register_all(model, log, progress=progress, cancel=cancel)
+        adjust_globally(model, log, cancel)
     revisits, log.revisits_tried = find_revisits(model, far)
     if not revisits:
         return model, log

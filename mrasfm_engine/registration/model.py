@@ -113,9 +113,14 @@ class Model:
         """Take the poses of units back that hardly observe a point any more; which ones."""
         counts = np.bincount(self.keypoints.unit[self.kept], minlength=len(self.registered))
         lost = np.flatnonzero(self.registered & (counts < min_observations))
-        self.registered[lost] = False
-        self.kept[np.isin(self.keypoints.unit, lost)] = False
+        self.forget(lost)
         return lost
+
+    def forget(self, units: Ints) -> None:
+        """Take the poses of units back, and what their images observe."""
+        self.registered[units] = False
+        self.missing[np.isin(self.image_unit, units)] = False
+        self.kept[np.isin(self.keypoints.unit, units)] = False
 
     def clear(self) -> None:
         """Forget all poses and points."""

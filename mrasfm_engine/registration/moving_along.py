@@ -32,7 +32,7 @@ MIN_FLOW_PX = 6.0  # what the world must move by before standing still means som
 STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
 STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the world
 MIN_KEYPOINTS = 30  # that move along, before an image is called covered
-COVERED_SHARE = 0.5  # of the keypoints that tell
+COVERED_SHARE = 0.5  # of the keypoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class MovingAlong:
     """Which keypoints move along with the vehicle, and which images they cover."""
 
     keypoint: Bools  # (keypoints,) no part of the world; set only where images are covered
-    share: Floats  # (images,) of an image's keypoints that tell; 0 where none does
+    share: Floats  # (images,) of an image's matched keypoints that do not move as the world does
     covered: Bools  # (images,)
 
     @property
@@ -61,21 +61,33 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
     """
     keypoints, images = model.keypoints, len(model.drive.images)
     along = np.zeros(len(keypoints.image), dtype=np.int64)  # matches for and against
-    moves = np.zeros(len(keypoints.image), dtype=np.bool_)
+    seen, moves = np.zeros((2, len(keypoints.image)), dtype=np.bool_)
     for a, b, least_px, moved_px in _flows(model, pairs):
         tells = least_px > MIN_FLOW_PX
         vote = np.where(tells, np.where(moved_px < STILL_SHARE * least_px, 1, -1), 0)
         for rows in (a, b):
             np.add.at(along, rows, vote)
+            seen[rows] = True
             moves[rows[moved_px > STILL_PX]] = True
-    with_it = along > 0
-    count = np.bincount(keypoints.image[with_it], minlength=images)
-    world = np.bincount(keypoints.image[~with_it & moves], minlength=images)
-    share = count / np.maximum(count + world, 1)
-    covered = (count >= MIN_KEYPOINTS) & (share >= COVERED_SHARE)
-    # In a covered image also what stands still without a ground to tell by: above the horizon of a straight street.
-    no_world = (with_it | (covered[keypoints.image] & ~moves)) if covered.any() else np.zeros_like(with_it)
+    # What stands still may be far away where no ground tells: above the horizon of a straight street. It counts with
+    # what moves along only where most of the keypoints that do tell are such.
+    with_it, still = along > 0, seen & (along == 0) & ~moves
+    count, counter, total, quiet = (
+        np.bincount(keypoints.image[which], minlength=images) for which in (with_it, along < 0, seen, still)
+    )
+    share = (count + quiet) / np.maximum(total, 1)
+    covered = (count >= MIN_KEYPOINTS) & (count >= COVERED_SHARE * (count + counter)) & (share >= COVERED_SHARE)
+    no_world = (with_it | (covered[keypoints.image] & still)) if covered.any() else np.zeros_like(with_it)
     return MovingAlong(keypoint=no_world, share=share, covered=covered)
+
+
+def units_to_doubt(model: Model, covered: Bools) -> Ints:
+    """Units whose covered images (images,) may have outvoted the others: their pose has to be found anew."""
+    units = len(model.registered)
+    images = np.bincount(model.image_unit, minlength=units)
+    doubt = model.registered & (2 * np.bincount(model.image_unit[covered], minlength=units) >= images)
+    # A scene of two units is the least to register others against.
+    return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
 
 
 def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools) -> list[PairMatches]:
