@@ -27,7 +27,7 @@ from mrasfm_engine.io.findings import as_json
 from mrasfm_engine.io.preflight import require_sound
 from mrasfm_engine.io.preflight_content import inspect_drive
 from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
-from mrasfm_engine.registration import incremental, mapping_report
+from mrasfm_engine.registration import incremental, mapping_report, wrong_camera
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
@@ -242,6 +242,9 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             "registered": model.registered,
             "solved": model.solved,
             "kept": model.kept,
+            "missing": model.missing,
+            "has_own_pose": model.motion.own_poses[0],
+            "unit_from_image": model.motion.own_poses[1],
             **{name: getattr(model.state, name) for name in STATE_ARRAYS},
         }
         return arrays, mapping_report.describe(model, log)
@@ -251,6 +254,9 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     model = Model(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
     model.registered, model.solved, model.kept = arrays["registered"], arrays["solved"], arrays["kept"]
     model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
+    model.missing = arrays["missing"]
+    for image in np.flatnonzero(arrays["has_own_pose"]):
+        model.set_image_pose(int(image), arrays["unit_from_image"][image])
     return model
 
 
@@ -269,6 +275,9 @@ def scene(
     )
     if refinement.placement is not None:
         run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
+    run.report["findings"] += [
+        as_json(wrong_camera.finding(run.drive.cameras[wrong.camera].name, wrong)) for wrong in refinement.wrong_cameras
+    ]
     run.report["stages"].append(
         {
             "stage": "refinement",

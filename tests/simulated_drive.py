@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +135,43 @@ def make_simulated_drive(
         )
         point_of_keypoint.append(np.concatenate([truth.point[rows], np.full(extra, -1)]).astype(np.int64))
     return SimulatedDrive(truth=truth, drive=drive, features=features, point_of_keypoint=point_of_keypoint)
+
+
+def with_lorry(
+    simulated: SimulatedDrive,
+    covered: Callable[[int, int], bool],
+    *,
+    keypoints: int = 200,
+    left: float = 0.1,
+    noise_px: float = 0.3,
+    seed: int = 1,
+) -> SimulatedDrive:
+    """A lorry with its own texture drives along: images of (unit, camera) for which `covered` says True show the same
+    keypoints at the same pixels, and only a share `left` of the world."""
+    rng = np.random.default_rng(seed)
+    width, height = simulated.truth.image_size_px
+    cameras = len(simulated.drive.cameras)
+    places = rng.uniform(0.03, 0.97, (cameras, keypoints, 2)) * [width, height]
+    texture = random_descriptors(cameras * keypoints, rng).reshape(cameras, keypoints, 128)
+    first = len(simulated.truth.points_m)  # points of lorries come after those of the world
+    features, points = [], []
+    for image, old, of in zip(simulated.drive.images, simulated.features, simulated.point_of_keypoint, strict=True):
+        if not covered(image.unit, image.camera):
+            features.append(old)
+            points.append(of)
+            continue
+        seen = np.flatnonzero(rng.random(len(of)) < left)
+        xy = places[image.camera] + rng.normal(0, noise_px, (keypoints, 2))
+        features.append(
+            ImageFeatures(
+                xy_px=np.concatenate([old.xy_px[seen], xy.astype(np.float32)]),
+                descriptors=np.concatenate([old.descriptors[seen], texture[image.camera]]),
+                colors=np.full((len(seen) + keypoints, 3), 128, np.uint8),
+            )
+        )
+        own = first + image.camera * keypoints + np.arange(keypoints)
+        points.append(np.concatenate([of[seen], own]).astype(np.int64))
+    return replace(simulated, features=features, point_of_keypoint=points)
 
 
 def random_descriptors(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How well the adjustment knows what it estimated: marginal covariances, scale, and what is only the prior."""
+"""How well the adjustment knows what it estimated: marginal covariances, and scale."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SINGULAR = 1e-11  # pivots and eigenvalues of the scaled matrix below this are rounding
-OBSERVED_RATIO = 0.5  # a direction counts as observed when its posterior sigma is below this share of the prior's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +25,7 @@ class Covariances:
     sigma_unit_position_m: Floats  # (u, 3), NaN for fixed units
     sigma_camera: Floats  # (c, 7) rotation (rad), translation (m), log focal; NaN for fixed cameras
     sigma_scale: float  # relative, of the trajectory's size
+    calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
 
 
 def covariances(problem: Problem, state: State) -> Covariances:
@@ -51,12 +51,16 @@ def covariances(problem: Problem, state: State) -> Covariances:
     per_camera = np.full((len(layout.camera_slot), CAMERA_DOF), np.nan)
     per_camera[cameras] = np.sqrt(variance[split:]).reshape(-1, CAMERA_DOF)
     positions = np.isinf(variance[:split]).reshape(-1, UNIT_DOF)[:, 3:]
+    poses = split + (CAMERA_DOF * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
+    loose_poses = np.isinf(variance[poses])
+    covariance[poses[loose_poses], poses[loose_poses]] = np.inf
     return Covariances(
         sigma_unit_position_m=per_unit[:, 3:],
         sigma_camera=per_camera,
         sigma_scale=np.inf
         if positions.any()
         else _sigma_scale(state.unit_position_m[units], covariance[:split, :split]),
+        calibration=covariance[np.ix_(poses, poses)],
     )
 
 
@@ -93,10 +97,3 @@ def _sigma_scale(position: Floats, covariance: Floats) -> float:
     functional[:, 3:] = centred / max(float((centred**2).sum()), 1e-12)
     row = functional.ravel()
     return float(np.sqrt(max(float(row @ covariance @ row), 0.0)))
-
-
-def observed_directions(sigma_camera: Floats, sigma_rotation_rad: Floats, sigma_translation_m: Floats) -> Bools:
-    """Which directions (c, 6) of the cameras' poses the drive observed; the rest is only the prior."""
-    prior = np.repeat(np.stack([sigma_rotation_rad, sigma_translation_m], 1), 3, axis=1)
-    result: Bools = sigma_camera[:, :6] < OBSERVED_RATIO * prior
-    return result

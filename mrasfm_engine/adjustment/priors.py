@@ -18,9 +18,11 @@ from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 # How firmly a gauge is held, relative to the priors: firm enough to hold, soft enough not to hurt the conditioning.
 GAUGE_STIFFNESS = 1e6
+HELD_SHARE = 0.02  # of a prior's sigma that is left in a direction that is held
 GAUGE_USUAL = 2.0  # cameras farther off than this many usual distances hardly count in the gauge
 
 
@@ -52,6 +54,7 @@ class CalibrationPrior:
     sigma_translation_m: Floats  # (c,)
     gauge_weights: Floats | None = None  # (c,) equal if None
     loss_scale: float = 3.0  # in sigmas, of one camera's correction as a whole
+    held: Bools | None = None  # (c, 6) directions that stay as given, as the drive does not observe them
 
     def corrections(self, state: State) -> Floats:
         """Rotation vectors (rad) and translations (m) of all cameras (c, 6) from given to current, in rig axes."""
@@ -66,6 +69,13 @@ class CalibrationPrior:
         sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
         return self.corrections(state) / sigma, sigma
 
+    def _own(self, whitened: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Every camera's own residuals, without the gauge, and the sigmas in them."""
+        if self.held is None:
+            return whitened, sigma
+        share = np.where(self.held, HELD_SHARE, 1.0)
+        return whitened / share, sigma * share
+
     def _gauge(self) -> Floats:
         w = np.ones(len(self.rotation)) if self.gauge_weights is None else self.gauge_weights
         result: Floats = w / w.sum() * np.sqrt(len(w))
@@ -73,24 +83,26 @@ class CalibrationPrior:
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        r, _ = self._whitened(state)
+        r, sigma = self._whitened(state)
         s2 = self.loss_scale**2
-        own = 0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum()
+        own = 0.5 * s2 * np.log1p((self._own(r, sigma)[0] ** 2).sum(1) / s2).sum()
         return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
         """See `Term`."""
         r, sigma = self._whitened(state)
         cameras = np.flatnonzero(layout.camera_slot >= 0)
-        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
+        own, own_sigma = self._own(r, sigma)
+        w = 1.0 / (1.0 + (own**2).sum(1) / self.loss_scale**2)
         gauge = self._gauge()
         mean = gauge @ r
         offsets = layout.camera_offsets(cameras)
         for axis in range(6):
             rows = offsets + axis
-            scaled = 1.0 / sigma[cameras, axis]
+            scaled = 1.0 / own_sigma[cameras, axis]
             h[rows, rows] += w[cameras] * scaled**2
-            g[rows] += w[cameras] * scaled * r[cameras, axis]
+            g[rows] += w[cameras] * scaled * own[cameras, axis]
+            scaled = 1.0 / sigma[cameras, axis]
             j = np.sqrt(GAUGE_STIFFNESS) * gauge[cameras] * scaled
             h[np.ix_(rows, rows)] += np.outer(j, j)
             g[rows] += j * np.sqrt(GAUGE_STIFFNESS) * mean[axis]

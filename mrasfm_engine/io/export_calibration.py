@@ -8,8 +8,10 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
-from mrasfm_engine.scene.scene import CameraCalibration, Scene
+from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, Scene
 from schemas import CAMERA_MODELS, Camera
+
+OBSERVED, ONLY_PRIOR = "observed", "only the prior"
 
 
 def calibration_document(scene: Scene) -> dict[str, Any]:
@@ -17,13 +19,36 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
 
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
     A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
+    `common` are the motions of all cameras together, of which no direction says anything: `observed` of a camera is
+    always among the others.
     """
     cameras = zip(scene.drive.cameras, scene.calibration, strict=True)
+    verdict = scene.calibration_verdict
     return {
         "version": 1,
+        **(
+            {} if verdict is None else {"adjusted": verdict.adjusted, "why": verdict.reason, "common": _common(verdict)}
+        ),
         "axes": "rotation_vector_deg, translation_m, sigmas and observed are about and along the rig's x, y, z",
         "cameras": {camera.name: _camera(camera, refined) for camera, refined in cameras},
     }
+
+
+def _common(verdict: CalibrationVerdict) -> dict[str, Any]:
+    """Motions of all cameras together: images show none of them, and only positions can tell the scale."""
+    scale: dict[str, Any] = {"observed": verdict.scale_observed}
+    if np.isfinite(verdict.sigma_scale):
+        scale["sigma_relative"] = verdict.sigma_scale
+    return {
+        "rotation": {"observed": [False] * 3, "verdict": ["held"] * 3},
+        "translation": {"observed": [False] * 3, "verdict": ["held"] * 3},
+        "scale": scale | {"verdict": "observed by positions" if verdict.scale_observed else ONLY_PRIOR},
+    }
+
+
+def verdict_in_words(refined: CameraCalibration) -> list[str]:
+    """Of the six directions of a camera: what its value rests on."""
+    return [OBSERVED if observed else ONLY_PRIOR for observed in refined.observed]
 
 
 def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
@@ -31,6 +56,7 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
     names = CAMERA_MODELS[camera.model]
     rotation = np.degrees(se3.log_so3(refined.rig_from_cam[:3, :3] @ given[:3, :3].T))
     focal = [k for k, name in enumerate(names) if name in ("f", "fx", "fy")]
+    words = verdict_in_words(refined)
     sigma = {
         "rotation_deg": refined.sigma_rotation_deg,
         "translation_m": refined.sigma_translation_m,
@@ -54,4 +80,6 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         },
         "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},
         "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()},
+        "verdict": {"rotation": words[:3], "translation": words[3:]},
+        "wrong": refined.is_wrong,
     }

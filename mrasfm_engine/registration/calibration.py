@@ -19,8 +19,11 @@ MIN_BASELINES_M2 = 1e-6
 MAX_UNKNOWNS_FOR_COVARIANCE = 12_000  # of units and cameras; above, the inverse would take gigabytes
 
 
-def calibration_prior(model: Model) -> CalibrationPrior:
-    """The prior of `rig_from_cam` from the manifest's sigmas, or the default ones, with weights as of now."""
+def calibration_prior(model: Model, held: Bools | None = None) -> CalibrationPrior:
+    """The prior of `rig_from_cam` from the manifest's sigmas, or the default ones, with weights as of now.
+
+    Directions that are `held` (cameras, 6) stay as given.
+    """
     settings, cameras = model.config.adjustment, model.drive.cameras
     given = model.drive.rig_from_cam
     prior = CalibrationPrior(
@@ -28,6 +31,7 @@ def calibration_prior(model: Model) -> CalibrationPrior:
         position_m=given[:, :3, 3],
         sigma_rotation_rad=np.radians([c.sigma_rotation_deg or settings.sigma_rotation_deg for c in cameras]),
         sigma_translation_m=np.array([c.sigma_translation_m or settings.sigma_translation_m for c in cameras]),
+        held=held,
     )
     return prior.with_weights(model.state)
 

@@ -2,21 +2,21 @@
 
 First one generalised PnP over all cameras. Where that fails, or a camera disagrees with it, every camera is registered
 alone, its pose turned into one of the unit through `rig_from_cam`, and the unit's pose is their robust average (MRASfM,
-section 3(a)); cameras far from it are voted out by name. Either way all images of the unit get their pose from the
-unit, also those that see too little to be registered alone.
+section 3(a), see `camera_vote`); cameras far from it are voted out by name. Either way all images of the unit get their
+pose from the unit, also those that see too little to be registered alone, or nothing but what covers them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.camera_model import unpack_camera
+from mrasfm_engine.registration.camera_vote import Vote, agree, consensus
 from mrasfm_engine.registration.model import Model
 
 Floats = NDArray[np.float64]
@@ -26,8 +26,7 @@ MAX_ERROR_PX = 8.0  # of an inlier; wider than elsewhere, as calibration may be 
 MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
 MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
 MIN_CAMERA_INLIER_RATIO = 0.25
-VOTE_ROTATION_DEG = 1.0  # votes farther than this from the average are out
-VOTE_TRANSLATION_M = 0.5
+VOTE_BEATS_JOINT = 0.9  # of the joint pose's inliers: what the vote loses on a wrong camera it may lose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +38,12 @@ class Registration:
     correspondences: int
     inliers: int
     method: str  # "joint", "vote" or "none"
-    voted_out: tuple[str, ...] = ()
+    voted_out: tuple[str, ...] = ()  # cameras with a well supported pose of their own that is another one
+    unclear: tuple[str, ...] = ()  # cameras that see enough points, but no pose fits these: they had no vote
     reason: str = ""
+    # Where images are registered one by one: poses of cameras that are apart from the unit's, and cameras without any.
+    own_poses: dict[int, Floats] = field(default_factory=dict)
+    missing: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +86,13 @@ class Eyes:
 
 def register_unit(model: Model, unit: int) -> Registration:
     """Find the pose of a unit from the points of its tracks."""
-    return register_seen(model, unit, _points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
+    return register_seen(model, unit, points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
 
 
 def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_vote: bool = True) -> Registration:
     """Find the pose of a unit from given correspondences; `by_vote` also by the cameras' own poses."""
     if len(seen.camera) < min_inliers:
-        return _failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {min_inliers} are needed")
+        return failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {min_inliers} are needed")
     sample = seen.of(_spread(len(seen.camera), MAX_CORRESPONDENCES))
     pose = _joint_pose(model, sample)
     inlier = np.zeros(len(seen.camera), dtype=np.bool_)
@@ -97,29 +100,30 @@ def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_v
         inlier = _errors_px(model, pose, seen) < MAX_ERROR_PX
     disagreeing = _disagreeing(model, seen, inlier)
     method = "joint"
-    voted_out: tuple[str, ...] = ()
+    votes: list[Vote] = []
     if by_vote and (pose is None or disagreeing or inlier.mean() < model.config.mapping.min_pnp_inlier_ratio):
-        vote, out = _vote(model, sample)
-        if vote is not None:
-            agreeing = _errors_px(model, vote, seen) < MAX_ERROR_PX
-            if agreeing.sum() >= inlier.sum() * 0.9:
-                pose, inlier, method, voted_out = vote, agreeing, "vote", out
-        if method == "joint" and disagreeing:
-            voted_out = disagreeing
+        votes = camera_votes(model, sample)
+        average = consensus(votes)
+        if average is not None:
+            agreeing = _errors_px(model, average.world_from_rig, seen) < MAX_ERROR_PX
+            if agreeing.sum() >= inlier.sum() * VOTE_BEATS_JOINT:
+                pose, inlier, method = average.world_from_rig, agreeing, "vote"
     count = int(inlier.sum())
     if pose is None or count < min_inliers or count < model.config.mapping.min_pnp_inlier_ratio * len(inlier):
-        return _failed(unit, seen, count, f"only {count} of {len(inlier)} points agree with one pose")
+        return failed(unit, seen, count, f"only {count} of {len(inlier)} points agree with one pose")
     return Registration(
         unit=unit,
         world_from_rig=pose,
         correspondences=len(inlier),
         inliers=count,
         method=method,
-        voted_out=voted_out,
+        voted_out=_others(model, votes, pose),
+        unclear=tuple(n for n in _disagreeing(model, seen, inlier) if n not in _names(model, votes)),
     )
 
 
-def _failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
+def failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
+    """A unit without a pose, and why."""
     return Registration(
         unit=unit,
         world_from_rig=None,
@@ -130,7 +134,8 @@ def _failed(unit: int, seen: Seen, inliers: int, reason: str) -> Registration:
     )
 
 
-def _points_seen(model: Model, unit: int) -> Seen:
+def points_seen(model: Model, unit: int) -> Seen:
+    """Keypoints of a unit whose tracks have a point, and these points."""
     rows = model.rows_of_unit[unit]
     tracks = model.tracks.of_keypoint[rows]
     known = model.solved[tracks]
@@ -224,13 +229,25 @@ def _rig_from_cameras(model: Model, seen: Seen) -> Floats:
     return result
 
 
-def _vote(model: Model, seen: Seen) -> tuple[Floats | None, tuple[str, ...]]:
-    """Average of the cameras' own poses, and the names of those that are far from it."""
-    cameras, votes, names = cameras_of(model), [], []
+def _names(model: Model, votes: list[Vote]) -> list[str]:
+    return [model.drive.cameras[vote.camera].name for vote in votes]
+
+
+def _others(model: Model, votes: list[Vote], pose: Floats) -> tuple[str, ...]:
+    """Names of the cameras that voted for another pose."""
+    if not votes:
+        return ()
+    same = agree(np.stack([vote.world_from_rig for vote in votes]), pose)
+    return tuple(name for name, agrees in zip(_names(model, votes), same, strict=True) if not agrees)
+
+
+def camera_votes(model: Model, seen: Seen) -> list[Vote]:
+    """Poses of the unit, each from one camera's own PnP, of the cameras for which that succeeds."""
+    votes = []
     rig_from_eye = _rig_from_cameras(model, seen)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac = _ransac(model)
-    for c, camera in enumerate(cameras):
+    for c, camera in enumerate(cameras_of(model)):
         rows = seen.camera == c
         if rows.sum() < MIN_CAMERA_MATCHES:
             continue
@@ -240,17 +257,11 @@ def _vote(model: Model, seen: Seen) -> tuple[Floats | None, tuple[str, ...]]:
         if result is None or result["num_inliers"] < MIN_CAMERA_INLIER_RATIO * rows.sum():
             continue
         world_from_cam = se3.inverse(matrix_of(result["cam_from_world"]))
-        votes.append(world_from_cam @ se3.inverse(rig_from_eye[c]))
-        names.append(model.drive.cameras[c].name)
-    if not votes:
-        return None, ()
-    poses = np.stack(votes)
-    rotation = robust_mean_rotation(poses[:, :3, :3])
-    position = geometric_median(poses[:, :3, 3])
-    turned = se3.rotation_angle_deg(poses[:, :3, :3] @ rotation.T)
-    moved = np.linalg.norm(poses[:, :3, 3] - position, axis=1)
-    good = (turned < VOTE_ROTATION_DEG) & (moved < VOTE_TRANSLATION_M)
-    if good.any():
-        rotation = se3.mean_rotation(poses[good, :3, :3])
-        position = poses[good, :3, 3].mean(0)
-    return se3.transform(rotation, position), tuple(n for n, g in zip(names, good, strict=True) if not g)
+        votes.append(
+            Vote(
+                camera=c,
+                world_from_rig=world_from_cam @ se3.inverse(rig_from_eye[c]),
+                inliers=int(result["num_inliers"]),
+            )
+        )
+    return votes

@@ -21,6 +21,8 @@ from mrasfm_engine.registration.camera_set import Registration, register_unit
 from mrasfm_engine.registration.initialise import Initialisation, initialise
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.moving_along import find_moving_along, units_to_doubt, without_keypoints
+from mrasfm_engine.registration.single_images import register_images_singly, retry_missing, take_over
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
@@ -46,6 +48,7 @@ class MappingLog:
     revisits_tried: int = 0  # pairs of units across a gap that were compared
     revisits: list[tuple[int, int]] = field(default_factory=list)  # those that were believed
     loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
+    covered_images: dict[int, float] = field(default_factory=dict)  # by image, the share of keypoints that move along
 
 
 def grow(
@@ -65,11 +68,22 @@ def grow(
     CancelledError
         Where `cancel` answers True.
     """
-    log, config = MappingLog(), model.config
+    log = MappingLog()
     log.initialisation = initialise(model, pairs, prior_world_from_rig)
-    since_local, at_global = 0, 2
-    recent: list[int] = list(log.initialisation.units)
     adjust_globally(model, log, cancel)
+    register_all(model, log, progress=progress, cancel=cancel)
+    return log
+
+
+def register_all(
+    model: Model,
+    log: MappingLog,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> None:
+    """Register what can be registered of the units that have no pose yet."""
+    config, since_local, at_global = model.config, 0, int(model.registered.sum())
     while not model.registered.all():
         if cancel is not None and cancel():
             raise CancelledError
@@ -77,11 +91,10 @@ def grow(
         if registration is None:
             break
         log.registrations.append(registration)
-        recent.append(registration.unit)
         model.extend(registration.unit)
         since_local += 1
         if since_local >= config.mapping.local_every:
-            _adjust_locally(model, recent[-1])
+            _adjust_locally(model, registration.unit)
             log.local_adjustments += 1
             since_local = 0
         if model.registered.sum() >= at_global * (1 + config.mapping.global_growth):
@@ -89,7 +102,8 @@ def grow(
             at_global = int(model.registered.sum())
         if progress is not None:
             progress(int(model.registered.sum()), len(model.registered))
-    return log
+    if not config.mapping.camera_set_registration:
+        retry_missing(model)
 
 
 def map_units(
@@ -102,7 +116,7 @@ def map_units(
     progress: Callable[[int, int], None] | None = None,
     cancel: Callable[[], bool] | None = None,
 ) -> tuple[Model, MappingLog]:
-    """The whole mapping: the scene grows along the drive, then loops are closed.
+    """The whole mapping: the scene grows along the drive, what moves along is taken out, then loops are closed.
 
     Raises
     ------
@@ -117,6 +131,15 @@ def map_units(
     if prior_world_from_rig is not None:
         model.motion.follow_prior(prior_world_from_rig)
     log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
+    # Only the poses of all cameras together tell what moves along, so the scene grows before it is cleaned.
+    moving = find_moving_along(model, near)
+    if moving.any:
+        log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}
+        near, far = (without_keypoints(p, keypoints.first, moving.keypoint) for p in (near, far))
+        model.forget(units_to_doubt(model, moving.covered))
+        model = _with_tracks_of(model, near)
+        register_all(model, log, progress=progress, cancel=cancel)
+        adjust_globally(model, log, cancel)
     revisits, log.revisits_tried = find_revisits(model, far)
     if not revisits:
         return model, log
@@ -125,13 +148,19 @@ def map_units(
     # Tracks anew, now with the matches across the loop that were believed, and points from the moved units.
     believed = set(log.revisits)
     across = [p for p in far if (*sorted((int(image_unit[p.image_a]), int(image_unit[p.image_b]))),) in believed]
-    closed = Model(drive, keypoints, build_tracks(keypoints, [*near, *across]), config)
-    closed.state = replace(model.state, points_m=closed.state.points_m)
-    closed.registered, closed.motion = model.registered, model.motion
-    closed.renew_motion()
-    closed.triangulate()
+    closed = _with_tracks_of(model, [*near, *across])
     adjust_globally(closed, log, cancel)
     return closed, log
+
+
+def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:
+    """The model's poses and calibration with tracks from other matches, and points from these."""
+    result = Model(model.drive, model.keypoints, build_tracks(model.keypoints, pairs), model.config)
+    result.state = replace(model.state, points_m=result.state.points_m)
+    result.registered, result.missing, result.motion = model.registered, model.missing, model.motion
+    result.renew_motion()
+    result.triangulate()
+    return result
 
 
 def _register_next(model: Model, log: MappingLog) -> Registration | None:
@@ -145,11 +174,13 @@ def _register_next(model: Model, log: MappingLog) -> Registration | None:
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue
         model.motion.predict(model.state, model.registered, unit)
-        registration = register_unit(model, unit)
+        register = register_unit if model.config.mapping.camera_set_registration else register_images_singly
+        registration = register(model, unit)
         if registration.world_from_rig is not None:
             log.failures.pop(unit, None)
             model.set_pose(unit, registration.world_from_rig)
             model.renew_motion(np.array([unit]))
+            take_over(model, registration)
             return registration
         log.failures[unit] = registration
     return None

@@ -13,12 +13,16 @@ from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES
 from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
+from mrasfm_engine.registration.wrong_camera import often_voted_out
+
+DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
 
 def describe(model: Model, log: MappingLog) -> dict[str, Any]:
     """Counts of the incremental loop, and what was rejected and why."""
     frames = model.drive.manifest.frames
-    voted_out = Counter(name for r in log.registrations for name in r.voted_out)
+    covered = _covered(model, log)
+    unclear = Counter(name for r in log.registrations for name in r.unclear)
     start = log.initialisation
     missing = [
         {
@@ -34,7 +38,9 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "registered_units": int(model.registered.sum()),
         "units_not_registered": missing,
         "registered_by": dict(Counter(r.method for r in log.registrations)),
-        "cameras_voted_out": dict(voted_out),
+        "cameras_voted_out": often_voted_out(log.registrations, {(c["unit"], c["camera"]) for c in covered}),
+        "cameras_without_a_vote": dict(unclear),
+        "images_occluded": covered,
         "images_posed_by_their_unit_alone": _poorly_seen(model),
         "tracks": len(model.tracks),
         "points": int(model.solved.sum()),
@@ -47,6 +53,20 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "local_adjustments": log.local_adjustments,
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
     }
+
+
+def _covered(model: Model, log: MappingLog) -> list[dict[str, Any]]:
+    """Images covered by something that moves along with the vehicle."""
+    images, cameras = model.drive.images, model.drive.cameras
+    return [
+        {
+            "file": images[i].file,
+            "camera": cameras[images[i].camera].name,
+            "unit": images[i].unit,
+            "share_of_keypoints_against_the_unit": round(share, 3),
+        }
+        for i, share in sorted(log.covered_images.items())
+    ]
 
 
 def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
@@ -67,6 +87,7 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
             "adjusted": refinement.calibration.free,
             "reason": refinement.calibration.reason,
             "heading_change_deg": heading_change_deg(model),
+            **_directions(model, refinement),
         },
         "georeferenced": refinement.georeferenced,
     }
@@ -89,8 +110,39 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     return result
 
 
+def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
+    """What of the cameras' poses was observed, by name, and which of them were wrong."""
+    cameras, directions = model.drive.cameras, refinement.directions
+    if directions is None:
+        return {}
+    observed = directions.observed & refinement.calibration.free
+    return {
+        "observed": {
+            camera.name: [d for d, seen in zip(DIRECTIONS, observed[c], strict=True) if seen]
+            for c, camera in enumerate(cameras)
+        },
+        "only_the_prior": {
+            camera.name: [d for d, seen in zip(DIRECTIONS, observed[c], strict=True) if not seen]
+            for c, camera in enumerate(cameras)
+        },
+        "held_for_all_cameras_together": [*DIRECTIONS],
+        "scale_of_the_rig": "observed by positions" if directions.scale_observed else "only the prior",
+        "cameras_wrong": [
+            {
+                "camera": cameras[w.camera].name,
+                "rotation_deg": w.rotation_deg,
+                "translation_m": w.translation_m,
+                "sigmas_of_its_prior": w.prior_sigmas,
+                "others_rotation_deg": w.others_rotation_deg,
+                "others_translation_m": w.others_translation_m,
+            }
+            for w in refinement.wrong_cameras
+        ],
+    }
+
+
 def _poorly_seen(model: Model) -> list[str]:
-    """Images that observe too little to be registered alone: occluded, dark, or without texture."""
+    """Images that observe too little to be registered alone: dark, without texture, or occluded."""
     images = model.drive.images
     counts = np.bincount(model.keypoints.image[model.kept], minlength=len(images))
     poor = np.flatnonzero(model.registered[model.image_unit] & (counts < MIN_CAMERA_MATCHES))

@@ -41,6 +41,8 @@ class Model:
         (tracks,) which tracks have a point.
     kept
         (keypoints,) which keypoints are observations of their track's point.
+    missing
+        (images,) images without a pose although their unit has one: only where images are registered one by one.
     motion
         Where the rig is at the images' own times, and poses that images have apart from it.
     """
@@ -60,6 +62,7 @@ class Model:
         self.registered = np.zeros(units, dtype=np.bool_)
         self.solved = np.zeros(len(tracks), dtype=np.bool_)
         self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
+        self.missing = np.zeros(len(drive.images), dtype=np.bool_)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
         shots = Shots.of(drive, compensate=config.mapping.motion_compensation)
@@ -110,9 +113,14 @@ class Model:
         """Take the poses of units back that hardly observe a point any more; which ones."""
         counts = np.bincount(self.keypoints.unit[self.kept], minlength=len(self.registered))
         lost = np.flatnonzero(self.registered & (counts < min_observations))
-        self.registered[lost] = False
-        self.kept[np.isin(self.keypoints.unit, lost)] = False
+        self.forget(lost)
         return lost
+
+    def forget(self, units: Ints) -> None:
+        """Take the poses of units back, and what their images observe."""
+        self.registered[units] = False
+        self.missing[np.isin(self.image_unit, units)] = False
+        self.kept[np.isin(self.keypoints.unit, units)] = False
 
     def clear(self) -> None:
         """Forget all poses and points."""
@@ -145,7 +153,7 @@ class Model:
         self.triangulator.triangulate(
             self.state,
             self.tracks,
-            self.registered,
+            (self.registered[self.image_unit] & ~self.missing)[self.motion.shots.image],
             which=which,
             points_m=self.state.points_m,
             solved=self.solved,
@@ -156,6 +164,7 @@ class Model:
     def extend(self, unit: int) -> None:
         """Let a newly registered unit observe the points of its tracks, and give its other tracks points."""
         rows = self.rows_of_unit[unit]
+        rows = rows[~self.missing[self.keypoints.image[rows]]]
         tracks = self.tracks.of_keypoint[rows]
         has_point = self.solved[tracks]
         errors = self.triangulator.errors_px(self.state, rows[has_point], self.state.points_m, tracks[has_point])
@@ -168,6 +177,7 @@ class Model:
         """Let every point have the observations that now fit it, and try again for tracks without a point."""
         of_keypoint = self.tracks.of_keypoint
         rows = np.flatnonzero((of_keypoint >= 0) & self.registered[self.keypoints.unit])
+        rows = rows[~self.missing[self.keypoints.image[rows]]]
         rows = rows[self.solved[of_keypoint[rows]]]
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, of_keypoint[rows])
         self.kept[:] = False

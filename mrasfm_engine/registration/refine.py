@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.adjustment.calibration_verdict import Observability, judge_directions
 from mrasfm_engine.adjustment.observability import Covariances, covariances
 from mrasfm_engine.adjustment.priors import FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.solver import Report, SolverOptions
@@ -22,6 +23,7 @@ from mrasfm_engine.registration.calibration import (
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
+from mrasfm_engine.registration.wrong_camera import WrongCamera, find_wrong_cameras
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -48,6 +50,9 @@ class Refinement:
     points_dropped: int = 0
     units_dropped: list[int] = field(default_factory=list)
     certainty: Covariances | None = None
+    directions: Observability | None = None  # of the cameras' poses; None where it is not known
+    held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
+    wrong_cameras: list[WrongCamera] = field(default_factory=list)
 
     @property
     def georeferenced(self) -> bool:
@@ -127,7 +132,53 @@ def refine(
             progress(done + 1, ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _certainty(model, positions, result)
+    result.directions = _directions(model, result.certainty)
+    if result.calibration.free and result.directions is not None and result.certainty is not None:
+        if not result.directions.observed.all():
+            _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
+        result.wrong_cameras = find_wrong_cameras(
+            calibration_prior(model), model.state, result.certainty, result.directions
+        )
     return result
+
+
+def _directions(model: Model, certainty: Covariances | None) -> Observability | None:
+    cameras = len(model.camera_kind)
+    if certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
+        return None
+    prior = calibration_prior(model)
+    return judge_directions(
+        certainty.calibration,
+        position_m=model.state.camera_position_m,
+        sigma_rotation_rad=prior.sigma_rotation_rad,
+        sigma_translation_m=prior.sigma_translation_m,
+    )
+
+
+def _hold_unobserved(
+    model: Model,
+    positions: PositionPrior | None,
+    result: Refinement,
+    free_units: Bools,
+    cancel: Callable[[], bool] | None,
+) -> None:
+    """Adjust once more with what the drive does not observe held as given.
+
+    A direction of which the drive knows a little would else carry a correction that is mostly noise, and pass for a
+    finding.
+    """
+    assert result.directions is not None
+    result.held = ~result.directions.observed
+    result.adjustments.append(
+        model.adjust(
+            free_units,
+            free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
+            free_focal=result.focal_free,
+            terms=_terms(model, positions, result),
+            options=_options(model, result.sigma_px, iterations=40),
+            cancel=cancel,
+        )
+    )
 
 
 def _options(model: Model, sigma_px: float, *, iterations: int) -> SolverOptions:
@@ -170,7 +221,7 @@ def _observation_sigma(model: Model) -> float:
 def _terms(model: Model, positions: PositionPrior | None, result: Refinement) -> list[Term]:
     terms: list[Term] = []
     if result.calibration.free:
-        terms.append(calibration_prior(model))
+        terms.append(calibration_prior(model, result.held))
     if result.focal_free:
         terms.append(_focal_prior(model))
     if positions is not None:

@@ -66,6 +66,11 @@ class RigMotion:
         self._own[image], self._unit_from_image[image] = True, unit_from_image
 
     @property
+    def own_poses(self) -> tuple[Bools, Floats]:
+        """Which images (i,) have a pose of their own, and the poses (i, 4, 4) as `set_image_pose` takes them."""
+        return self._own, self._unit_from_image
+
+    @property
     def needed(self) -> bool:
         """Whether any image is apart from its unit at all."""
         return bool(self._own.any()) or not self.shots.simultaneous

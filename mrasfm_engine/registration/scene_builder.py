@@ -7,14 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.observability import observed_directions
 from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
 from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.registration.calibration import calibration_prior
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
-from mrasfm_engine.scene.scene import CameraCalibration, ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, ImageFeatures, PairMatches, Scene
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +27,8 @@ def build_scene(
     *,
     notes: Sequence[str] = (),
 ) -> Scene:
-    """Everything that is exported, as arrays. All images of a registered unit are part of the scene."""
+    """Everything that is exported, as arrays. All images of a registered unit are part of the scene, unless
+    images were registered one by one."""
     rows = model.observation_rows()
     tracks, point = np.unique(model.tracks.of_keypoint[rows], return_inverse=True)
     errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
@@ -45,10 +45,11 @@ def build_scene(
     return Scene(
         drive=model.drive,
         unit_registered=model.registered.copy(),
-        image_registered=model.registered[model.image_unit],
+        image_registered=model.registered[model.image_unit] & ~model.missing,
         world_from_rig=poses,
         sigma_position_m=sigma,
         calibration=_calibrations(model, refinement),
+        calibration_verdict=_verdict(refinement),
         points_m=model.state.points_m[tracks],
         point_colors=np.round(mean_color / counts[:, None]).astype(np.uint8),
         point_error_px=np.bincount(point, errors, minlength=len(tracks)) / counts,
@@ -64,6 +65,16 @@ def build_scene(
     )
 
 
+def _verdict(refinement: Refinement) -> CalibrationVerdict:
+    directions = refinement.directions
+    return CalibrationVerdict(
+        adjusted=refinement.calibration.free,
+        reason=refinement.calibration.reason,
+        scale_observed=refinement.calibration.free and directions is not None and directions.scale_observed,
+        sigma_scale=np.nan if directions is None else directions.sigma_scale,
+    )
+
+
 def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibration]:
     prior: CalibrationPrior = calibration_prior(model)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
@@ -71,9 +82,11 @@ def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibratio
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
         sigma = refinement.certainty.sigma_camera[:, :6]
-        observed = observed_directions(sigma, prior.sigma_rotation_rad, prior.sigma_translation_m)
         if refinement.focal_free:
             focal = refinement.certainty.sigma_camera[:, 6] * model.state.camera_params[:, 0]
+    if refinement.calibration.free and refinement.directions is not None:
+        observed = refinement.directions.observed
+    wrong = {w.camera for w in refinement.wrong_cameras}
     return [
         CameraCalibration(
             rig_from_cam=model.state.rig_from_cam[c],
@@ -82,6 +95,7 @@ def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibratio
             sigma_translation_m=sigma[c, 3:],
             sigma_focal_px=float(focal[c]),
             observed=observed[c],
+            is_wrong=c in wrong,
         )
         for c, camera in enumerate(model.drive.cameras)
     ]

@@ -58,8 +58,20 @@ class CameraCalibration:
     sigma_rotation_deg: Floats  # (3,) about the rig's axes, posterior
     sigma_translation_m: Floats  # (3,) along the rig's axes, posterior
     sigma_focal_px: float
-    # which of the six directions (rotation x y z, translation x y z) the drive observed, the rest is only the prior
+    # which of the six directions (rotation x y z, translation x y z) of this camera among the others the drive
+    # observed, the rest is only the prior
     observed: NDArray[np.bool_]  # (6,)
+    is_wrong: bool = False  # whether what was given is far from what the drive shows
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationVerdict:
+    """What the drive could say of the cameras together."""
+
+    adjusted: bool  # whether `rig_from_cam` varied at all
+    reason: str
+    scale_observed: bool  # whether positions tell the cameras' distances better than their priors
+    sigma_scale: float  # relative, of the cameras' distances; NaN where not known
 
 
 @dataclass(kw_only=True)
@@ -75,6 +87,7 @@ class Scene:
     world_from_rig: Floats  # (units, 4, 4); rows of units that are not registered are NaN
     sigma_position_m: Floats  # (units, 3), NaN where not known
     calibration: list[CameraCalibration]  # by camera
+    calibration_verdict: CalibrationVerdict | None = None
     points_m: Floats  # (p, 3)
     point_colors: NDArray[np.uint8]  # (p, 3)
     point_error_px: Floats  # (p,) mean reprojection error

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic import objects
 from mrasfm_engine.synthetic.light import Light, ShadowMap, cast_shadows
 from mrasfm_engine.synthetic.materials import Materials
@@ -21,6 +23,7 @@ from mrasfm_engine.synthetic.world import StaticWorld
 Floats = NDArray[np.float64]
 
 _UNDERGROUND_M = -500.0  # where things wait that are not there
+_COLLISION_STEP_S = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,12 +77,14 @@ class SceneInTime:
         return replace(self.everything, **geometry), np.concatenate([np.zeros((0, 8)), *boxes])
 
 
-def parked_cars(options: SynthOptions, world: StaticWorld, drive: int, rng: np.random.Generator) -> list[Mesh]:
-    """Cars in the parking lanes along a drive's way, none in another street."""
+def parked_cars(
+    options: SynthOptions, world: StaticWorld, drive: int, rng: np.random.Generator
+) -> list[tuple[Mesh, Floats]]:
+    """Cars in the parking lanes along a drive's way, none in another street: in the world, and where they stand."""
     layout: Layout = world.layout
     route = layout.routes[drive]
     street = layout.streets[route.street]
-    result: list[Mesh] = []
+    result: list[tuple[Mesh, Floats]] = []
     places: list[tuple[int, float]] = []
     for _ in range(60 * options.parked_cars):
         if len(result) == options.parked_cars:
@@ -96,8 +101,24 @@ def parked_cars(options: SynthOptions, world: StaticWorld, drive: int, rng: np.r
         places.append((side, along))
         turn = float(heading) + (np.pi if side > 0 else 0.0) + float(rng.normal(0, 0.03))
         frame = objects.pose_on_ground(layout.ground.lift(xy), turn)
-        result.append(objects.car(world.materials, is_moving=False, rng=rng).moved(frame))
+        result.append((objects.car(world.materials, is_moving=False, rng=rng).moved(frame), frame))
     return result
+
+
+def _drives_through(lorry: Mover, pose_of_car: Callable[[float], Floats | None]) -> bool:
+    """Whether a lorry is in one place with a car, whose pose at any time is given, while it is there."""
+    reach = (np.array(lorry.size_m[:2]) + np.array(objects.CAR_SIZE_M[:2])) / 2
+    for time_s in np.arange(lorry.begin_s, lorry.end_s, _COLLISION_STEP_S).tolist():
+        world_from_lorry, world_from_car = lorry.pose(time_s), pose_of_car(time_s)
+        if world_from_lorry is None or world_from_car is None:
+            continue
+        if (np.abs((se3.inverse(world_from_lorry) @ world_from_car)[:2, 3]) < reach).all():
+            return True
+    return False
+
+
+def _covers(lorry: Mover, world_from_car: Floats) -> bool:
+    return _drives_through(lorry, lambda time_s: world_from_car)
 
 
 def build_scene(
@@ -111,7 +132,7 @@ def build_scene(
     rng: np.random.Generator,
 ) -> SceneInTime:
     """The world with one drive's parked cars, traffic and light."""
-    static = concatenate([world.mesh, *parked_cars(options, world, drive, rng)])
+    parked = parked_cars(options, world, drive, rng)
     movers = [
         Mover(
             mesh=objects.car(world.materials, is_moving=True, rng=rng),
@@ -122,19 +143,23 @@ def build_scene(
         )
         for motion in traffic(options, world.layout, drive, rng)
     ]
-    for camera in rig:
-        if camera.name in options.occluded_cameras:
-            movers.append(
-                Mover(
-                    mesh=objects.truck(world.materials, rng=rng),
-                    motion=own,
-                    motion_from_mover=place_truck(camera, rig),
-                    size_m=objects.TRUCK_SIZE_M,
-                    is_truck=True,
-                    begin_s=0.25 * options.units / RATE_HZ - 0.05,
-                    end_s=0.75 * options.units / RATE_HZ - 0.05,
-                )
-            )
+    lorries = [
+        Mover(
+            mesh=objects.truck(world.materials, rng=rng),
+            motion=own,
+            motion_from_mover=place_truck(camera, rig),
+            size_m=objects.TRUCK_SIZE_M,
+            is_truck=True,
+            begin_s=0.25 * options.units / RATE_HZ - 0.05,
+            end_s=0.75 * options.units / RATE_HZ - 0.05,
+        )
+        for camera in rig
+        if camera.name in options.occluded_cameras
+    ]
+    movers = [mover for mover in movers if not any(_drives_through(lorry, mover.pose) for lorry in lorries)] + lorries
+    static = concatenate(
+        [world.mesh, *(mesh for mesh, at in parked if not any(_covers(lorry, at) for lorry in lorries))]
+    )
     return SceneInTime(
         materials=world.materials,
         light=light,

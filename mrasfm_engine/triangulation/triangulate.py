@@ -322,14 +322,14 @@ class Triangulator:
         self,
         state: State,
         tracks: Tracks,
-        registered_units: Bools,
+        usable: Bools,
         *,
         which: Ints,
         points_m: Floats,
         solved: Bools,
         kept: Bools,
     ) -> None:
-        """Triangulate the tracks `which` from their observations in registered units.
+        """Triangulate the tracks `which` from their observations in usable shots (s,), those that have a pose.
 
         Writes the points into points_m (tracks, 3), whether there is one into solved (tracks,), and which keypoints are
         its observations into kept (keypoints,).
@@ -337,7 +337,7 @@ class Triangulator:
         r, t = self._cam_from_world(state, _members(tracks, which))
         _triangulate(
             which, tracks.first, tracks.keypoints, self._keypoints.shot, self._keypoints.camera, self._keypoints.xy_px,
-            self._keypoints.rays, registered_units[self._shot_unit], r, t, self._kind, state.camera_params,
+            self._keypoints.rays, usable, r, t, self._kind, state.camera_params,
             self.max_error_px**2, self._min_angle, points_m, solved, kept,
         )  # fmt: skip
 

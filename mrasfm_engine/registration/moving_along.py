@@ -1,0 +1,162 @@
+"""Things that move along with the vehicle: a lorry in the next lane, the own bonnet, a car that is followed.
+
+They hardly move in the image, so they match best of all, and nothing in a pair of images contradicts them: what stands
+still in an image looks like something very far away, and in a curve like something at the curve's centre. The poses
+that the other cameras give tell the difference. A ray that points below the horizon meets the ground after some metres;
+what it shows must therefore move by so much between two units, and what moves by less is no part of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.registration.model import Model
+from mrasfm_engine.scene.scene import PairMatches
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+NEAREST_M = 1.0  # nearer things than this are not expected
+FARTHEST_M = 1000.0
+MAX_CAMERA_HEIGHT_M = 4.0  # of any camera above the ground
+MAX_GRADE = 0.1  # by which the ground may fall away from the vehicle
+DEPTHS = 24  # tried between nearest and farthest, evenly in inverse depth
+MIN_FLOW_PX = 6.0  # what the world must move by before standing still means something
+STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
+STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the world
+MIN_KEYPOINTS = 30  # that move along, before an image is called covered
+COVERED_SHARE = 0.5  # of the keypoints
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingAlong:
+    """Which keypoints move along with the vehicle, and which images they cover."""
+
+    keypoint: Bools  # (keypoints,) no part of the world; set only where images are covered
+    share: Floats  # (images,) of an image's matched keypoints that do not move as the world does
+    covered: Bools  # (images,)
+
+    @property
+    def any(self) -> bool:
+        """Whether an image is covered."""
+        return bool(self.covered.any())
+
+
+def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong:
+    """Keypoints and images that contradict the motion of their units, from matches of one camera at two instants.
+
+    Parameters
+    ----------
+    model
+        With poses; units without one take no part. Where the vehicle hardly moves nothing is said.
+    pairs
+        Verified matches.
+    """
+    keypoints, images = model.keypoints, len(model.drive.images)
+    along = np.zeros(len(keypoints.image), dtype=np.int64)  # matches for and against
+    seen, moves = np.zeros((2, len(keypoints.image)), dtype=np.bool_)
+    for a, b, least_px, moved_px in _flows(model, pairs):
+        tells = least_px > MIN_FLOW_PX
+        vote = np.where(tells, np.where(moved_px < STILL_SHARE * least_px, 1, -1), 0)
+        for rows in (a, b):
+            np.add.at(along, rows, vote)
+            seen[rows] = True
+            moves[rows[moved_px > STILL_PX]] = True
+    # What stands still may be far away where no ground tells: above the horizon of a straight street. It counts with
+    # what moves along only where most of the keypoints that do tell are such.
+    with_it, still = along > 0, seen & (along == 0) & ~moves
+    count, counter, total, quiet = (
+        np.bincount(keypoints.image[which], minlength=images) for which in (with_it, along < 0, seen, still)
+    )
+    share = (count + quiet) / np.maximum(total, 1)
+    covered = (count >= MIN_KEYPOINTS) & (count >= COVERED_SHARE * (count + counter)) & (share >= COVERED_SHARE)
+    no_world = (with_it | (covered[keypoints.image] & still)) if covered.any() else np.zeros_like(with_it)
+    return MovingAlong(keypoint=no_world, share=share, covered=covered)
+
+
+def units_to_doubt(model: Model, covered: Bools) -> Ints:
+    """Units whose covered images (images,) may have outvoted the others: their pose has to be found anew."""
+    units = len(model.registered)
+    images = np.bincount(model.image_unit, minlength=units)
+    doubt = model.registered & (2 * np.bincount(model.image_unit[covered], minlength=units) >= images)
+    # A scene of two units is the least to register others against.
+    return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
+
+
+def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools) -> list[PairMatches]:
+    """The pairs without the matches of some keypoints; `first` (images + 1,) as in `Keypoints`."""
+    result = []
+    for pair in pairs:
+        gone = removed[first[pair.image_a] + pair.matches[:, 0]] | removed[first[pair.image_b] + pair.matches[:, 1]]
+        result.append(replace(pair, inliers=pair.inliers & ~gone) if gone.any() else pair)
+    return result
+
+
+def _flows(model: Model, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
+    """Of every pair of one camera's images: keypoints of both, and by how much each must and does move, pixels."""
+    keypoints = model.keypoints
+    rig_from_cam = model.state.rig_from_cam
+    posed = model.registered[model.image_unit] & ~model.missing
+    world_from_image = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
+    for pair in pairs:
+        unit_a, unit_b = int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])
+        camera = int(model.image_camera[pair.image_a])
+        if unit_a == unit_b or camera != model.image_camera[pair.image_b]:
+            continue
+        if not (posed[pair.image_a] and posed[pair.image_b]):
+            continue
+        a, b = model.matched_keypoints(pair, unit_a)
+        world_from_a = world_from_image[pair.image_a] @ rig_from_cam[camera]
+        world_from_b = world_from_image[pair.image_b] @ rig_from_cam[camera]
+        least_px = _least_flow_px(
+            keypoints.rays[a],
+            keypoints.xy_px[a],
+            se3.inverse(world_from_b) @ world_from_a,
+            up=rig_from_cam[camera, 2, :3],
+            kind=int(model.camera_kind[camera]),
+            params=model.state.camera_params[camera],
+        )
+        yield a, b, least_px, np.linalg.norm(keypoints.xy_px[b] - keypoints.xy_px[a], axis=1)
+
+
+def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats, kind: int, params: Floats) -> Floats:
+    """By how much points (n,) of a standing world move at least from image a to image b, at whatever depth they are.
+
+    `up` (3,) is the rig's up direction in camera axes: it bounds the depth of rays that point down. Infinite where a
+    point of the world could not be in front of camera b.
+    """
+    falling = -(rays @ up) - MAX_GRADE
+    deepest = np.where(
+        falling * FARTHEST_M > MAX_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_M / np.maximum(falling, 1e-9), FARTHEST_M
+    )
+    deepest = np.maximum(deepest, NEAREST_M)
+    steps = np.linspace(0.0, 1.0, DEPTHS)
+    inverse = (1 - steps) / deepest[:, None] + steps / NEAREST_M
+    points = rays[:, None, :] / inverse[..., None]
+    pixels = project_points(kind, params, se3.apply(b_from_a, points.reshape(-1, 3))).reshape(len(rays), DEPTHS, 2)
+    from_a = pixels - xy_px[:, None, :]
+    return _distance_to_path(from_a)
+
+
+def _distance_to_path(path: Floats) -> Floats:
+    """Distances (n,) of the origin from polylines (n, k, 2); knots that are NaN are left out."""
+    start, step = path[:, :-1], np.diff(path, axis=1)
+    length2 = np.maximum((step**2).sum(-1), 1e-12)
+    at = np.clip(-(start * step).sum(-1) / length2, 0.0, 1.0)
+    distance = np.linalg.norm(start + at[..., None] * step, axis=-1)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    result: Floats = np.minimum(distance.min(1), _knots(path))
+    return result
+
+
+def _knots(path: Floats) -> Floats:
+    distance = np.linalg.norm(path, axis=-1)
+    result: Floats = np.where(np.isfinite(distance), distance, np.inf).min(1)
+    return result
