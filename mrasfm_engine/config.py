@@ -52,6 +52,7 @@ class MatchConfig(_Section):
 class MappingConfig(_Section):
     """The incremental loop."""
 
+    motion_compensation: bool = True  # images (and rows, where a readout time is declared) are posed at their own times
     max_error_px: Positive = 4.0  # reprojection error of an observation while poses still settle
     filter_error_px: Positive = 3.0  # and in the final scene
     min_angle_deg: Positive = 1.0  # of a point's rays; below it depth is mostly noise

@@ -34,13 +34,15 @@ from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.views.birds_eye import birds_eye
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
 STATE_ARRAYS = (
-    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m"
+    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
+    "shot_rotation", "shot_position_m",
 )  # fmt: skip
 
 
@@ -224,7 +226,8 @@ def _unpack_pairs(arrays: Arrays) -> list[PairMatches]:
 
 def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory) -> Model:
     """Units registered one by one, points triangulated, everything adjusted."""
-    keypoints = Keypoints.of(run.drive, found)
+    shots = Shots.of(run.drive, compensate=run.config.mapping.motion_compensation)
+    keypoints = Keypoints.of(run.drive, found, shots)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
         model, log = incremental.map_units(

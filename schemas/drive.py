@@ -39,6 +39,7 @@ MAX_FRAMES = 100_000
 MAX_GNSS_SAMPLES = 1_000_000  # 100 Hz for 2.7 hours
 MAX_IMAGE_SIDE_PX = 20_000
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
+MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -122,6 +123,11 @@ class Camera(_Model):
     sigma_rotation_deg: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
     sigma_translation_m: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
     sigma_focal_px: Positive | None = Field(None, description="how well the focal length is known")
+    readout_us: Annotated[int, Field(ge=0, le=MAX_READOUT_US, strict=True)] | None = Field(
+        None,
+        description="rolling shutter: time from the first row to the last, microseconds; an image's timestamp is then "
+        "that of its middle row. Absent or 0: all rows at once",
+    )
 
     @field_validator("model")
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.synthetic.rigs import mounts
 from mrasfm_engine.synthetic.simulate import SimulatedObservations, simulate_observations
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
+
+FIRST_US = 1_750_000_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +46,7 @@ def make_drive(
     size_px: tuple[int, int] = (960, 540),
     names: Iterable[str] | None = None,
     present: Callable[[int, int], bool] = lambda unit, camera: True,
+    time_offset_us: Sequence[int] | None = None,
     **camera_fields: Any,
 ) -> Drive:
     """A manifest of PINHOLE cameras without files."""
@@ -61,9 +65,16 @@ def make_drive(
     ]
     frames = [
         Frame(
-            timestamp_us=1_750_000_000_000_000 + 100_000 * u,
+            timestamp_us=FIRST_US + 100_000 * u,
             source_frame=u,
-            images={n: FrameImage(file=f"images/{n}/{u:06d}.png") for c, n in enumerate(names) if present(u, c)},
+            images={
+                n: FrameImage(
+                    file=f"images/{n}/{u:06d}.png",
+                    timestamp_us=None if time_offset_us is None else FIRST_US + 100_000 * u + time_offset_us[c],
+                )
+                for c, n in enumerate(names)
+                if present(u, c)
+            },
         )
         for u in range(units)
     ]
@@ -81,6 +92,8 @@ def make_simulated_drive(
     spacing_m: float = 1.1,
     given: Callable[[np.ndarray], np.ndarray] = lambda rig_from_cam: rig_from_cam,
     hidden: Callable[[int, int], bool] = lambda unit, camera: False,
+    time_offset_ms: Sequence[int] | None = None,
+    readout_ms: int = 0,
     seed: int = 0,
 ) -> SimulatedDrive:
     """Images of (unit, camera) for which `hidden` says True have no keypoints; `given` is what the manifest says."""
@@ -92,6 +105,8 @@ def make_simulated_drive(
         noise_px=noise_px,
         straight=straight,
         spacing_m=spacing_m,
+        time_offset_s=0.0 if time_offset_ms is None else np.array(time_offset_ms) / 1e3,
+        readout_s=readout_ms / 1e3,
         rng=rng,
     )
     drive = make_drive(
@@ -100,6 +115,8 @@ def make_simulated_drive(
         units=units,
         size_px=truth.image_size_px,
         names=[m.name for m in mounts(cameras)],
+        time_offset_us=None if time_offset_ms is None else [1000 * ms for ms in time_offset_ms],
+        readout_us=1000 * readout_ms or None,
     )
     descriptors = random_descriptors(len(truth.points_m), rng)
     features, point_of_keypoint = [], []
@@ -158,15 +175,23 @@ def make_model(
     simulated: SimulatedDrive, pairs: list[PairMatches] | None = None, config: EngineConfig | None = None
 ) -> Model:
     """A model of the drive without any pose, one thread."""
-    keypoints = Keypoints.of(simulated.drive, simulated.features)
+    config = config or EngineConfig(threads=1)
+    keypoints = keypoints_of(simulated, config)
     tracks = build_tracks(keypoints, true_matches(simulated) if pairs is None else pairs)
-    return Model(simulated.drive, keypoints, tracks, config or EngineConfig(threads=1))
+    return Model(simulated.drive, keypoints, tracks, config)
+
+
+def keypoints_of(simulated: SimulatedDrive, config: EngineConfig) -> Keypoints:
+    """The drive's keypoints at the times that the settings give them."""
+    shots = Shots.of(simulated.drive, compensate=config.mapping.motion_compensation)
+    return Keypoints.of(simulated.drive, simulated.features, shots)
 
 
 def with_true_poses(model: Model, simulated: SimulatedDrive, units: Iterable[int]) -> Model:
     """The model with some units at their true poses, and the points these see."""
     for u in units:
         model.set_pose(u, simulated.world_from_rig[u])
+    model.renew_motion()
     model.triangulate()
     return model
 

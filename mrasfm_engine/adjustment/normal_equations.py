@@ -1,14 +1,20 @@
 """The compiled inner loops of camera set bundle adjustment: residuals, Jacobians, Schur complement over points.
 
-One observation of point X by camera c of unit u, with (R_u, t_u) = world_from_rig, (R_c, t_c) = rig_from_cam:
+One observation of point X by camera c of unit u, with (R_u, t_u) = world_from_rig, (A, b) = unit_from_shot,
+(R_c, t_c) = rig_from_cam:
 
-    x_rig = R_u' (X - t_u)          x_cam = R_c' (x_rig - t_c)          residual = (pixel(x_cam) - observed) / sigma
+    x_rig = R_u' (X - t_u)      x_shot = A' (x_rig - b)      x_cam = R_c' (x_shot - t_c)
+    residual = (pixel(x_cam) - observed) / sigma
 
-With P = d pixel / d x_cam (2x3), M = P R_c' and N = M R_u' the derivatives in the steps of `problem` are, row by row,
+With P = d pixel / d x_cam (2x3), M = P R_c', Q = M A' and N = Q R_u' the derivatives in the steps of `problem` are,
+row by row,
 
     d/dX     =  N                       d/dtau_u = -N            d/domega_u = N x (X - t_u)
-    d/dtau_c = -M                       d/domega_c = M x (x_rig - t_c)
+    d/dtau_c = -M                       d/domega_c = M x (x_shot - t_c)
     d/dphi   =  pixel - principal point
+
+(A, b) is held. Where all images are taken at their unit's time, shot_r, shot_t and obs_shot are None: numba compiles
+the kernels without them, so that nobody pays for what is not there.
 
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
 reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
@@ -36,26 +42,39 @@ MIN_DEPTH_M = 1e-3
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def _camera_point(unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, x: Any, from_unit: Any, rig: Any, cam: Any) -> None:
-    """from_unit = X - t_u, rig = x_rig - t_c, cam = x_cam."""
+def _camera_point(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, cam_r: Any, cam_t: Any, x: Any,
+    from_unit: Any, rig: Any, cam: Any,
+) -> None:  # fmt: skip
+    """from_unit = X - t_u, rig = x_shot - t_c, cam = x_cam."""
     for i in range(3):
         from_unit[i] = x[i] - unit_t[i]
-    for i in range(3):
-        rig[i] = unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
+    if shot_r is None:
+        for i in range(3):
+            rig[i] = unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
+    else:
+        for i in range(3):
+            cam[i] = (
+                unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2]
+                - shot_t[shot, i]
+            )  # fmt: skip
+        for i in range(3):
+            rig[i] = shot_r[shot, 0, i] * cam[0] + shot_r[shot, 1, i] * cam[1] + shot_r[shot, 2, i] * cam[2] - cam_t[i]
     for i in range(3):
         cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def squared_errors(
-    unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared behind the camera."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for n in range(lo, hi):
         u, c = obs_unit[n], obs_camera[n]
-        _camera_point(unit_r[u], unit_t[u], cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam)
+        shot = 0 if obs_shot is None else obs_shot[n]
+        _camera_point(unit_r[u], unit_t[u], shot_r, shot_t, shot, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam)
         if cam[2] < MIN_DEPTH_M:
             out[n] = BEHIND_PX * BEHIND_PX
             continue
@@ -65,11 +84,12 @@ def squared_errors(
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _linearise(
-    unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, cam_r: Any, cam_t: Any,
+    kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, ju: Any, jc: Any, jx: Any,
 ) -> bool:  # fmt: skip
     """Weighted residual and Jacobians of one observation; False behind the camera."""
-    _camera_point(unit_r, unit_t, cam_r, cam_t, x, d, rig, cam)
+    _camera_point(unit_r, unit_t, shot_r, shot_t, shot, cam_r, cam_t, x, d, rig, cam)
     if cam[2] < MIN_DEPTH_M:
         return False
     project(kind, k, cam[0], cam[1], cam[2], work, proj)
@@ -82,9 +102,15 @@ def _linearise(
         m0 = p0 * cam_r[0, 0] + p1 * cam_r[0, 1] + p2 * cam_r[0, 2]
         m1 = p0 * cam_r[1, 0] + p1 * cam_r[1, 1] + p2 * cam_r[1, 2]
         m2 = p0 * cam_r[2, 0] + p1 * cam_r[2, 1] + p2 * cam_r[2, 2]
-        n0 = m0 * unit_r[0, 0] + m1 * unit_r[0, 1] + m2 * unit_r[0, 2]
-        n1 = m0 * unit_r[1, 0] + m1 * unit_r[1, 1] + m2 * unit_r[1, 2]
-        n2 = m0 * unit_r[2, 0] + m1 * unit_r[2, 1] + m2 * unit_r[2, 2]
+        if shot_r is None:
+            q0, q1, q2 = m0, m1, m2
+        else:
+            q0 = m0 * shot_r[shot, 0, 0] + m1 * shot_r[shot, 0, 1] + m2 * shot_r[shot, 0, 2]
+            q1 = m0 * shot_r[shot, 1, 0] + m1 * shot_r[shot, 1, 1] + m2 * shot_r[shot, 1, 2]
+            q2 = m0 * shot_r[shot, 2, 0] + m1 * shot_r[shot, 2, 1] + m2 * shot_r[shot, 2, 2]
+        n0 = q0 * unit_r[0, 0] + q1 * unit_r[0, 1] + q2 * unit_r[0, 2]
+        n1 = q0 * unit_r[1, 0] + q1 * unit_r[1, 1] + q2 * unit_r[1, 2]
+        n2 = q0 * unit_r[2, 0] + q1 * unit_r[2, 1] + q2 * unit_r[2, 2]
         jx[i, 0], jx[i, 1], jx[i, 2] = n0, n1, n2
         ju[i, 0], ju[i, 1], ju[i, 2] = n1 * d[2] - n2 * d[1], n2 * d[0] - n0 * d[2], n0 * d[1] - n1 * d[0]
         ju[i, 3], ju[i, 4], ju[i, 5] = -n0, -n1, -n2
@@ -121,9 +147,9 @@ def _invert3(v: Any, out: Any) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
-    unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any, num_units: int,
-    sigma: float, loss2: float, damping: float, lo: int, hi: int, s: Any, diagonal: Any, g: Any,
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any,
+    num_units: int, sigma: float, loss2: float, damping: float, lo: int, hi: int, s: Any, diagonal: Any, g: Any,
     v_inverse: Any, v_gradient: Any,
 ) -> None:  # fmt: skip
     """Add the reduced normal equations of points lo..hi to s (n, n), the undamped diagonal of the unreduced ones to
@@ -139,8 +165,10 @@ def accumulate(
         e[:] = 0.0
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
+            shot = 0 if obs_shot is None else obs_shot[n]
             if not _linearise(
-                unit_r[u], unit_t[u], cam_r[c], cam_t[c], kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
+                unit_r[u], unit_t[u], shot_r, shot_t, shot, cam_r[c], cam_t[c],
+                kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, ju, jc, jx,
             ):  # fmt: skip
                 continue
@@ -222,9 +250,9 @@ def accumulate(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
-    unit_r: Any, unit_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any, num_units: int,
-    sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any,
+    num_units: int, sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
@@ -237,8 +265,10 @@ def substitute(
             su, sc = unit_slot[u], camera_slot[c]
             if su < 0 and sc < 0:
                 continue
+            shot = 0 if obs_shot is None else obs_shot[n]
             if not _linearise(
-                unit_r[u], unit_t[u], cam_r[c], cam_t[c], kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
+                unit_r[u], unit_t[u], shot_r, shot_t, shot, cam_r[c], cam_t[c],
+                kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, ju, jc, jx,
             ):  # fmt: skip
                 continue

@@ -40,6 +40,7 @@ class Observations:
     xy_px: Floats  # (n, 2)
     first_of_point: Ints = field(init=False)  # (p + 1,) observations of point i: first[i]:first[i + 1]
     num_points: int
+    shot: Ints | None = None  # (n,) indices into the state's shots; without, all are at their unit's timestamp
 
     def __post_init__(self) -> None:
         first = np.searchsorted(self.point, np.arange(self.num_points + 1))

@@ -75,7 +75,7 @@ class Problem:
             self.options.threads,
             len(out),
             lambda lo, hi, _: squared_errors(
-                *_arrays(state, self.camera_kind), o.unit, o.camera, o.point, o.xy_px, lo, hi, out
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.point, o.xy_px, lo, hi, out
             ),
         )
         return out
@@ -98,7 +98,7 @@ class Problem:
             parts,
             p,
             lambda lo, hi, t: accumulate(
-                *_arrays(state, self.camera_kind), o.unit, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
                 layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
                 damping, lo, hi, s[t], diagonal[t], g[t], v_inverse, v_gradient,
             ),
@@ -123,7 +123,7 @@ class Problem:
             options.threads,
             o.num_points,
             lambda lo, hi, _: substitute(
-                *_arrays(state, self.camera_kind), o.unit, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
                 layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
                 step, reduced.v_inverse, reduced.v_gradient, lo, hi, out,
             ),
@@ -142,10 +142,12 @@ class Reduced:
     v_gradient: Floats  # (p, 3)
 
 
-def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic], ...]:
+def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic] | None, ...]:
     return (
         state.unit_rotation,
         state.unit_position_m,
+        None if state.simultaneous else state.shot_rotation,
+        None if state.simultaneous else state.shot_position_m,
         state.camera_rotation,
         state.camera_position_m,
         kind,

@@ -57,6 +57,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     choose("--speed-profile", [profile.value for profile in SpeedProfile], "how the speed varies")
     add("--standing", int, "units in the middle during which the vehicle stands", to="standing_units", metavar="UNITS")
     add("--time-skew-ms", float, "images of a unit are taken up to that long apart")
+    add("--readout-ms", float, "rolling shutter: time from the first row to the last; slow to render")
     add("--drop-images", float, "fraction of images that are missing", metavar="FRACTION")
     parser.add_argument(
         "--occlude",

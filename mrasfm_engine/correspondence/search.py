@@ -22,6 +22,8 @@ from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+SIMULTANEOUS_US = 2_000  # cameras less apart than this are one rig: a fast car goes 6 cm
+
 
 @dataclass(frozen=True, kw_only=True)
 class SearchResult:
@@ -66,7 +68,9 @@ def match_pairs(
         ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
         ca, cb = drive.images[a].camera, drive.images[b].camera
         inliers = essential_inliers(ra, rb, max_error=config.max_error_px / min(focal[ca], focal[cb]))
-        if drive.images[a].unit == drive.images[b].unit:
+        apart_us = abs(drive.images[a].timestamp_us - drive.images[b].timestamp_us)
+        # The vehicle's motion between two instants is part of the geometry, and not known yet.
+        if drive.images[a].unit == drive.images[b].unit and apart_us <= SIMULTANEOUS_US:
             b_from_a = se3.inverse(drive.rig_from_cam[cb]) @ drive.rig_from_cam[ca]
             gate = config.calibration_error_px / min(focal[ca], focal[cb])
             inliers &= (epipolar_errors(b_from_a, ra, rb) < gate) & in_front_of_both(b_from_a, ra, rb)

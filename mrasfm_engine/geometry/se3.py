@@ -105,6 +105,37 @@ def apply(a_from_b: ArrayLike, points_b: ArrayLike) -> Floats:
     return result
 
 
+def exp_se3(twist: ArrayLike) -> Floats:
+    """Transforms (..., 4, 4) of twists (..., 6): rotation vector (rad), then velocity, both in the moving frame.
+
+    A frame that turns and moves at a constant rate for unit time ends there. Source: Barfoot, "State Estimation for
+    Robotics" (2017), section 7.1.
+    """
+    xi = np.asarray(twist, dtype=np.float64)
+    w = xi[..., :3]
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = skew(w)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    c = np.where(small, 1.0 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    left_jacobian = np.eye(3) + b * k + c * (k @ k)
+    return transform(exp_so3(w), (left_jacobian @ xi[..., 3:, None])[..., 0])
+
+
+def log_se3(a_from_b: ArrayLike) -> Floats:
+    """Twists (..., 6) of transforms (..., 4, 4), the inverse of `exp_se3`; angles below pi."""
+    m = np.asarray(a_from_b, dtype=np.float64)
+    w = log_so3(m[..., :3, :3])
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = skew(w)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    c = np.where(small, 1.0 / 12, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    inverse_jacobian = np.eye(3) - 0.5 * k + c * (k @ k)
+    return np.concatenate([w, (inverse_jacobian @ m[..., :3, 3:])[..., 0]], axis=-1)
+
+
 def rotation_angle_deg(rotation: ArrayLike) -> Floats:
     """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
     result: Floats = np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))

@@ -18,6 +18,7 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.io.export_colmap import frame_of_image
 from mrasfm_engine.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -116,7 +117,7 @@ def check_features(scene: Scene, path: Path) -> None:
         expected = [(i + 1, image.file, image.camera + 1) for i, image in enumerate(images)]
         require(found == expected, path, "images are not the drive's")
         frames = db.execute("SELECT frame_id, sensor_id, data_id FROM frame_data ORDER BY data_id").fetchall()
-        expected_frames = [(image.unit + 1, image.camera + 1, i + 1) for i, image in enumerate(images)]
+        expected_frames = [(frame_of_image(scene, i), image.camera + 1, i + 1) for i, image in enumerate(images)]
         require(frames == expected_frames, path, "frames are not the drive's")
         cameras = [np.frombuffer(row[0]) for row in db.execute("SELECT params FROM cameras ORDER BY camera_id")]
         same = [np.array_equal(a, b.params) for a, b in zip(cameras, scene.calibration, strict=True)]
@@ -213,7 +214,11 @@ def _check_poses(
     row = dict(zip(np.flatnonzero(scene.unit_registered).tolist(), range(len(registered)), strict=True))
     seen = [image for image in images if image["registered"]]
     world_from_cam = _poses(seen, "world_from_cam")
-    composed = [world_from_rig[row[image["unit"]]] @ rig_from_cam[image["camera"]] for image in seen]
+    moved = np.tile(np.eye(4), (len(images), 1, 1)) if scene.unit_from_image is None else scene.unit_from_image
+    composed = [
+        world_from_rig[row[image["unit"]]] @ unit_from_image @ rig_from_cam[image["camera"]]
+        for image, unit_from_image in zip(seen, moved[scene.image_registered], strict=True)
+    ]
     require_close(
         world_from_cam,
         np.reshape(composed, (-1, 4, 4)),

@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mrasfm_engine.io.export_check import POSE_TOLERANCE, checking, matrices, refuse, require, require_close
-from mrasfm_engine.io.export_colmap import BINARY_FILES, TEXT_FILES
+from mrasfm_engine.io.export_colmap import BINARY_FILES, TEXT_FILES, frame_of_image
 from mrasfm_engine.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -62,6 +62,9 @@ def _require_files(folder: Path, names: tuple[str, ...]) -> None:
 def _expected_cam_from_world(scene: Scene, image: int) -> Floats:
     source = scene.drive.images[image]
     world_from_cam = scene.world_from_rig[source.unit] @ scene.calibration[source.camera].rig_from_cam
+    if scene.unit_from_image is not None:
+        unit_from_cam = scene.unit_from_image[image] @ scene.calibration[source.camera].rig_from_cam
+        world_from_cam = scene.world_from_rig[source.unit] @ unit_from_cam
     return np.asarray(np.linalg.inv(world_from_cam), dtype=np.float64)
 
 
@@ -79,7 +82,9 @@ def _check_reconstruction(
     for i in registered.tolist():
         image, source = reconstruction.images[i + 1], scene.drive.images[i]
         known = (image.name, image.camera_id, image.frame_id)
-        require(known == (source.file, source.camera + 1, source.unit + 1), images, f"image {i + 1} is {known}")
+        require(
+            known == (source.file, source.camera + 1, frame_of_image(scene, i)), images, f"image {i + 1} is {known}"
+        )
         require(image.num_points2D() == len(scene.features[i].xy_px), images, f"keypoints of {image.name} are missing")
         require(image.num_points3D == counts[i], images, f"observations of {image.name} are missing")
         composed[i + 1] = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
@@ -122,7 +127,9 @@ def _check_image_poses(
 
 
 def _check_baselines(scene: Scene, composed: dict[int, Floats], *, path: Path) -> None:
-    """Distances between the cameras of a unit must be the same in every unit."""
+    """Distances between the cameras of a unit must be the same in every unit, if they are simultaneous."""
+    if scene.unit_from_image is not None:
+        return
     centres = np.full((len(scene.unit_registered), len(scene.calibration), 3), np.nan)
     for image_id, pose in composed.items():
         source = scene.drive.images[image_id - 1]

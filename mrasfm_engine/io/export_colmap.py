@@ -4,6 +4,9 @@ The binary files are packed here: point by point through pycolmap's Python objec
 image = index + 1, frame = unit + 1, camera = index + 1, point = index + 1; keypoints keep their indices. The rig frame
 is the vehicle's, so the rig's reference sensor is a virtual inertial unit and every camera has a `sensor_from_rig`.
 
+A frame is one instant. Where images have poses at their own times, every image is a frame of its own (frame = image),
+at the rig's pose at that time: whoever loads the model then finds the poses under which the points were seen.
+
 Source of the layout: COLMAP 4.2, src/colmap/scene/reconstruction_io_binary.cc.
 """
 
@@ -17,7 +20,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.io.export_poses import rig_from_world, world_from_cam
 from mrasfm_engine.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -48,13 +50,17 @@ def text_model_fits(scene: Scene) -> bool:
     return not any(any(c.isspace() for c in image.file) for image in scene.drive.images)
 
 
-def images_of_units(scene: Scene) -> dict[int, list[int]]:
-    """Registered images by unit, for units that have any; both rising."""
-    units: dict[int, list[int]] = {}
-    for i, image in enumerate(scene.drive.images):
-        if scene.image_registered[i]:
-            units.setdefault(image.unit, []).append(i)
-    return dict(sorted(units.items()))
+def frame_of_image(scene: Scene, image: int) -> int:
+    """The id of the frame that an image belongs to."""
+    return 1 + (scene.drive.images[image].unit if scene.unit_from_image is None else image)
+
+
+def images_of_frames(scene: Scene) -> dict[int, list[int]]:
+    """Registered images by frame id, for frames that have any; both rising."""
+    frames: dict[int, list[int]] = {}
+    for i in np.flatnonzero(scene.image_registered).tolist():
+        frames.setdefault(frame_of_image(scene, i), []).append(i)
+    return dict(sorted(frames.items()))
 
 
 def _wxyz_and_translation(transforms: Floats) -> Floats:
@@ -80,17 +86,20 @@ def _rigs(scene: Scene) -> bytes:
 
 
 def _frames(scene: Scene) -> bytes:
-    units = images_of_units(scene)
-    poses = _wxyz_and_translation(rig_from_world(scene))
-    parts = [struct.pack("<Q", len(units))]
-    for unit, images in units.items():
-        parts.append(struct.pack("<II7dI", unit + 1, RIG_ID, *poses[unit], len(images)))
+    frames = images_of_frames(scene)
+    parts = [struct.pack("<Q", len(frames))]
+    for frame, images in frames.items():
+        world_from_rig = scene.world_from_rig[scene.drive.images[images[0]].unit]
+        if scene.unit_from_image is not None:
+            world_from_rig = world_from_rig @ scene.unit_from_image[images[0]]
+        pose = _wxyz_and_translation(se3.inverse(world_from_rig))
+        parts.append(struct.pack("<II7dI", frame, RIG_ID, *pose, len(images)))
         parts += [struct.pack("<iIQ", SENSOR_CAMERA, scene.drive.images[i].camera + 1, i + 1) for i in images]
     return b"".join(parts)
 
 
 def _images(scene: Scene) -> bytes:
-    poses = _wxyz_and_translation(se3.inverse(world_from_cam(scene)))
+    poses = _wxyz_and_translation(se3.inverse(scene.world_from_cam))
     observations = _observations_by_image(scene)
     registered = np.flatnonzero(scene.image_registered)
     parts = [struct.pack("<Q", len(registered))]

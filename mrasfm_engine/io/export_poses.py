@@ -7,23 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.geometry import geodesy, se3
+from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.scene.scene import Scene
 
 Floats = NDArray[np.float64]
 
-
-def world_from_cam(scene: Scene) -> Floats:
-    """Poses (images, 4, 4) of all images at their unit's time; NaN for images that are not registered."""
-    images = scene.drive.images
-    units = np.array([image.unit for image in images], dtype=np.int64)
-    cameras = np.array([image.camera for image in images], dtype=np.int64)
-    rig_from_cam = np.stack([camera.rig_from_cam for camera in scene.calibration])
-    poses: Floats = scene.world_from_rig[units] @ rig_from_cam[cameras]
-    poses[~scene.image_registered] = np.nan
-    return poses
+POSE_TIME = {
+    False: "an image's pose is at its unit's timestamp_us",
+    True: "a unit's pose is at its timestamp_us, an image's at its own: with a rolling shutter, of its middle row",
+}
 
 
 def poses_text(scene: Scene) -> str:
@@ -38,7 +32,7 @@ def poses_document(scene: Scene) -> dict[str, Any]:
     A value that does not exist (the pose of what is not registered, the geodetic position of a scene that is not
     georeferenced, an unknown sigma) is absent, never zero or null.
     """
-    cameras = world_from_cam(scene)
+    cameras = scene.world_from_cam
     unit_places, camera_places = _geodetic(scene, scene.world_from_rig), _geodetic(scene, cameras)
     units = []
     for u, frame in enumerate(scene.drive.manifest.frames):
@@ -70,7 +64,7 @@ def poses_document(scene: Scene) -> dict[str, Any]:
     return {
         "version": 1,
         "world": "the local frame of frame.json",
-        "pose_time": "an image's pose is at its unit's timestamp_us",
+        "pose_time": POSE_TIME[scene.unit_from_image is not None],
         "units": units,
         "images": images,
     }
@@ -92,8 +86,3 @@ def _place(places: Floats | None, index: int) -> dict[str, Any]:
         return {}
     latitude, longitude, height = places[index].tolist()
     return {"geodetic": {"latitude_deg": latitude, "longitude_deg": longitude, "ellipsoidal_height_m": height}}
-
-
-def rig_from_world(scene: Scene) -> Floats:
-    """Poses (units, 4, 4) as COLMAP's frames have them; NaN for units that are not registered."""
-    return se3.inverse(scene.world_from_rig)

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.io.export_colmap import REFERENCE_SENSOR_ID, RIG_ID
+from mrasfm_engine.io.export_colmap import REFERENCE_SENSOR_ID, RIG_ID, frame_of_image
 from mrasfm_engine.scene.scene import Scene
 
 
@@ -68,10 +68,11 @@ def _write_images(scene: Scene, database: pycolmap.Database) -> None:
             type=pycolmap.FeatureExtractorType.SIFT, data=np.ascontiguousarray(features.descriptors)
         )
         database.write_descriptors(i + 1, descriptors)
-        frame = frames.setdefault(image.unit, pycolmap.Frame(frame_id=image.unit + 1, rig_id=RIG_ID))
+        frame_id = frame_of_image(scene, i)
+        frame = frames.setdefault(frame_id, pycolmap.Frame(frame_id=frame_id, rig_id=RIG_ID))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, image.camera + 1)
         frame.add_data_id(pycolmap.data_t(sensor, i + 1))
-    for frame in frames.values():
+    for _, frame in sorted(frames.items()):
         database.write_frame(frame, use_frame_id=True)
 
 

@@ -108,4 +108,5 @@ def scale_with_baselines(model: Model, factor: float) -> None:
     moved = (factor - 1.0) * mean
     state.unit_position_m[:] = centre + factor * (state.unit_position_m - centre) + state.unit_rotation @ moved
     state.points_m[:] = centre + factor * (state.points_m - centre)
+    model.motion.scale(state, factor, mean)
     state.camera_position_m[:] = mean + factor * (state.camera_position_m - mean)

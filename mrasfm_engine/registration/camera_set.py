@@ -50,10 +50,35 @@ class Seen:
     xy_px: Floats  # (n, 2)
     points_m: Floats  # (n, 3)
     camera: Ints  # (n,)
+    shot: Ints  # (n,)
 
     def of(self, rows: Ints) -> Seen:
         """Some of them."""
-        return Seen(xy_px=self.xy_px[rows], points_m=self.points_m[rows], camera=self.camera[rows])
+        return Seen(
+            xy_px=self.xy_px[rows], points_m=self.points_m[rows], camera=self.camera[rows], shot=self.shot[rows]
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eyes:
+    """What looks out of a rig: its cameras, or, where these are not simultaneous, its cameras at their shots."""
+
+    index: Ints  # (n,) which of them each image point is seen by
+    rig_from_eye: Floats  # (e, 4, 4)
+    camera: Ints  # (e,)
+
+    @staticmethod
+    def of(model: Model, camera: Ints, shot: Ints) -> Eyes:
+        """The eyes of image points of given cameras (n,) and shots (n,)."""
+        if model.state.simultaneous:
+            return Eyes(index=camera, rig_from_eye=model.state.rig_from_cam, camera=np.arange(len(model.camera_kind)))
+        shots, index = np.unique(shot, return_inverse=True)
+        camera_of_shot = model.motion.shots.camera[shots]
+        return Eyes(
+            index=index.astype(np.int64),
+            rig_from_eye=model.state.unit_from_shot[shots] @ model.state.rig_from_cam[camera_of_shot],
+            camera=camera_of_shot,
+        )
 
 
 def register_unit(model: Model, unit: int) -> Registration:
@@ -114,6 +139,7 @@ def _points_seen(model: Model, unit: int) -> Seen:
         xy_px=model.keypoints.xy_px[rows],
         points_m=model.state.points_m[tracks],
         camera=model.keypoints.camera[rows],
+        shot=model.keypoints.shot[rows],
     )
 
 
@@ -150,12 +176,13 @@ def _ransac(model: Model) -> pycolmap.RANSACOptions:
 
 def _joint_pose(model: Model, seen: Seen) -> Floats | None:
     """world_from_rig by one generalised PnP over all cameras."""
+    eyes, cameras = Eyes.of(model, seen.camera, seen.shot), cameras_of(model)
     result = pycolmap.estimate_and_refine_generalized_absolute_pose(
         seen.xy_px,
         seen.points_m,
-        [int(c) for c in seen.camera],
-        [rigid3d(m) for m in se3.inverse(model.state.rig_from_cam)],
-        cameras_of(model),
+        [int(i) for i in eyes.index],
+        [rigid3d(m) for m in se3.inverse(eyes.rig_from_eye)],
+        [cameras[c] for c in eyes.camera],
         estimation_options=_ransac(model),
     )
     return None if result is None else se3.inverse(matrix_of(result["rig_from_world"]))
@@ -163,11 +190,15 @@ def _joint_pose(model: Model, seen: Seen) -> Floats | None:
 
 def _errors_px(model: Model, world_from_rig: Floats, seen: Seen) -> Floats:
     """Reprojection errors (n,) under a pose of the unit; infinite behind a camera."""
-    cam_from_world = se3.inverse(world_from_rig @ model.state.rig_from_cam)
+    eyes = Eyes.of(model, seen.camera, seen.shot)
+    eye_from_world = se3.inverse(world_from_rig @ eyes.rig_from_eye)
     errors = np.full(len(seen.camera), np.inf)
     for c, camera in enumerate(cameras_of(model)):
         rows = np.flatnonzero(seen.camera == c)
-        points = se3.apply(cam_from_world[c], seen.points_m[rows])
+        if model.state.simultaneous:
+            points = se3.apply(eye_from_world[c], seen.points_m[rows])
+        else:
+            points = se3.apply(eye_from_world[eyes.index[rows]], seen.points_m[rows, None])[:, 0]
         front = points[:, 2] > 1e-3
         pixels = camera.img_from_cam(points[front])
         errors[rows[front]] = np.linalg.norm(pixels - seen.xy_px[rows[front]], axis=1)
@@ -183,9 +214,20 @@ def _disagreeing(model: Model, seen: Seen, inlier: NDArray[np.bool_]) -> tuple[s
     )
 
 
+def _rig_from_cameras(model: Model, seen: Seen) -> Floats:
+    """The cameras (c, 4, 4) in the middle of their images, which one PnP over all rows finds."""
+    result = model.state.rig_from_cam
+    if not model.state.simultaneous:
+        shots = model.motion.shots
+        middle = np.unique(shots.middle_of_image[shots.image[seen.shot]])
+        result[shots.camera[middle]] = model.state.unit_from_shot[middle] @ result[shots.camera[middle]]
+    return result
+
+
 def _vote(model: Model, seen: Seen) -> tuple[Floats | None, tuple[str, ...]]:
     """Average of the cameras' own poses, and the names of those that are far from it."""
     cameras, votes, names = cameras_of(model), [], []
+    rig_from_eye = _rig_from_cameras(model, seen)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac = _ransac(model)
     for c, camera in enumerate(cameras):
@@ -198,7 +240,7 @@ def _vote(model: Model, seen: Seen) -> tuple[Floats | None, tuple[str, ...]]:
         if result is None or result["num_inliers"] < MIN_CAMERA_INLIER_RATIO * rows.sum():
             continue
         world_from_cam = se3.inverse(matrix_of(result["cam_from_world"]))
-        votes.append(world_from_cam @ se3.inverse(model.state.rig_from_cam[c]))
+        votes.append(world_from_cam @ se3.inverse(rig_from_eye[c]))
         names.append(model.drive.cameras[c].name)
     if not votes:
         return None, ()

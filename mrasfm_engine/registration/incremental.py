@@ -114,6 +114,8 @@ def map_units(
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
     model = Model(drive, keypoints, build_tracks(keypoints, near), config)
+    if prior_world_from_rig is not None:
+        model.motion.follow_prior(prior_world_from_rig)
     log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
     revisits, log.revisits_tried = find_revisits(model, far)
     if not revisits:
@@ -125,7 +127,8 @@ def map_units(
     across = [p for p in far if (*sorted((int(image_unit[p.image_a]), int(image_unit[p.image_b]))),) in believed]
     closed = Model(drive, keypoints, build_tracks(keypoints, [*near, *across]), config)
     closed.state = replace(model.state, points_m=closed.state.points_m)
-    closed.registered = model.registered
+    closed.registered, closed.motion = model.registered, model.motion
+    closed.renew_motion()
     closed.triangulate()
     adjust_globally(closed, log, cancel)
     return closed, log
@@ -141,10 +144,12 @@ def _register_next(model: Model, log: MappingLog) -> Registration | None:
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue
+        model.motion.predict(model.state, model.registered, unit)
         registration = register_unit(model, unit)
         if registration.world_from_rig is not None:
             log.failures.pop(unit, None)
             model.set_pose(unit, registration.world_from_rig)
+            model.renew_motion(np.array([unit]))
             return registration
         log.failures[unit] = registration
     return None

@@ -13,7 +13,7 @@ from mrasfm_engine.adjustment.solver import SolverOptions
 from mrasfm_engine.correspondence.verification import parallax_rad
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.registration.camera_set import cameras_of, matrix_of, register_unit, rigid3d
+from mrasfm_engine.registration.camera_set import Eyes, cameras_of, matrix_of, register_unit, rigid3d
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.scene.scene import PairMatches
 
@@ -24,6 +24,7 @@ CANDIDATES = 4  # pairs of units that are tried
 MAX_RELATIVE_MATCHES = 1200
 RELATIVE_ERROR_PX = 4.0
 ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
+MOTION_ROUNDS = 5
 FULL_PARALLAX_RAD = np.radians(0.5)
 MIN_POINTS = 30
 GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
@@ -102,6 +103,7 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
     _, result, pose_u, pose_v = best
     model.set_pose(result.units[0], pose_u)
     model.set_pose(result.units[1], pose_v)
+    model.renew_motion()
     model.triangulate()
     return result
 
@@ -127,7 +129,9 @@ def _proposals(
         yield "prior poses", anchor @ se3.inverse(prior_world_from_rig[u]) @ prior_world_from_rig[v]
     model.clear()
     model.set_pose(u, anchor)
+    model.renew_motion()
     if model.triangulate(model.tracks_of_units(np.array([u]))) >= MIN_POINTS:
+        model.motion.predict(model.state, model.registered, v)
         registration = register_unit(model, v)
         if registration.world_from_rig is not None:
             yield INSIDE, registration.world_from_rig
@@ -146,13 +150,15 @@ def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: in
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
     options.min_num_trials, options.max_num_trials = 100, 2000
+    both, cameras = np.concatenate([a, b]), cameras_of(model)
+    eyes = Eyes.of(model, model.keypoints.camera[both], model.keypoints.shot[both])
     result = pycolmap.estimate_generalized_relative_pose(
         model.keypoints.xy_px[a],
         model.keypoints.xy_px[b],
-        [int(c) for c in model.keypoints.camera[a]],
-        [int(c) for c in model.keypoints.camera[b]],
-        [rigid3d(m) for m in se3.inverse(model.state.rig_from_cam)],
-        cameras_of(model),
+        [int(i) for i in eyes.index[: len(a)]],
+        [int(i) for i in eyes.index[len(a) :]],
+        [rigid3d(m) for m in se3.inverse(eyes.rig_from_eye)],
+        [cameras[c] for c in eyes.camera],
         estimation_options=options,
     )
     if result is None or "rig2_from_rig1" not in result:
@@ -179,8 +185,9 @@ def _single_camera_relative_pose(
         length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
     u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))
     u_from_v[:3, 3] *= length_m / max(float(np.linalg.norm(u_from_v[:3, 3])), 1e-9)
-    rig_from_cam = model.state.rig_from_cam[index]
-    result_pose: Floats = rig_from_cam @ u_from_v @ se3.inverse(rig_from_cam)
+    rig_from_eye = np.stack([model.motion.unit_from_image(model.state)[model.keypoints.image[k[0]]] for k in (a, b)])
+    rig_from_eye = rig_from_eye @ model.state.rig_from_cam[index]
+    result_pose: Floats = rig_from_eye[0] @ u_from_v @ se3.inverse(rig_from_eye[1])
     return result_pose
 
 
@@ -203,12 +210,15 @@ def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int
     model.clear()
     model.set_pose(u, anchor)
     model.set_pose(v, pose)
+    model.renew_motion()
     tracks = model.tracks_of_units(np.array([u, v]))
     free = np.zeros(len(model.registered), dtype=np.bool_)
     free[v] = True
     threshold = model.triangulator.max_error_px
+    # Baselines between cameras that are not simultaneous follow from the pose that is sought: it takes some turns.
+    rough_rounds = 1 if model.state.simultaneous else MOTION_ROUNDS
     try:
-        for error_px in (ROUGH_ERROR_PX, ROUGH_ERROR_PX / 2, threshold):
+        for error_px in (*([ROUGH_ERROR_PX] * rough_rounds), ROUGH_ERROR_PX / 2, threshold):
             model.triangulator.max_error_px = max(error_px, threshold)
             if model.triangulate(tracks) < MIN_POINTS:
                 return 0

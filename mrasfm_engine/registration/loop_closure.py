@@ -84,6 +84,7 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
         xy_px=model.keypoints.xy_px[rows],
         points_m=model.state.points_m[track],
         camera=model.keypoints.camera[rows],
+        shot=model.keypoints.shot[rows],
     )
     registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS, by_vote=False)
     if registration.world_from_rig is None:

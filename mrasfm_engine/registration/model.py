@@ -15,8 +15,10 @@ from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solv
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.registration.rig_motion import RigMotion
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.triangulation.triangulate import Triangulator
@@ -39,6 +41,8 @@ class Model:
         (tracks,) which tracks have a point.
     kept
         (keypoints,) which keypoints are observations of their track's point.
+    motion
+        Where the rig is at the images' own times, and poses that images have apart from it.
     """
 
     def __init__(self, drive: Drive, keypoints: Keypoints, tracks: Tracks, config: EngineConfig) -> None:
@@ -58,10 +62,14 @@ class Model:
         self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
+        shots = Shots.of(drive, compensate=config.mapping.motion_compensation)
+        self.motion = RigMotion(shots, drive.timestamps_us)
+        if self.motion.needed:
+            self._place_shots()
         self.triangulator = Triangulator(
             keypoints,
-            self.image_unit,
-            self.image_camera,
+            shots.unit,
+            shots.camera,
             self.camera_kind,
             max_error_px=config.mapping.max_error_px,
             min_angle_deg=config.mapping.min_angle_deg,
@@ -77,6 +85,26 @@ class Model:
         self.state.unit_rotation[unit] = world_from_rig[:3, :3]
         self.state.unit_position_m[unit] = world_from_rig[:3, 3]
         self.registered[unit] = True
+
+    def set_image_pose(self, image: int, unit_from_image: Floats) -> None:
+        """Give an image a pose (4, 4) apart from the rig's: where the rig would stand for it, relative to its unit.
+
+        The image's camera then is at world_from_rig * unit_from_image * rig_from_cam, also after further adjustments.
+        """
+        self.motion.set_image_pose(image, unit_from_image)
+        if self.state.simultaneous:
+            self._place_shots()
+        self.renew_motion(np.array([self.image_unit[image]]))
+
+    def _place_shots(self) -> None:
+        count = len(self.motion.shots)
+        self.state = replace(
+            self.state, shot_rotation=np.tile(np.eye(3), (count, 1, 1)), shot_position_m=np.zeros((count, 3))
+        )
+
+    def renew_motion(self, units: Ints | None = None) -> float:
+        """Let the images follow the units' present trajectory (around some units); by how much in metres at most."""
+        return self.motion.renew(self.state, self.registered, units)
 
     def drop_unsupported(self, min_observations: int) -> Ints:
         """Take the poses of units back that hardly observe a point any more; which ones."""
@@ -199,6 +227,7 @@ class Model:
                 point=point.astype(np.int64),
                 xy_px=self.keypoints.xy_px[rows],
                 num_points=len(tracks),
+                shot=None if self.state.simultaneous else self.keypoints.shot[rows],
             ),
             layout=Layout.of(
                 free_units & self.registered,
@@ -230,4 +259,5 @@ class Model:
         points = self.state.points_m
         points[tracks] = solution.points_m
         self.state = replace(solution, points_m=points)
+        self.renew_motion(np.flatnonzero(free_units & self.registered))
         return report

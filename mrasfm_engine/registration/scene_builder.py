@@ -60,6 +60,7 @@ def build_scene(
         georeference=prior.georeference if georeferenced else None,
         rough_world_from_local=None if georeferenced else prior.rough_world_from_local,
         notes=list(notes),
+        unit_from_image=None if model.state.simultaneous else model.motion.unit_from_image(model.state),
     )
 
 

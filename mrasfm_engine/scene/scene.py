@@ -88,3 +88,18 @@ class Scene:
     # without georeference but with rough poses: rough_world_from_local is a pure translation (4, 4)
     rough_world_from_local: Floats | None = None
     notes: list[str] = field(default_factory=list)
+    # where the rig was at every image's own timestamp, relative to its unit's pose (images, 4, 4); None: at its unit's
+    unit_from_image: Floats | None = None
+
+    @property
+    def world_from_cam(self) -> Floats:
+        """Poses (images, 4, 4) of all images at their own timestamps; NaN for images that are not registered."""
+        units = np.array([image.unit for image in self.drive.images], dtype=np.int64)
+        cameras = np.array([image.camera for image in self.drive.images], dtype=np.int64)
+        rig_from_cam = np.stack([camera.rig_from_cam for camera in self.calibration])
+        world_from_rig = self.world_from_rig[units]
+        if self.unit_from_image is not None:
+            world_from_rig = world_from_rig @ self.unit_from_image
+        poses: Floats = world_from_rig @ rig_from_cam[cameras]
+        poses[~self.image_registered] = np.nan
+        return poses

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A value of all variables, free or not."""
+    """A value of all variables, free or not, and the units' motion, which is held while they are adjusted.
+
+    The camera of a shot (see `scene.shots`) stands at world_from_rig * unit_from_shot * rig_from_cam. Without shots all
+    images are taken at their unit's timestamp.
+    """
 
     unit_rotation: Floats  # (u, 3, 3) of world_from_rig
     unit_position_m: Floats  # (u, 3)
@@ -22,6 +26,8 @@ class State:
     camera_position_m: Floats  # (c, 3)
     camera_params: Floats  # (c, 8), see geometry.camera_model
     points_m: Floats  # (p, 3)
+    shot_rotation: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (s, 3, 3) of unit_from_shot
+    shot_position_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (s, 3)
 
     @property
     def world_from_rig(self) -> Floats:
@@ -32,3 +38,13 @@ class State:
     def rig_from_cam(self) -> Floats:
         """The cameras' poses (c, 4, 4)."""
         return se3.transform(self.camera_rotation, self.camera_position_m)
+
+    @property
+    def simultaneous(self) -> bool:
+        """Whether all images are taken at their unit's timestamp."""
+        return len(self.shot_rotation) == 0
+
+    @property
+    def unit_from_shot(self) -> Floats:
+        """The rig's poses at the shots, relative to its pose at their unit's timestamp (s, 4, 4)."""
+        return se3.transform(self.shot_rotation, self.shot_position_m)

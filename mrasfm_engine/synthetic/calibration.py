@@ -53,6 +53,7 @@ def given_cameras(options: SynthOptions, cameras: list[TrueCamera], rng: np.rand
                 sigma_rotation_deg=rotation_sigma,
                 sigma_translation_m=translation_sigma,
                 sigma_focal_px=None,
+                readout_us=round(options.readout_ms * 1000) or None,
             )
         )
     return result

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -23,7 +25,7 @@ from mrasfm_engine.synthetic.calibration import given_cameras
 from mrasfm_engine.synthetic.light import daylight
 from mrasfm_engine.synthetic.motion import Motion, drive_motion
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
-from mrasfm_engine.synthetic.render import Lens, develop, render
+from mrasfm_engine.synthetic.render import Lens, View, develop, render
 from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
 from mrasfm_engine.synthetic.scene_in_time import SceneInTime, build_scene
 from mrasfm_engine.synthetic.world import StaticWorld, build_world
@@ -35,11 +37,12 @@ Progress = Callable[[int, int], None]
 FIRST_EPOCH_US = 1_750_000_000_000_000
 _BETWEEN_DRIVES_US = 3_600_000_000
 _WORKERS = 2
+_BAND_MS = 0.5  # of a rolling shutter's rows that are rendered as one instant
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One image to be taken."""
+    """One image to be taken; with a rolling shutter its middle row at its timestamp."""
 
     unit: int
     camera: int
@@ -166,7 +169,18 @@ def _render_drive(
     _write_truth(folder, options, rig, shots, world_from_rig, unit_us)
     with ThreadPoolExecutor(_WORKERS) as pool:
         tasks = [
-            pool.submit(_take, options, scene, lenses[shot.camera], shot, folder, start_us, drive) for shot in shots
+            pool.submit(
+                _take,
+                options,
+                scene,
+                lenses[shot.camera],
+                shot,
+                folder,
+                start_us=start_us,
+                drive=drive,
+                motion=motion,
+            )
+            for shot in shots
         ]
         try:
             for done, task in enumerate(tasks, 1):
@@ -265,22 +279,55 @@ def _write_truth(
     (folder / "truth_world.json").write_text(json.dumps(origin, indent=1) + "\n")
 
 
-def _take(
-    options: SynthOptions, scene: SceneInTime, lens: Lens, shot: Shot, folder: Path, start_us: int, drive: int
-) -> None:
-    """Render, expose and write one image and its mask."""
-    mesh, boxes = scene.at((shot.timestamp_us - start_us) / 1e6)
-    view = render(
+def _view(options: SynthOptions, scene: SceneInTime, lens: Lens, time_s: float, world_from_cam: Floats) -> View:
+    mesh, boxes = scene.at(time_s)
+    return render(
         mesh,
         scene.materials.atlas,
         lens,
-        shot.world_from_cam,
+        world_from_cam,
         light=scene.light,
         shadows=scene.shadows,
         shadow_strength=options.shadow_strength,
         moving_boxes=boxes,
         sky_texture=scene.materials.clouds,
     )
+
+
+def _rolling(options: SynthOptions, scene: SceneInTime, lens: Lens, middle_s: float, motion: Motion) -> View:
+    """What a sensor sees whose rows are read one after the other, in bands that are each one instant."""
+    height = lens.camera.height
+    count = min(height, math.ceil(options.readout_ms / _BAND_MS))
+    bounds = np.linspace(0, height, count + 1).round().astype(int)
+    views = []
+    for first, stop in pairwise(bounds):
+        time_s = middle_s + (0.5 * (first + stop) / height - 0.5) * options.readout_ms / 1000
+        world_from_cam = motion.world_from_rig(time_s) @ lens.camera.rig_from_cam
+        views.append(_view(options, scene, lens.rows(first, stop), time_s, world_from_cam))
+    return View(
+        intensity=np.concatenate([view.intensity for view in views]),
+        labels=np.concatenate([view.labels for view in views]),
+        depth_m=np.concatenate([view.depth_m for view in views]),
+    )
+
+
+def _take(
+    options: SynthOptions,
+    scene: SceneInTime,
+    lens: Lens,
+    shot: Shot,
+    folder: Path,
+    *,
+    start_us: int,
+    drive: int,
+    motion: Motion,
+) -> None:
+    """Render, expose and write one image and its mask."""
+    at_s = (shot.timestamp_us - start_us) / 1e6
+    if options.readout_ms > 0:
+        view = _rolling(options, scene, lens, at_s, motion)
+    else:
+        view = _view(options, scene, lens, at_s, shot.world_from_cam)
     # An image's noise must not depend on which thread comes first.
     rng = np.random.default_rng([options.seed, 4, drive, shot.unit, shot.camera])
     gain = scene.light.gain * float(np.exp(0.5 * options.exposure_jitter * rng.normal()))

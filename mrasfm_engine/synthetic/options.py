@@ -20,6 +20,7 @@ class World(StrEnum):
     STREET = "street"  # one winding street
     CROSSING = "crossing"  # two streets that cross
     LOOP = "loop"  # once around a block
+    TURN = "turn"  # one street that turns to the left by 90 degrees
     REPEATED = "repeated"  # two parallel streets whose facades are all the same
 
 
@@ -60,6 +61,7 @@ class SynthOptions:
     speed_profile: SpeedProfile = SpeedProfile.GENTLE
     standing_units: int = 0  # the vehicle stands still for that many units in the middle of each drive
     time_skew_ms: float = 0.0  # the images of a unit are taken up to that long apart
+    readout_ms: float = 0.0  # rolling shutter: from the first row of an image to the last
     drop_images: float = 0.0  # fraction of images that are missing
     occluded_cameras: tuple[str, ...] = ()  # a lorry covers most of their images for half of the drive
 
@@ -101,6 +103,7 @@ class SynthOptions:
             "blur_px",
             "standing_units",
             "time_skew_ms",
+            "readout_ms",
             "gnss_noise_m",
             "gnss_drift_m",
             "gnss_bias_m",
@@ -121,6 +124,8 @@ class SynthOptions:
             refuse(f"--spacing-m {self.spacing_m} is not a car's", "Use 0.05 to 5 m, which is 0.5 to 50 m/s.")
         if self.time_skew_ms >= 1000 / RATE_HZ:
             refuse(f"--time-skew-ms {self.time_skew_ms} reaches the next unit", "Use less than 100 ms.")
+        if self.readout_ms >= 1000 / RATE_HZ:
+            refuse(f"--readout-ms {self.readout_ms} reaches the next unit", "Use less than 100 ms.")
         if abs(self.ramp_percent) > 20:
             refuse(f"--ramp {self.ramp_percent} is steeper than streets are", "Use -20 to 20 percent.")
         if self.standing_units > self.units // 2:

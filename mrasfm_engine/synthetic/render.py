@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -34,6 +34,11 @@ class View:
 
 class Lens:
     """A camera with the ray of every pixel worked out."""
+
+    def rows(self, first: int, stop: int) -> Lens:
+        """The same lens before a sensor of some rows only."""
+        fx, fy, cx, cy, *distortion = self.camera.params
+        return Lens(replace(self.camera, height=stop - first, params=(fx, fy, cx, cy - first, *distortion)))
 
     def __init__(self, camera: TrueCamera) -> None:
         self.camera = camera

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
@@ -13,6 +14,10 @@ from mrasfm_engine.synthetic.rigs import true_cameras
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
+
+RATE_HZ = 10.0
+_ROW_ROUNDS = 5
+_FINE = 20  # steps of the curve from unit to unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +31,7 @@ class SimulatedObservations:
     rig_from_cam: Floats  # (cameras, 4, 4)
     camera_params: Floats  # (cameras, 4): PINHOLE's fx fy cx cy, px
     image_size_px: tuple[int, int]  # width, height
-    timestamps_us: NDArray[np.int64]  # (units,), 10 Hz
+    timestamps_us: NDArray[np.int64]  # (units,), at RATE_HZ
     points_m: Floats  # (points, 3), world frame
     unit: Ints  # (observations,) index into world_from_rig
     camera: Ints  # (observations,) index into rig_from_cam
@@ -41,21 +46,39 @@ def simulate_trajectory(units: int, *, spacing_m: float = 1.1, straight: bool = 
 
     Over 40 units of 1.1 m the heading of the winding street varies by 29 degrees.
     """
-    # Fine steps, then every n-th: the units' headings and positions belong to one smooth curve.
-    fine = 20
-    s = np.arange(units * fine) * (spacing_m / fine)
-    heading = np.radians(25.0) + (
-        np.zeros_like(s) if straight else np.radians(24.0) * np.sin(s / 19.0) + np.radians(5.0) * np.sin(s / 4.0)
-    )
-    step = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(s)], -1) * (spacing_m / fine)
-    position = np.concatenate([np.zeros((1, 3)), np.cumsum(step, 0)[:-1]])
-    pitch_roll = np.radians(0.4) * np.stack([np.sin(s / 1.3), np.sin(s / 2.1 + 1.0)], -1)
+    way_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
+    return poses_along(way_m, spacing_m=spacing_m, straight=straight)
+
+
+def poses_along(way_m: Floats, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
+    """Poses (n, 4, 4) of the car of `simulate_trajectory` after any way (n,) driven, also before its first unit."""
+
+    def heading(s: Floats) -> Floats:
+        swing = (
+            np.zeros_like(s) if straight else np.radians(24.0) * np.sin(s / 19.0) + np.radians(5.0) * np.sin(s / 4.0)
+        )
+        result: Floats = np.radians(25.0) + swing
+        return result
+
+    # Fine steps forward and back from the start: the poses belong to one smooth curve.
+    step_m = spacing_m / _FINE
+    ahead = np.arange(max(0, math.ceil(way_m.max(initial=0.0) / step_m)) + 2) * step_m
+    back = -np.arange(max(0, math.ceil(-way_m.min(initial=0.0) / step_m)) + 2) * step_m
+    grids, places = [], []
+    for grid in (back, ahead):
+        along = np.stack([np.cos(heading(grid)), np.sin(heading(grid)), np.zeros_like(grid)], -1) * (grid[1] - grid[0])
+        grids.append(grid)
+        places.append(np.concatenate([np.zeros((1, 3)), np.cumsum(along, 0)[:-1]]))
+    grid = np.concatenate([grids[0][:0:-1], grids[1]])
+    place = np.concatenate([places[0][:0:-1], places[1]])
+    position = np.stack([np.interp(way_m, grid, place[:, k]) for k in range(3)], -1)
+    pitch_roll = np.radians(0.4) * np.stack([np.sin(way_m / 1.3), np.sin(way_m / 2.1 + 1.0)], -1)
     rotation = (
-        se3.exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0]))
+        se3.exp_so3(heading(way_m)[:, None] * np.array([0.0, 0.0, 1.0]))
         @ se3.exp_so3(pitch_roll[:, :1] * np.array([0.0, 1.0, 0.0]))
         @ se3.exp_so3(pitch_roll[:, 1:] * np.array([1.0, 0.0, 0.0]))
     )
-    return se3.transform(rotation, position)[::fine]
+    return se3.transform(rotation, position)
 
 
 def _points_along(world_from_rig: Floats, count: int, rng: np.random.Generator) -> Floats:
@@ -91,6 +114,8 @@ def simulate_observations(
     straight: bool = False,
     max_depth_m: float = 60.0,
     image_size_px: tuple[int, int] = (960, 540),
+    time_offset_s: ArrayLike = 0.0,
+    readout_s: float = 0.0,
     rng: np.random.Generator,
 ) -> SimulatedObservations:
     """Random points around a trajectory and what the cameras see of them.
@@ -112,6 +137,10 @@ def simulate_observations(
         Farther points are not seen.
     image_size_px
         Width and height of every image.
+    time_offset_s
+        When each camera (cameras,) takes its image, from its unit's timestamp on; for a rolling shutter its middle row.
+    readout_s
+        Time from the first row of an image to the last.
     rng
         Source of everything random.
 
@@ -139,6 +168,17 @@ def simulate_observations(
     safe = np.where(depth > 0.3, depth, np.inf)
     xy = in_camera[..., :2] / safe[..., None] * params[:, None, :2] + params[:, None, 2:]
     seen = (depth > 0.3) & (depth < max_depth_m) & np.all((xy > 0) & (xy < np.array([width, height])), -1)
+    offset_s = np.broadcast_to(np.asarray(time_offset_s, dtype=np.float64), (cameras,))
+    if offset_s.any() or readout_s > 0:
+        which = np.nonzero(seen)
+        time_s = which[0] / RATE_HZ + offset_s[which[1]]
+        for _ in range(_ROW_ROUNDS):
+            # The row tells the time, and the time the row.
+            at_s = time_s + (xy[which][:, 1] / height - 0.5) * readout_s
+            then = poses_along(at_s * RATE_HZ * spacing_m, spacing_m=spacing_m, straight=straight)
+            local = se3.apply(se3.inverse(then @ rig_from_cam[which[1]]), world[which[2], None])[:, 0]
+            xy[which] = local[:, :2] / local[:, 2:].clip(0.3) * params[which[1], :2] + params[which[1], 2:]
+        seen[which] = (local[:, 2] > 0.3) & np.all((xy[which] > 0) & (xy[which] < np.array([width, height])), -1)
     kept = np.flatnonzero(seen.sum((0, 1)) >= 2)
     unit, camera, point = np.nonzero(seen[:, :, kept])
     exact = xy[:, :, kept][unit, camera, point]

@@ -16,6 +16,7 @@ ROAD_HALF_M = 5.4  # two lanes and a parking lane on each side
 KERB_M = 0.12
 SIDEWALK_M = 2.9  # width
 LANE_M = 1.65  # centre of the right lane, to the right of the street's axis
+TURN_AFTER_M, TURN_WAY_M = 4.0, 30.0  # of a street that turns; its radius is 9.5 m in the middle of it
 MARGIN_M = 75.0  # street before and after a drive
 _STEP_M = 0.25
 _HILL_GRID_M = 4.0
@@ -121,6 +122,19 @@ def _winding(heading: float, length_m: float) -> Street:
     return Street(points - points[round(MARGIN_M / _STEP_M)])
 
 
+def _turning(heading: float, length_m: float) -> Street:
+    """A straight street that turns to the left by 90 degrees soon after arc length MARGIN_M, at the world's origin.
+
+    Its curvature rises and falls smoothly, as a steering wheel is turned.
+    """
+    s = np.arange(0.0, length_m + _STEP_M, _STEP_M)
+    x = np.clip((s - MARGIN_M - TURN_AFTER_M) / TURN_WAY_M, 0.0, 1.0)
+    angle = heading + np.pi / 2 * (x - np.sin(2 * np.pi * x) / (2 * np.pi))
+    steps = np.stack([np.cos(angle), np.sin(angle)], -1)[:-1] * _STEP_M
+    points = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)])
+    return Street(points - points[round(MARGIN_M / _STEP_M)])
+
+
 def _block(heading: float, length_m: float) -> Street:
     """A closed rounded rectangle, counter-clockwise."""
     radius = 9.0
@@ -173,6 +187,8 @@ def lay_out(options: SynthOptions, rng: np.random.Generator) -> Layout:
     if options.straight or options.world is World.REPEATED:
         along = np.array([np.cos(heading), np.sin(heading)])
         first = _line(-MARGIN_M * along, heading, total)
+    elif options.world is World.TURN:
+        first = _turning(heading, total)
     else:
         first = _winding(heading, total)
     if options.world is World.REPEATED:
@@ -180,7 +196,7 @@ def lay_out(options: SynthOptions, rng: np.random.Generator) -> Layout:
         second = Street(first.points + 60.0 * across)
         routes = [Route(street=k % 2, start_m=MARGIN_M + 2.0 * (k // 2), direction=1) for k in range(options.drives)]
         return Layout(streets=[first, second] if options.drives > 1 else [first], ground=ground, routes=routes)
-    if options.world is World.STREET:
+    if options.world in (World.STREET, World.TURN):
         routes = [
             Route(street=0, start_m=MARGIN_M + 0.25 * length * (k % 3), direction=1, lane_m=LANE_M - 0.2 * (k % 2))
             for k in range(options.drives)

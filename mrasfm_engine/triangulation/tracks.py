@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.scene.shots import Shots
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -26,12 +27,13 @@ class Keypoints:
     image: Ints  # (n,)
     unit: Ints  # (n,)
     camera: Ints  # (n,)
+    shot: Ints  # (n,) index into the drive's shots, see `scene.shots`
     xy_px: Floats  # (n, 2)
     rays: Floats  # (n, 3) unit viewing rays in camera axes under the given intrinsics
 
     @staticmethod
-    def of(drive: Drive, features: Sequence[ImageFeatures]) -> Keypoints:
-        """Line up the features of all images of a drive."""
+    def of(drive: Drive, features: Sequence[ImageFeatures], shots: Shots | None = None) -> Keypoints:
+        """Line up the features of all images of a drive; by default every image is one instant."""
         counts = np.array([len(f.xy_px) for f in features], dtype=np.int64)
         image = np.repeat(np.arange(len(features), dtype=np.int64), counts)
         unit_of_image = np.array([i.unit for i in drive.images], dtype=np.int64)
@@ -48,6 +50,7 @@ class Keypoints:
             image=image,
             unit=unit_of_image[image],
             camera=camera,
+            shot=image if shots is None else shots.of_rows(image, xy[:, 1]),
             xy_px=xy,
             rays=rays,
         )

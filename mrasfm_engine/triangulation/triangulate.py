@@ -25,6 +25,7 @@ Bools = NDArray[np.bool_]
 MAX_HYPOTHESES = 24  # pairs of rays tried a track
 MAX_OBSERVATIONS = 256  # of a track that are looked at
 MIN_DEPTH_M = 0.05
+ALL_SHOTS = 4096  # up to so many, the poses of all are computed at once; rolling shutters have hundreds a unit
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
@@ -40,7 +41,7 @@ def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, w
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _refine(
-    count: int, use: Any, members: Any, image: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any,
+    count: int, use: Any, members: Any, shot: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any,
     params: Any, x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
 ) -> None:  # fmt: skip
     """A few Gauss-Newton steps on a point with Cauchy weights over the observations in use."""
@@ -51,9 +52,9 @@ def _refine(
             if not use[m]:
                 continue
             k = members[m]
-            r = cfw_r[image[k]]
+            r = cfw_r[shot[k]]
             c = camera[k]
-            e2 = _error2(r, cfw_t[image[k]], kind[c], params[c], x, xy[k], cam, work, proj)
+            e2 = _error2(r, cfw_t[shot[k]], kind[c], params[c], x, xy[k], cam, work, proj)
             if e2 > 1e11:
                 continue
             w = 1.0 / (1.0 + e2 / scale2)
@@ -86,7 +87,7 @@ def _refine(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _triangulate(
-    which: Any, first: Any, track_keypoints: Any, image: Any, camera: Any, xy: Any, rays: Any, usable: Any,
+    which: Any, first: Any, track_keypoints: Any, shot: Any, camera: Any, xy: Any, rays: Any, usable: Any,
     cfw_r: Any, cfw_t: Any, kind: Any, params: Any, max_error2: float, min_angle: float,
     points: Any, solved: Any, kept: Any,
 ) -> None:  # fmt: skip
@@ -102,8 +103,8 @@ def _triangulate(
         for s in range(first[track], first[track + 1]):
             k = track_keypoints[s]
             kept[k] = False
-            if count < MAX_OBSERVATIONS and usable[image[k]]:
-                r, t = cfw_r[image[k]], cfw_t[image[k]]
+            if count < MAX_OBSERVATIONS and usable[shot[k]]:
+                r, t = cfw_r[shot[k]], cfw_t[shot[k]]
                 for i in range(3):
                     origin[count, i] = -(r[0, i] * t[0] + r[1, i] * t[1] + r[2, i] * t[2])
                     direction[count, i] = r[0, i] * rays[k, 0] + r[1, i] * rays[k, 1] + r[2, i] * rays[k, 2]
@@ -145,7 +146,7 @@ def _triangulate(
                 for m in range(count):
                     k = members[m]
                     e2 = _error2(
-                        cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+                        cfw_r[shot[k]], cfw_t[shot[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
                     )
                     if e2 < max_error2:
                         score += max_error2 - e2
@@ -160,7 +161,7 @@ def _triangulate(
             for m in range(count):
                 k = members[m]
                 e2 = _error2(
-                    cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+                    cfw_r[shot[k]], cfw_t[shot[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
                 )
                 use[m] = e2 < max_error2
                 inliers += use[m]
@@ -170,7 +171,7 @@ def _triangulate(
                 count,
                 use,
                 members,
-                image,
+                shot,
                 camera,
                 xy,
                 cfw_r,
@@ -188,9 +189,7 @@ def _triangulate(
         inliers = 0
         for m in range(count):
             k = members[m]
-            e2 = _error2(
-                cfw_r[image[k]], cfw_t[image[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
-            )
+            e2 = _error2(cfw_r[shot[k]], cfw_t[shot[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj)
             use[m] = e2 < max_error2
             inliers += use[m]
         if inliers < 2:
@@ -224,7 +223,7 @@ def _triangulate(
 def _errors(
     rows: Any,
     point: Any,
-    image: Any,
+    shot: Any,
     camera: Any,
     xy: Any,
     cfw_r: Any,
@@ -238,7 +237,7 @@ def _errors(
     for n in range(len(rows)):
         k = rows[n]
         c = camera[k]
-        out[n] = _error2(cfw_r[image[k]], cfw_t[image[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj)
+        out[n] = _error2(cfw_r[shot[k]], cfw_t[shot[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -247,7 +246,7 @@ def _has_angle(
     first: Any,
     track_keypoints: Any,
     kept: Any,
-    image: Any,
+    shot: Any,
     rays: Any,
     cfw_r: Any,
     cos_limit: float,
@@ -261,7 +260,7 @@ def _has_angle(
         for s in range(first[which[n]], first[which[n] + 1]):
             k = track_keypoints[s]
             if kept[k] and count < MAX_OBSERVATIONS and not out[n]:
-                r = cfw_r[image[k]]
+                r = cfw_r[shot[k]]
                 for i in range(3):
                     direction[count, i] = r[0, i] * rays[k, 0] + r[1, i] * rays[k, 1] + r[2, i] * rays[k, 2]
                 for m in range(count):
@@ -273,13 +272,15 @@ def _has_angle(
                 count += 1
 
 
-def cam_from_world(state: State, keypoint_units: Ints, keypoint_cameras: Ints) -> tuple[Floats, Floats]:
-    """Rotations (n, 3, 3) and translations (n, 3) of images of the given units and cameras."""
-    world_from_cam = state.unit_rotation[keypoint_units] @ state.camera_rotation[keypoint_cameras]
-    centre = (
-        np.einsum("nij,nj->ni", state.unit_rotation[keypoint_units], state.camera_position_m[keypoint_cameras])
-        + state.unit_position_m[keypoint_units]
-    )
+def cam_from_world(state: State, units: Ints, cameras: Ints, shots: Ints | None = None) -> tuple[Floats, Floats]:
+    """Rotations (n, 3, 3) and translations (n, 3) of images of the given units and cameras, at the given shots."""
+    rotation, centre = state.camera_rotation[cameras], state.camera_position_m[cameras]
+    if shots is not None and not state.simultaneous:
+        turn = state.shot_rotation[shots]
+        rotation = turn @ rotation
+        centre = np.einsum("nij,nj->ni", turn, centre) + state.shot_position_m[shots]
+    world_from_cam = state.unit_rotation[units] @ rotation
+    centre = np.einsum("nij,nj->ni", state.unit_rotation[units], centre) + state.unit_position_m[units]
     rotation = np.ascontiguousarray(np.swapaxes(world_from_cam, 1, 2))
     return rotation, -np.einsum("nij,nj->ni", rotation, centre)
 
@@ -290,17 +291,32 @@ class Triangulator:
     def __init__(
         self,
         keypoints: Keypoints,
-        image_unit: Ints,
-        image_camera: Ints,
+        shot_unit: Ints,
+        shot_camera: Ints,
         camera_kind: Ints,
         *,
         max_error_px: float,
         min_angle_deg: float,
     ) -> None:
         self._keypoints = keypoints
-        self._image_unit, self._image_camera, self._kind = image_unit, image_camera, camera_kind
+        self._shot_unit, self._shot_camera, self._kind = shot_unit, shot_camera, camera_kind
+        self._few_shots = len(shot_unit) <= ALL_SHOTS
         self.max_error_px = max_error_px
         self._min_angle = math.radians(min_angle_deg)
+
+    def _cam_from_world(self, state: State, keypoints: Ints | None) -> tuple[Floats, Floats]:
+        """Poses of all shots; where there are many, only those of some keypoints' shots are filled in."""
+        if self._few_shots or keypoints is None:
+            every = None if state.simultaneous else np.arange(len(self._shot_unit))
+            return cam_from_world(state, self._shot_unit, self._shot_camera, every)
+        needed = np.zeros(len(self._shot_unit), dtype=np.bool_)
+        needed[self._keypoints.shot[keypoints]] = True
+        shots = np.flatnonzero(needed)
+        rotation, translation = np.empty((len(needed), 3, 3)), np.empty((len(needed), 3))
+        rotation[shots], translation[shots] = cam_from_world(
+            state, self._shot_unit[shots], self._shot_camera[shots], shots
+        )
+        return rotation, translation
 
     def triangulate(
         self,
@@ -318,29 +334,39 @@ class Triangulator:
         Writes the points into points_m (tracks, 3), whether there is one into solved (tracks,), and which keypoints are
         its observations into kept (keypoints,).
         """
-        r, t = cam_from_world(state, self._image_unit, self._image_camera)
+        r, t = self._cam_from_world(state, _members(tracks, which))
         _triangulate(
-            which, tracks.first, tracks.keypoints, self._keypoints.image, self._keypoints.camera, self._keypoints.xy_px,
-            self._keypoints.rays, registered_units[self._image_unit], r, t, self._kind, state.camera_params,
+            which, tracks.first, tracks.keypoints, self._keypoints.shot, self._keypoints.camera, self._keypoints.xy_px,
+            self._keypoints.rays, registered_units[self._shot_unit], r, t, self._kind, state.camera_params,
             self.max_error_px**2, self._min_angle, points_m, solved, kept,
         )  # fmt: skip
 
     def has_angle(self, state: State, tracks: Tracks, kept: Bools, which: Ints) -> Bools:
         """Which of the tracks `which` are still seen under an angle that gives depth by their kept observations."""
-        r, _ = cam_from_world(state, self._image_unit, self._image_camera)
+        r, _ = self._cam_from_world(state, _members(tracks, which))
         out = np.empty(len(which), dtype=np.bool_)
         _has_angle(
-            which, tracks.first, tracks.keypoints, kept, self._keypoints.image, self._keypoints.rays, r,
+            which, tracks.first, tracks.keypoints, kept, self._keypoints.shot, self._keypoints.rays, r,
             math.cos(self._min_angle), out,
         )  # fmt: skip
         return out
 
     def errors_px(self, state: State, rows: Ints, points_m: Floats, point: Ints) -> Floats:
         """Reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) of points_m; 1e6 behind."""
-        r, t = cam_from_world(state, self._image_unit, self._image_camera)
+        r, t = self._cam_from_world(state, rows)
         out = np.empty(len(rows))
         _errors(
-            rows, point, self._keypoints.image, self._keypoints.camera, self._keypoints.xy_px, r, t, self._kind,
+            rows, point, self._keypoints.shot, self._keypoints.camera, self._keypoints.xy_px, r, t, self._kind,
             state.camera_params, points_m, out,
         )  # fmt: skip
         return np.sqrt(out)
+
+
+def _members(tracks: Tracks, which: Ints) -> Ints | None:
+    """Keypoints of some tracks; None for all, where asking costs more than it saves."""
+    if 2 * len(which) > len(tracks):
+        return None
+    lengths = tracks.first[which + 1] - tracks.first[which]
+    starts = np.repeat(tracks.first[which] - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
+    result: Ints = tracks.keypoints[starts + np.arange(len(starts))]
+    return result

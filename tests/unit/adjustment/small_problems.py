@@ -86,9 +86,12 @@ def make_case(
     return Case(truth=truth, problem=problem, simulation=sim)
 
 
-def project(state: State, kind: Any, unit: Any, camera: Any, point: Any) -> np.ndarray:
+def project(state: State, kind: Any, unit: Any, camera: Any, point: Any, shot: Any = None) -> np.ndarray:
     """Pixels (n, 2) of points in images, one at a time: slow and plain."""
-    cam_from_world = se3.inverse(state.world_from_rig[unit] @ state.rig_from_cam[camera])
+    world_from_rig = state.world_from_rig[unit]
+    if shot is not None:
+        world_from_rig = world_from_rig @ state.unit_from_shot[shot]
+    cam_from_world = se3.inverse(world_from_rig @ state.rig_from_cam[camera])
     in_camera = se3.apply(cam_from_world, state.points_m[point][:, None, :])[:, 0]
     pixels = np.empty((len(unit), 2))
     for c in range(len(kind)):
@@ -140,7 +143,7 @@ def moved(problem: Problem, state: State, step: np.ndarray) -> State:
 def weighted_residuals(problem: Problem, state: State) -> np.ndarray:
     """Residuals (2 n,) over sigma, without the loss."""
     o = problem.observations
-    pixels = project(state, problem.camera_kind, o.unit, o.camera, o.point)
+    pixels = project(state, problem.camera_kind, o.unit, o.camera, o.point, o.shot)
     return ((pixels - o.xy_px) / problem.options.sigma_px).ravel()
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import Case, dense_normal_equations, make_case, moved, numeric_gradient, perturbed
+from small_problems import Case, dense_normal_equations, make_case, moved, numeric_gradient, perturbed, project
 
 from mrasfm_engine.adjustment.normal_equations import BEHIND_PX
 from mrasfm_engine.adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, UprightPrior
@@ -42,6 +42,21 @@ def case_of_all_kinds(seed: int = 0) -> tuple[Case, State]:
         focal=0.002,
     )
     return case, state
+
+
+def with_shots(case: Case, state: State, seed: int = 0) -> tuple[Problem, State]:
+    """Every image of the case at a time of its own, the rig somewhere else for each; observed is what follows."""
+    rng, cameras = np.random.default_rng(seed), len(case.problem.camera_kind)
+    count = len(state.unit_rotation) * cameras
+    motion = {
+        "shot_rotation": se3.exp_so3(0.05 * rng.normal(size=(count, 3))),
+        "shot_position_m": 0.4 * rng.normal(size=(count, 3)),
+    }
+    o, truth = case.problem.observations, replace(case.truth, **motion)
+    shot = o.unit * cameras + o.camera
+    seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, shot)
+    observations = replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), shot=shot)
+    return replace(case.problem, observations=observations), replace(state, **motion)
 
 
 def all_terms(case: Case) -> list[CalibrationPrior | PositionPrior | UprightPrior | FocalPrior]:
@@ -111,6 +126,35 @@ def test_the_step_equals_that_of_the_dense_full_system() -> None:
     points = problem.points_after(state, reduced, step)
     np.testing.assert_allclose(points, moved(problem, state, expected).points_m, atol=1e-5)
     assert np.abs(points - state.points_m).max() > 1e-3
+
+
+def test_derivatives_are_right_where_images_are_not_simultaneous() -> None:
+    problem, state = with_shots(*case_of_all_kinds())
+    n = problem.layout.size
+    reduced = problem.normal_equations(state, 0.0)
+    numeric = numeric_gradient(problem, state, range(n + state.points_m.size))
+    h, g = dense_normal_equations(problem, state)
+    np.testing.assert_allclose(g, numeric, rtol=1e-4, atol=1e-4 * np.abs(g).max())
+    np.testing.assert_allclose(reduced.v_gradient.ravel(), numeric[n:], rtol=1e-4, atol=0.05)
+    matrix, gradient = schur(h, g, n)
+    scale = np.sqrt(np.diagonal(h)[:n])
+    np.testing.assert_allclose(reduced.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
+    np.testing.assert_allclose(reduced.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
+    still = replace(problem, observations=replace(problem.observations, shot=None))
+    alone = replace(state, shot_rotation=np.zeros((0, 3, 3)), shot_position_m=np.zeros((0, 3)))
+    assert problem.cost(state) < 0.5 * still.cost(alone)
+
+
+def test_shots_that_stand_at_their_unit_change_nothing() -> None:
+    case, state = case_of_all_kinds()
+    problem, moving = with_shots(case, state)
+    problem = replace(problem, observations=replace(case.problem.observations, shot=problem.observations.shot))
+    count = len(moving.shot_rotation)
+    identity = replace(moving, shot_rotation=np.tile(np.eye(3), (count, 1, 1)), shot_position_m=np.zeros((count, 3)))
+    np.testing.assert_allclose(problem.errors_px2(identity), case.problem.errors_px2(state), rtol=1e-9, atol=1e-12)
+    a, b = problem.normal_equations(identity, 1e-3), case.problem.normal_equations(state, 1e-3)
+    np.testing.assert_allclose(a.matrix, b.matrix, rtol=1e-9, atol=1e-9 * np.abs(b.matrix).max())
+    np.testing.assert_allclose(a.gradient, b.gradient, rtol=1e-9, atol=1e-9 * np.abs(b.gradient).max())
 
 
 def test_threads_share_the_work_without_changing_it() -> None:

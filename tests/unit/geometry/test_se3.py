@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.geometry import se3
@@ -34,6 +35,20 @@ def test_exp_and_log_agree_with_scipy_at_every_angle(angle_rad: float) -> None:
     # At a half turn both signs are right.
     np.testing.assert_allclose(se3.exp_so3(logs), rotations, atol=1e-12)
     np.testing.assert_allclose(se3.rotation_angle_deg(rotations), np.degrees(angle_rad), atol=1e-7)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-5, 0.9e-4, 1.1e-4, 0.3, 2.0, 3.1])
+def test_twists_and_transforms_agree_with_the_matrix_exponential(angle_rad: float) -> None:
+    rng = np.random.default_rng(1)
+    axis = rng.normal(size=(10, 3))
+    twist = np.concatenate(
+        [angle_rad * axis / np.linalg.norm(axis, axis=1, keepdims=True), 3 * rng.normal(size=(10, 3))], axis=1
+    )
+    generator = np.zeros((10, 4, 4))
+    generator[:, :3, :3], generator[:, :3, 3] = se3.skew(twist[:, :3]), twist[:, 3:]
+    moved = se3.exp_se3(twist)
+    np.testing.assert_allclose(moved, scipy.linalg.expm(generator), atol=1e-12)
+    np.testing.assert_allclose(se3.log_se3(moved), twist, atol=1e-9)
 
 
 def test_small_and_large_angles_meet_at_the_threshold() -> None:

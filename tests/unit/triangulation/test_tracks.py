@@ -18,6 +18,7 @@ def keypoints_of(per_image: list[int]) -> Keypoints:
         image=image,
         unit=image,
         camera=np.zeros(n, dtype=np.int64),
+        shot=image,
         xy_px=np.zeros((n, 2)),
         rays=np.tile([0.0, 0, 1], (n, 1)),
     )

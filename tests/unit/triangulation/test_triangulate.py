@@ -80,6 +80,7 @@ def setting(
         image=image,
         unit=image,
         camera=np.zeros(len(image), dtype=np.int64),
+        shot=image,
         xy_px=flat,
         rays=unproject_pixels(kind, params, flat),
     )

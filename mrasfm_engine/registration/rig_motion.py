@@ -1,0 +1,168 @@
+"""Where the rig stands when an image is taken, relative to its unit's timestamp.
+
+`State.unit_from_shot` comes from the units' own trajectory: the motion around a unit is interpolated from the
+registered units before and after it. It is held while units are adjusted, and renewed between adjustments. The same
+place holds poses that images have of their own, apart from the rig.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.local_motion import LocalMotion, local_motion, smoothed_velocity
+from mrasfm_engine.scene.shots import Shots
+from mrasfm_engine.scene.state import State
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+PRIOR_WINDOW_S = 1.0  # over which the velocity of noisy prior poses is averaged
+
+
+@dataclass(frozen=True, kw_only=True)
+class LargestMotion:
+    """The most that images are apart from their unit, over the registered units."""
+
+    time_offset_s: float
+    translation_m: float
+    rotation_deg: float
+
+
+class RigMotion:
+    """The motion within units. It changes a state's `unit_from_shot` in place and keeps no poses of units itself.
+
+    Parameters
+    ----------
+    shots
+        When every image (or band of its rows) was taken.
+    timestamps_us
+        The units' times (u,).
+    """
+
+    def __init__(self, shots: Shots, timestamps_us: Ints) -> None:
+        self.shots = shots
+        self._time_s = (timestamps_us - timestamps_us[0]) / 1e6
+        self._own = np.zeros(len(shots.middle_of_image), dtype=np.bool_)
+        self._unit_from_image = np.tile(np.eye(4), (len(self._own), 1, 1))
+        self._shot_range = np.searchsorted(shots.unit, np.arange(len(timestamps_us) + 1))
+        self.last_change_m = 0.0  # how far the last renewal moved the rig at a shot
+        self._prior_velocity = np.zeros((len(timestamps_us), 6))  # of units without registered neighbours
+
+    def follow_prior(self, world_from_rig: Floats) -> None:
+        """Where no registered unit says how the vehicle moves, prior poses (u, 4, 4) do; NaN where unknown."""
+        if not self.shots.simultaneous:
+            self._prior_velocity = smoothed_velocity(world_from_rig, self._time_s, window_s=PRIOR_WINDOW_S)
+
+    def set_image_pose(self, image: int, unit_from_image: Floats) -> None:
+        """Give an image a pose (4, 4) of its own: the rig's, relative to its unit's, at the image's timestamp.
+
+        From now on it stays as it is; rows of a rolling shutter still move about it.
+        """
+        self._own[image], self._unit_from_image[image] = True, unit_from_image
+
+    @property
+    def needed(self) -> bool:
+        """Whether any image is apart from its unit at all."""
+        return bool(self._own.any()) or not self.shots.simultaneous
+
+    def renew(self, state: State, registered: Bools, units: Ints | None = None) -> float:
+        """Compute `unit_from_shot` anew from the registered units' poses; also says how far it moved, in metres.
+
+        Parameters
+        ----------
+        units
+            Only of these units and their neighbours, whose motion depends on them.
+        """
+        if state.simultaneous:
+            return 0.0
+        motion = local_motion(state.world_from_rig, self._time_s, registered)
+        motion.velocity[~motion.known] = self._prior_velocity[~motion.known]
+        gap = np.where(motion.known, 0.0, np.inf)  # nothing bounds a prior's motion but the images' own times
+        motion.earliest_s[:] -= gap
+        motion.latest_s[:] += gap
+        chosen = np.flatnonzero(registered) if units is None else _with_neighbours(units, registered)
+        self.last_change_m = self._apply(state, motion, self._shots_of(chosen))
+        return self.last_change_m
+
+    def predict(self, state: State, registered: Bools, unit: int) -> None:
+        """Set `unit_from_shot` of a unit that has no pose yet: it moves as its registered neighbours do."""
+        if state.simultaneous:
+            return
+        twist = self._prior_velocity[unit]
+        known = np.flatnonzero(registered)
+        nearest = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
+        if len(nearest) == 2:
+            pair = np.sort(nearest)
+            around = local_motion(state.world_from_rig[pair], self._time_s[pair], np.ones(2, dtype=np.bool_))
+            if around.known.all():
+                twist = around.velocity[0]
+        rows = self._shots_of(np.array([unit]))
+        moved = se3.exp_se3(self.shots.time_offset_s[rows, None] * twist)
+        self._write(state, rows, moved, se3.exp_se3(self._offset_of_image(rows)[:, None] * twist))
+
+    def unit_from_image(self, state: State) -> Floats:
+        """The rig's poses (images, 4, 4) at the images' own timestamps, relative to their units'."""
+        if state.simultaneous:
+            return np.tile(np.eye(4), (len(self._own), 1, 1))
+        return state.unit_from_shot[self.shots.middle_of_image]
+
+    def scale(self, state: State, factor: float, mean_camera_m: Floats) -> None:
+        """Follow a scaling of units and points, and of the cameras about their mean place in the rig (3,).
+
+        Shots keep their images: with the rig's origin moved by (factor - 1) mean, b becomes
+        factor b + (factor - 1) (A - I) mean.
+        """
+        if state.simultaneous:
+            return
+        turned = state.shot_rotation @ mean_camera_m - mean_camera_m
+        state.shot_position_m[:] = factor * state.shot_position_m + (factor - 1.0) * turned
+        own = np.flatnonzero(self._own)
+        self._unit_from_image[own] = self.unit_from_image(state)[own]
+
+    def largest(self, state: State, registered: Bools) -> LargestMotion:
+        """How far apart images and units are."""
+        rows = np.flatnonzero(registered[self.shots.unit])
+        if state.simultaneous or not len(rows):
+            return LargestMotion(time_offset_s=0.0, translation_m=0.0, rotation_deg=0.0)
+        return LargestMotion(
+            time_offset_s=float(np.abs(self.shots.time_offset_s[rows]).max()),
+            translation_m=float(np.linalg.norm(state.shot_position_m[rows], axis=1).max()),
+            rotation_deg=float(se3.rotation_angle_deg(state.shot_rotation[rows]).max()),
+        )
+
+    def _shots_of(self, units: Ints) -> Ints:
+        first, last = self._shot_range[units], self._shot_range[units + 1]
+        rows = [np.arange(lo, hi) for lo, hi in zip(first, last, strict=True)]
+        return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+
+    def _offset_of_image(self, rows: Ints) -> Floats:
+        result: Floats = self.shots.time_offset_s[self.shots.middle_of_image[self.shots.image[rows]]]
+        return result
+
+    def _apply(self, state: State, motion: LocalMotion, rows: Ints) -> float:
+        unit, before = self.shots.unit[rows], state.shot_position_m[rows]
+        moved = motion.at(unit, self.shots.time_offset_s[rows])
+        self._write(state, rows, moved, None if not self._own.any() else motion.at(unit, self._offset_of_image(rows)))
+        return float(np.linalg.norm(state.shot_position_m[rows] - before, axis=1).max(initial=0.0))
+
+    def _write(self, state: State, rows: Ints, moved: Floats, at_image: Floats | None) -> None:
+        own = self._own[self.shots.image[rows]]
+        if at_image is not None and own.any():
+            moved = moved.copy()
+            moved[own] = self._unit_from_image[self.shots.image[rows[own]]] @ se3.inverse(at_image[own]) @ moved[own]
+        state.shot_rotation[rows], state.shot_position_m[rows] = moved[:, :3, :3], moved[:, :3, 3]
+
+
+def _with_neighbours(units: Ints, registered: Bools) -> Ints:
+    """Units, and the registered ones next to them."""
+    known = np.flatnonzero(registered)
+    if not len(known):
+        return units
+    before = known[np.maximum(np.searchsorted(known, units) - 1, 0)]
+    after = known[np.minimum(np.searchsorted(known, units, side="right"), len(known) - 1)]
+    return np.unique(np.concatenate([units, before, after]))

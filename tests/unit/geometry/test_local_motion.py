@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.local_motion import (
+    MAX_ACCELERATION_MPS2,
+    MAX_GAP_S,
+    local_motion,
+    smoothed_velocity,
+)
+
+TWIST = np.array([0.05, -0.02, 0.6, 8.0, 0.3, -0.1])  # rad/s and m/s: a turn with some roll and climb
+START = se3.transform(se3.exp_so3([0.1, 0.2, -1.0]), [3.0, -4.0, 1.0])
+
+
+def driven(time_s: np.ndarray, twist: np.ndarray = TWIST) -> np.ndarray:
+    return START @ se3.exp_se3(time_s[:, None] * twist)
+
+
+def all_known(time_s: np.ndarray) -> np.ndarray:
+    return np.ones(len(time_s), dtype=np.bool_)
+
+
+@pytest.mark.parametrize("offset_s", [-0.05, -0.01, 0.0, 0.03, 0.05])
+@pytest.mark.parametrize("unit", [0, 3, 7])
+def test_a_constant_twist_is_exact_inside_and_at_both_ends(unit: int, offset_s: float) -> None:
+    time_s = np.array([0.0, 0.1, 0.2, 0.35, 0.4, 0.5, 0.62, 0.7])
+    motion = local_motion(driven(time_s), time_s, all_known(time_s))
+    found = motion.at(np.array([unit]), np.array([offset_s]))[0]
+    np.testing.assert_allclose(found, se3.exp_se3(offset_s * TWIST), atol=1e-12)
+    assert motion.known.all()
+
+
+def test_constant_acceleration_on_a_line_is_exact_between_neighbours() -> None:
+    time_s = np.array([0.0, 0.1, 0.25])
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 5.0 * time_s + 0.5 * 3.0 * time_s**2
+    motion = local_motion(poses, time_s, all_known(time_s))
+    at = motion.at(np.array([1, 1]), np.array([-0.04, 0.05]))
+    expected = [5.0 * t + 1.5 * t**2 - poses[1, 0, 3] for t in (0.06, 0.15)]
+    np.testing.assert_allclose(at[:, 0, 3], expected, atol=1e-12)
+
+
+def test_a_gap_is_bridged_and_a_far_one_is_not() -> None:
+    time_s = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 10.0])
+    known = np.array([True, False, True, False, True, True])
+    poses = driven(time_s)
+    poses[~known] = np.eye(4)
+    motion = local_motion(poses, time_s, known)
+    at = motion.at(np.array([2]), np.array([0.04]))[0]
+    np.testing.assert_allclose(at, se3.exp_se3(0.04 * TWIST), atol=1e-12)
+    assert time_s[5] - time_s[4] > MAX_GAP_S
+    assert motion.known.tolist() == [True, False, True, False, True, False]
+    np.testing.assert_array_equal(motion.at(np.array([1, 5]), np.array([0.05, 0.05])), np.tile(np.eye(4), (2, 1, 1)))
+
+
+def test_nothing_is_said_of_times_beyond_the_neighbours() -> None:
+    time_s = np.array([0.0, 0.1, 0.2])
+    motion = local_motion(driven(time_s), time_s, all_known(time_s))
+    far = motion.at(np.array([1, 1]), np.array([5.0, -5.0]))
+    np.testing.assert_allclose(far, se3.exp_se3(np.array([[0.1], [-0.1]]) * TWIST), atol=1e-12)
+
+
+def test_poses_at_almost_the_same_time_do_not_turn_noise_into_speed() -> None:
+    time_s = np.array([0.0, 0.1, 0.1001, 0.2])
+    poses = driven(time_s)
+    poses[2, :3, 3] += 0.02
+    velocity = local_motion(poses, time_s, all_known(time_s)).velocity[1]
+    np.testing.assert_allclose(velocity, TWIST, atol=1e-9)
+
+
+def test_a_neighbour_that_is_far_off_asks_for_an_acceleration_that_is_not_believed() -> None:
+    time_s = np.arange(3) * 0.1
+    poses = driven(time_s)
+    poses[2, :3, 3] += [3.0, 0.0, 0.0]
+    motion = local_motion(poses, time_s, all_known(time_s))
+    bend = float(np.linalg.norm(motion.bend[1, 3:]))
+    assert bend == pytest.approx(MAX_ACCELERATION_MPS2 / 2)
+
+
+def test_a_standing_car_does_not_move() -> None:
+    time_s = np.arange(4) * 0.1
+    motion = local_motion(np.tile(START, (4, 1, 1)), time_s, all_known(time_s))
+    np.testing.assert_allclose(motion.at(np.arange(4), np.full(4, 0.05)), np.tile(np.eye(4), (4, 1, 1)), atol=1e-12)
+
+
+def test_velocity_of_noisy_poses_is_averaged_and_zero_where_nothing_is_known() -> None:
+    time_s = np.arange(40) * 0.1
+    rng = np.random.default_rng(0)
+    twist = np.array([0.0, 0.0, 0.1, 8.0, 0.0, 0.0])
+    poses = driven(time_s, twist)
+    poses[:, :3, 3] += 0.3 * rng.normal(size=(40, 3))
+    poses[:5] = np.nan
+    velocity = smoothed_velocity(poses, time_s, window_s=1.0)
+    assert not velocity[:5].any()
+    error = np.linalg.norm(velocity[15:30, 3:] - twist[3:], axis=1)
+    assert 0.005 < np.median(error) < 0.4  # from one unit to the next it would be 4 m/s
+    np.testing.assert_allclose(velocity[15:30, :3], np.tile(twist[:3], (15, 1)), atol=1e-9)
