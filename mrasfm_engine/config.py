@@ -85,6 +85,12 @@ class GnssConfig(_Section):
     max_time_gap_s: Positive = 2.0  # no interpolation across larger gaps
 
 
+class OutputConfig(_Section):
+    """What is written besides the scene itself."""
+
+    pictures: bool = True  # the road from above before and after recalibration, as PNG; takes a few seconds
+
+
 class EngineConfig(_Section):
     """All settings of a reconstruction."""
 
@@ -94,6 +100,7 @@ class EngineConfig(_Section):
     mapping: MappingConfig = MappingConfig()
     adjustment: AdjustmentConfig = AdjustmentConfig()
     gnss: GnssConfig = GnssConfig()
+    output: OutputConfig = OutputConfig()
     use_gnss: bool = True
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     threads: Count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -55,7 +55,8 @@ def reconstruct(
     matches = stages.matches(run, features, prior)
     model = stages.mapping(run, features, matches, prior)
     scene = stages.scene(run, model, features, matches, prior)
+    pictures = stages.pictures(run, scene)
     if cancel():
         raise CancelledError
-    write_scene(scene, out, run.report)
+    write_scene(scene, out, run.report, pictures)
     return run.report

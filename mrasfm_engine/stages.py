@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
@@ -35,6 +36,7 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
+from mrasfm_engine.views.birds_eye import birds_eye
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
@@ -287,6 +289,30 @@ def scene(
         }
     )
     return build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)
+
+
+def pictures(run: Run, result: Scene) -> dict[str, NDArray[np.uint8]]:
+    """The pictures (h, w, 3) of a scene by file name: the road from above before and after recalibration."""
+    if not run.config.output.pictures:
+        return {}
+
+    def step(done: int, total: int) -> None:
+        if run.cancel():
+            raise CancelledError
+        run.progress("pictures", done, total)
+
+    started = time.perf_counter()
+    drawn = birds_eye(result, seed=run.config.seed, progress=step)
+    run.report["stages"].append(
+        {
+            "stage": "pictures",
+            "seconds": round(time.perf_counter() - started, 3),
+            "reused": False,
+            "birds_eye": drawn.report,
+        }
+    )
+    run.progress("pictures", 1, 1)
+    return drawn.pictures
 
 
 def store_of(out: Path) -> StageStore:

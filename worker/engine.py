@@ -65,9 +65,11 @@ class CancelFile:
 def _reconstruct(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
+    last = "pictures" if config.output.pictures else "refinement"
+
     def report(stage: str, done: int, total: int) -> None:
         progress(stage, done, total)
-        if stage == "refinement" and done == total:
+        if stage == last and done == total:
             progress("export", 0, 1)
 
     reconstruct(request.drive, request.out, config, progress=report, cancel=cancelled)

@@ -18,7 +18,8 @@ WEIGHTS: Mapping[Work, Mapping[str, float]] = MappingProxyType(
             "features": 32.0,
             "matches": 25.0,
             "mapping": 20.0,
-            "refinement": 9.0,
+            "refinement": 6.0,
+            "pictures": 3.0,
             "export": 4.0,
             "publish": 3.0,
         },
@@ -33,6 +34,7 @@ UNITS: Mapping[str, str] = MappingProxyType(
         "matches": "pairs",
         "mapping": "units",  # rigid units: all cameras at one instant
         "refinement": "rounds",
+        "pictures": "images",
         "publish": "files",
     }
 )

@@ -90,7 +90,18 @@ def _say(report: dict[str, Any], out: Path) -> None:
         print(f"  scale sigma:      {refinement['scale']['sigma_relative']:.2%}")
     calibration = refinement["calibration"]
     print(f"  calibration:      {'refined' if calibration['adjusted'] else 'held'} ({calibration['reason']})")
+    if "pictures" in stages:
+        print(f"  road from above:  {_birds_eye(stages['pictures']['birds_eye'], out)}")
     for finding in report["findings"]:
         print(f"  {finding['severity']}: {finding['what']}")
     for missing in mapping["units_not_registered"]:
         print(f"  not registered: frame {missing['source_frame']}: {missing['reason']}")
+
+
+def _birds_eye(seen: dict[str, Any], out: Path) -> str:
+    if "not_drawn" in seen:
+        return f"not drawn ({seen['not_drawn']})"
+    if "not_compared" in seen:
+        return f"{out / 'pictures'} ({seen['not_compared']})"
+    before, after = (seen[name]["correlation"] for name in ("before", "after"))
+    return f"{out / 'pictures'}; correlation of two cameras {before:.2f} as given, {after:.2f} now"

@@ -1,7 +1,8 @@
 """Writes a scene's files, checks them, and puts them in place.
 
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
-`poses.json`, `calibration.json`, `frame.json`, `features.db` and `report.json`. One with a `report.json` is complete.
+`poses.json`, `calibration.json`, `frame.json`, `features.db`, `pictures/` where any were drawn, and `report.json`. One
+with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from mrasfm_engine.io import (
     export_check_model,
     export_colmap,
     export_frame,
+    export_pictures,
     export_ply,
     export_poses,
     feature_database,
@@ -33,10 +36,14 @@ from mrasfm_engine.io import (
 from mrasfm_engine.scene.scene import Scene
 
 COMPLETE_MARK = "report.json"
+PICTURES = "pictures"
+NO_PICTURES: Mapping[str, export_pictures.Picture] = MappingProxyType({})
 LEFTOVER_AGE_S = 3600.0
 
 
-def write_scene(scene: Scene, out: Path, report: Mapping[str, Any]) -> None:
+def write_scene(
+    scene: Scene, out: Path, report: Mapping[str, Any], pictures: Mapping[str, export_pictures.Picture] = NO_PICTURES
+) -> None:
     """Write all files of a scene into the folder `out`.
 
     They are written into a temporary folder, read back and compared with the scene, and only then moved: an interrupted
@@ -47,6 +54,8 @@ def write_scene(scene: Scene, out: Path, report: Mapping[str, Any]) -> None:
     ----------
     report
         What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths.
+    pictures
+        PNG files of `pictures/` by name; those of an earlier scene there are removed.
 
     Raises
     ------
@@ -60,10 +69,11 @@ def write_scene(scene: Scene, out: Path, report: Mapping[str, Any]) -> None:
     try:
         # Inside an existing folder, because that may be another file system than its parent.
         home = out if out.is_dir() else out.parent
-        _prepare(scene, out, home)
+        _prepare(_size_bytes(scene) + export_pictures.size_bytes(pictures), out, home)
         work = home / f".{out.name}.partial-{os.getpid()}-{secrets.token_hex(4)}"
         work.mkdir()
         try:
+            export_pictures.write_pictures(pictures, work / PICTURES)
             _write(scene, work, report)
             _put_in_place(work, out)
         finally:
@@ -135,7 +145,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
-def _prepare(scene: Scene, out: Path, home: Path) -> None:
+def _prepare(needed: int, out: Path, home: Path) -> None:
     """Make the folder to work in, clear what killed runs left there, and see that the files will fit."""
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
@@ -143,7 +153,7 @@ def _prepare(scene: Scene, out: Path, home: Path) -> None:
     for leftover in home.glob(f".{out.name}.partial-*"):
         if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
             shutil.rmtree(leftover, ignore_errors=True)
-    needed, free = _size_bytes(scene), shutil.disk_usage(home).free
+    free = shutil.disk_usage(home).free
     if free < needed:
         raise StorageError(
             f"{out} needs about {needed / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
@@ -163,7 +173,10 @@ def _put_in_place(work: Path, out: Path) -> None:
         work.rename(out)
         return
     (out / COMPLETE_MARK).unlink(missing_ok=True)
-    for item in sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK):
+    items = sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK)
+    if (out / PICTURES).is_dir() and not (work / PICTURES).exists():
+        (out / PICTURES).rename(work / f"old-{PICTURES}")  # they would show another scene
+    for item in items:
         target = out / item.name
         if item.is_dir() and target.is_dir():
             target.rename(work / f"old-{item.name}")

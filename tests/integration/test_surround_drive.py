@@ -29,7 +29,16 @@ def test_accuracy(surround_drive: Path, surround_scene: Path, mrasfm: Run) -> No
 
 
 def test_every_file_is_there_and_readable(surround_scene: Path) -> None:
-    expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration.json", "frame.json", "features.db"}
+    expected = {
+        "model",
+        "points.ply",
+        "poses.tum",
+        "poses.json",
+        "calibration.json",
+        "frame.json",
+        "features.db",
+        "pictures",
+    }
     assert {path.name for path in surround_scene.iterdir()} == {*expected, "report.json", ".stages"}
     assert leftovers(surround_scene.parent) == []
     points = read_report(surround_scene)["summary"]["points"]

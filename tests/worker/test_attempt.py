@@ -24,7 +24,7 @@ from worker.outcomes import Cancelled, Failed, Outcome, Succeeded
 from worker.progress import Progress
 from worker.stages import Attempt, AttemptFolder, Tick, Verdict, run_attempt
 
-STAGES = ["preflight", "features", "matches", "mapping", "refinement", "export"]
+STAGES = ["preflight", "features", "matches", "mapping", "refinement", "pictures", "export"]
 
 
 def attempt(
@@ -97,7 +97,7 @@ def test_reconstruction_and_another_that_reuses_its_stages(
     again = attempt(small_drive, second, settings, tick, max_keypoints=1000, seed=5)
     assert isinstance(again, Succeeded)
     reused = {stage["stage"]: stage["reused"] for stage in again.report["stages"]}
-    assert reused == {"features": True, "matches": True, "mapping": True, "refinement": False}
+    assert reused == {"features": True, "matches": True, "mapping": True, "refinement": False, "pictures": False}
     assert seen[-1].reused == ("features", "matches", "mapping")
 
 

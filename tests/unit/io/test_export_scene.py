@@ -28,11 +28,13 @@ from export_example import (
 from mrasfm_engine.errors import MrasfmError, StorageError
 from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io import (
+    export_pictures,
     export_ply,
     export_scene,
     feature_database,
 )
 from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.scene.scene import ImageFeatures, Scene
 
@@ -340,4 +342,25 @@ def test_a_scene_that_contradicts_itself_is_refused(
 ) -> None:
     with pytest.raises(MrasfmError, match=message):
         write_scene(replace(scene, **{field: value(scene)}), tmp_path / "scene", {})
+    assert_nothing_published(tmp_path / "scene")
+
+
+def test_pictures_are_part_of_the_scene(scene: Scene, tmp_path: Path) -> None:
+    out = tmp_path / "scene"
+    picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    write_scene(scene, out, {}, {"a.png": picture})
+    assert {p.name for p in out.iterdir()} == {*FILES, "pictures"}
+    np.testing.assert_array_equal(read_image_rgb(out / "pictures" / "a.png"), picture)
+    write_scene(scene, out, {}, {"b.png": picture[:20]})
+    assert [p.name for p in (out / "pictures").iterdir()] == ["b.png"]
+    write_scene(scene, out, {})
+    assert {p.name for p in out.iterdir()} == FILES  # old pictures would show another scene
+
+
+def test_a_picture_that_does_not_read_back_is_withheld(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export_pictures, "read_image_rgb", lambda path: np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(MrasfmError, match="was written but does not read back"):
+        write_scene(scene, tmp_path / "scene", {}, {"a.png": np.ones((2, 2, 3), np.uint8)})
     assert_nothing_published(tmp_path / "scene")

@@ -1,0 +1,1 @@
+"""Pictures of a finished scene by which a user can judge it."""

@@ -1,0 +1,126 @@
+"""How well the views of different cameras agree where they show the same ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mrasfm_engine.views.mosaic import Mosaic
+
+Floats = NDArray[np.float64]
+Gray = NDArray[np.float32]
+
+BLOCK_M = 0.8  # side of the pieces of ground that are compared
+ROADSIDE_M = 4.0  # farther from the way there are kerbs
+SEARCH_M = 0.4  # displacements up to this are found
+MIN_COVER = 0.96  # of the cells of a piece and of where it is searched
+MIN_CONTRAST = 3.0  # standard deviation of grey values: plain asphalt says nothing
+MAX_BLOCKS = 600  # those of most contrast
+SMOOTHING_M = 0.03  # against noise, and so that a sharper and a softer image compare
+MIN_PEAK = 0.6  # correlation at which a displacement counts as found
+MIN_BLOCKS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """Of two cameras' views of the same ground.
+
+    Attributes
+    ----------
+    blocks
+        How many pieces of ground were compared.
+    correlation
+        Median normalised cross-correlation of the two views where they lie, -1 to 1.
+    displaced_blocks
+        Pieces whose displacement could be found.
+    displacement_m
+        Their median displacement between the two views.
+    """
+
+    blocks: int
+    correlation: float
+    displaced_blocks: int
+    displacement_m: float
+
+
+def measure_agreement(mosaic: Mosaic, way_m: Floats) -> tuple[Agreement, Agreement] | None:
+    """Agreement of the best with the second best camera under the given and under the refined calibration.
+
+    Both are measured on the same pieces within `ROADSIDE_M` of the way (n, 2), chosen by contrast alone; None where
+    there are too few.
+    """
+    cell = mosaic.grid.cell_m
+    size, margin = round(BLOCK_M / cell), round(SEARCH_M / cell)
+    if size < 4 or margin < 2:
+        return None  # the cells of a long drive are too coarse
+    gray = _gray(mosaic)
+    corners = _textured_blocks(mosaic, gray[1], way_m, size, margin)
+    if len(corners) < MIN_BLOCKS:
+        return None
+    given, refined = (_compare(layers, corners, size, margin, cell) for layers in gray)
+    return given, refined
+
+
+def _gray(mosaic: Mosaic) -> list[list[Gray]]:
+    """By calibration and layer."""
+    sigma = SMOOTHING_M / mosaic.grid.cell_m
+    return [
+        [
+            np.asarray(cv2.GaussianBlur(cv2.cvtColor(layer, cv2.COLOR_RGB2GRAY), None, sigma), dtype=np.float32)
+            for layer in layers
+        ]
+        for layers in mosaic.color
+    ]
+
+
+def _textured_blocks(mosaic: Mosaic, layers: list[Gray], way_m: Floats, size: int, margin: int) -> NDArray[np.int64]:
+    """Top left cells (n, 2) of pieces that both layers cover with their surroundings, of most contrast in both."""
+    seen = (mosaic.owner > 0).all(axis=0).astype(np.uint8)
+    covered = cv2.integral(seen)
+    rows = np.arange(margin, mosaic.grid.rows - size - margin, size)
+    columns = np.arange(margin, mosaic.grid.columns - size - margin, size)
+    if not len(rows) or not len(columns):
+        return np.zeros((0, 2), dtype=np.int64)
+    r, c = (a.ravel() for a in np.meshgrid(rows, columns, indexing="ij"))
+    r0, r1, c0, c1 = r - margin, r + size + margin, c - margin, c + size + margin
+    cover = covered[r1, c1] - covered[r0, c1] - covered[r1, c0] + covered[r0, c0]
+    grid = mosaic.grid
+    x, y = grid.left_m + (c + size / 2) * grid.cell_m, grid.top_m - (r + size / 2) * grid.cell_m
+    from_way_m, _ = cKDTree(way_m).query(np.column_stack([x, y]))
+    whole = (cover >= MIN_COVER * (size + 2 * margin) ** 2) & (from_way_m < ROADSIDE_M)
+    r, c = r[whole], c[whole]
+    contrast = np.array(
+        [min(float(g[i : i + size, j : j + size].std()) for g in layers) for i, j in zip(r, c, strict=True)]
+    )
+    best = [k for k in np.argsort(-contrast, kind="stable")[:MAX_BLOCKS] if contrast[k] >= MIN_CONTRAST]
+    return np.stack([r[best], c[best]], 1).astype(np.int64)
+
+
+def _compare(layers: list[Gray], corners: NDArray[np.int64], size: int, margin: int, cell_m: float) -> Agreement:
+    correlations, displacements = [], []
+    for row, column in corners:
+        template = layers[0][row : row + size, column : column + size]
+        window = layers[1][row - margin : row + size + margin, column - margin : column + size + margin]
+        score = np.nan_to_num(cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED))
+        correlations.append(float(score[margin, margin]))
+        i, j = np.unravel_index(int(score.argmax()), score.shape)
+        if score[i, j] >= MIN_PEAK and 0 < i < 2 * margin and 0 < j < 2 * margin:
+            di = _vertex(score[i - 1, j], score[i, j], score[i + 1, j])
+            dj = _vertex(score[i, j - 1], score[i, j], score[i, j + 1])
+            displacements.append(cell_m * float(np.hypot(i + di - margin, j + dj - margin)))
+    return Agreement(
+        blocks=len(corners),
+        correlation=float(np.median(correlations)),
+        displaced_blocks=len(displacements),
+        displacement_m=float(np.median(displacements)) if displacements else float("nan"),
+    )
+
+
+def _vertex(before: float, at: float, after: float) -> float:
+    """Where a parabola through three samples has its top, in samples from the middle one."""
+    curvature = before - 2 * at + after
+    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
