@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -23,6 +23,9 @@ class _Section(BaseModel):
 class FeatureConfig(_Section):
     """Extraction of keypoints."""
 
+    extractor: Literal["sift", "superpoint", "aliked", "xfeat"] = "sift"  # all but SIFT need a model
+    model: str | None = None  # name of the model, see `mrasfm models list`; the extractor's usual one if not given
+    min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's keypoints; the usual if not given
     max_keypoints: Count = 2048  # a image, strongest first; 1024 costs accuracy
     contrast_threshold: Positive = 0.02  # half of SIFT's usual value, so that asphalt and shade yield keypoints too
     max_side_px: Count = 1600  # larger images are extracted at reduced size; coordinates stay those of the full image
@@ -41,9 +44,13 @@ class PairConfig(_Section):
 
 
 class MatchConfig(_Section):
-    """Nearest neighbours and their verification."""
+    """Matching of image pairs and its verification."""
 
-    ratio: Share = 0.8  # of the distances to the best and second best descriptor
+    matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] = "nearest"  # all but nearest need a model
+    model: str | None = None  # name of the model; the usual one for the extractor if not given
+    max_keypoints: Count = 1024  # strongest of an image that a network matches: time grows with the square
+    min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's matches; the usual if not given
+    ratio: Share = 0.8  # nearest: of the distances to the best and second best descriptor
     min_matches: Count = 15  # pairs with fewer matches or inliers are dropped
     max_error_px: Positive = 2.0  # epipolar distance of an inlier
     calibration_error_px: Positive = 8.0  # the same between cameras of one unit, where calibration gives the geometry
@@ -91,6 +98,19 @@ class OutputConfig(_Section):
     pictures: bool = True  # the road from above before and after recalibration, as PNG; takes a few seconds
 
 
+class SemanticsConfig(_Section):
+    """Masks of images that come without one."""
+
+    model: str | None = None  # name of a model for segmentation; no masks are made if not given
+
+
+class ModelsConfig(_Section):
+    """Where trained models lie and what runs them."""
+
+    folder: Path | None = None  # MRASFM_MODELS or the user's data folder if not given
+    gpu: bool = True  # where onnxruntime has a provider for one that starts
+
+
 class EngineConfig(_Section):
     """All settings of a reconstruction."""
 
@@ -101,6 +121,8 @@ class EngineConfig(_Section):
     adjustment: AdjustmentConfig = AdjustmentConfig()
     gnss: GnssConfig = GnssConfig()
     output: OutputConfig = OutputConfig()
+    semantics: SemanticsConfig = SemanticsConfig()
+    models: ModelsConfig = ModelsConfig()
     use_gnss: bool = True
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     threads: Count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

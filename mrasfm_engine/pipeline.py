@@ -48,6 +48,7 @@ def reconstruct(
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
+    stages.load_models(run)
     stages.preflight(run)
     prior = stages.prior(run)
     stages.probe(run)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.correspondence.calibration_check import require_calibration_direction
-from mrasfm_engine.correspondence.features import SiftExtractor, extract_features
-from mrasfm_engine.correspondence.matching import NearestNeighbourMatcher
+from mrasfm_engine.correspondence.features import extract_features
 from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window
+from mrasfm_engine.correspondence.plugins import Plugins, load_plugins
 from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.correspondence.revisits import revisit_pairs
 from mrasfm_engine.correspondence.search import match_pairs
@@ -40,6 +41,7 @@ from mrasfm_engine.views.birds_eye import birds_eye
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
+FEATURE_ARRAYS = ("xy_px", "descriptors", "colors")
 STATE_ARRAYS = (
     "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
     "shot_rotation", "shot_position_m",
@@ -57,6 +59,18 @@ class Run:
     cancel: Callable[[], bool]
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
     _key: str = ""
+
+    @cached_property
+    def plugins(self) -> Plugins:
+        """Extractor, matcher and segmenter; their models are loaded when first asked for, once."""
+        return load_plugins(self.config, self.drive.manifest.label_map)
+
+    @property
+    def feature_settings(self) -> object:
+        """What the features depend on: settings, and the models by their hashes."""
+        config = self.config
+        models = self.plugins.fingerprint_of("extractor", "segmenter")
+        return [config.features.model_dump(), config.semantics.model_dump(), models]
 
     def step(self, stage: str) -> Callable[[int, int], None]:
         """The progress callback of a stage."""
@@ -90,6 +104,11 @@ class Run:
         return arrays, report
 
 
+def load_models(run: Run) -> None:
+    """Read the models that the settings name; refuse what does not go together before any work."""
+    run.report["models"] = run.plugins.describe()
+
+
 def preflight(run: Run) -> None:
     """Check manifest, files and a sample of the images; refuse what cannot work before any long work."""
     findings = inspect_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"), cancel=run.cancel)
@@ -111,16 +130,18 @@ def prior(run: Run) -> PriorTrajectory:
 def probe(run: Run) -> None:
     """On the first units: is the calibration the right way round?"""
     images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
-    known = run.store.has("features", run.next_key("features", run.config.features.model_dump()))
+    known = run.store.has("features", run.next_key("features", run.feature_settings))
     if len(run.drive.cameras) < 2 or known:
         return
     first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
     features = extract_features(
-        Drive(run.drive.root, first), SiftExtractor(run.config.features), threads=run.config.threads, cancel=run.cancel
+        Drive(run.drive.root, first),
+        run.plugins.extractor,
+        threads=run.config.threads,
+        segmenter=run.plugins.segmenter,
+        cancel=run.cancel,
     )
-    require_calibration_direction(
-        run.drive, images, features, NearestNeighbourMatcher(run.config.matching), run.config.matching
-    )
+    require_calibration_direction(run.drive, images, features, run.plugins.matcher, run.config.matching)
 
 
 def features(run: Run) -> list[ImageFeatures]:
@@ -129,24 +150,23 @@ def features(run: Run) -> list[ImageFeatures]:
     def work() -> tuple[Arrays, dict[str, Any]]:
         found = extract_features(
             run.drive,
-            SiftExtractor(run.config.features),
+            run.plugins.extractor,
             threads=run.config.threads,
+            segmenter=run.plugins.segmenter,
             progress=run.step("features"),
             cancel=run.cancel,
         )
         counts = np.array([len(f.xy_px) for f in found], dtype=np.int64)
         poor = [run.drive.images[i].file for i in np.flatnonzero(counts < 100)]
+        arrays = {"counts": counts, **{name: _joined(found, name) for name in FEATURE_ARRAYS}}
+        if all(f.scores is not None for f in found):
+            arrays["scores"] = _joined(found, "scores")
         return (
-            {
-                "counts": counts,
-                "xy_px": np.concatenate([f.xy_px for f in found]),
-                "descriptors": np.concatenate([f.descriptors for f in found]),
-                "colors": np.concatenate([f.colors for f in found]),
-            },
+            arrays,
             {"images": len(found), "keypoints": int(counts.sum()), "images_with_under_100_keypoints": poor},
         )
 
-    arrays, _ = run.stage("features", run.config.features.model_dump(), work)
+    arrays, _ = run.stage("features", run.feature_settings, work)
     if not arrays["counts"].sum():
         raise ReconstructionError(
             "no image of the drive has a keypoint",
@@ -154,14 +174,15 @@ def features(run: Run) -> list[ImageFeatures]:
             code="no-features",
         )
     ends = np.cumsum(arrays["counts"])
+    names = [name for name in (*FEATURE_ARRAYS, "scores") if name in arrays]
     return [
-        ImageFeatures(
-            xy_px=arrays["xy_px"][hi - n : hi],
-            descriptors=arrays["descriptors"][hi - n : hi],
-            colors=arrays["colors"][hi - n : hi],
-        )
+        ImageFeatures(**{name: arrays[name][hi - n : hi] for name in names})
         for n, hi in zip(arrays["counts"], ends, strict=True)
     ]
+
+
+def _joined(found: Sequence[ImageFeatures], name: str) -> NDArray[Any]:
+    return np.concatenate([getattr(f, name) for f in found])
 
 
 def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> list[PairMatches]:
@@ -177,7 +198,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             run.drive,
             found,
             pairs,
-            NearestNeighbourMatcher(run.config.matching),
+            run.plugins.matcher,
             run.config.matching,
             threads=run.config.threads,
             progress=run.step("matches"),
@@ -192,7 +213,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
         }
 
     settings = [section.model_dump() for section in (run.config.pairs, run.config.matching, run.config.gnss)]
-    settings.append({"use_gnss": run.config.use_gnss})
+    settings.append({"use_gnss": run.config.use_gnss, "models": run.plugins.fingerprint_of("matcher")})
     arrays, report = run.stage("matches", settings, work)
     if not report["verified_pairs"]:
         raise ReconstructionError(

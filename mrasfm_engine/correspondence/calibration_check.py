@@ -55,7 +55,8 @@ def require_calibration_direction(
         Where the calibration is the wrong way round.
     """
     kinds, params = pack_cameras(drive.cameras)
-    prepared = [matcher.prepare(f) for f in features]
+    cameras = [drive.cameras[drive.images[i].camera] for i in images]
+    prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
     rays = [
         unproject_pixels(int(kinds[drive.images[i].camera]), params[drive.images[i].camera], f.xy_px)
         for i, f in zip(images, features, strict=True)

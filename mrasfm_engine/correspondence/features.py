@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.correspondence.segmentation import Segmenter
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.drive import Drive
@@ -71,13 +72,18 @@ class SiftExtractor:
         root = np.sqrt(
             descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM)
         )
-        column = np.clip(xy[:, 0].astype(int), 0, rgb.shape[1] - 1)
-        row = np.clip(xy[:, 1].astype(int), 0, rgb.shape[0] - 1)
         return ImageFeatures(
             xy_px=xy.astype(np.float32),
             descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
-            colors=np.ascontiguousarray(rgb[row, column]),
+            colors=colors_at(rgb, xy),
         )
+
+
+def colors_at(rgb: NDArray[np.uint8], xy_px: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of an image (h, w, 3) at keypoints (n, 2)."""
+    column = np.clip(xy_px[:, 0].astype(int), 0, rgb.shape[1] - 1)
+    row = np.clip(xy_px[:, 1].astype(int), 0, rgb.shape[0] - 1)
+    return np.ascontiguousarray(rgb[row, column])
 
 
 @contextmanager
@@ -96,12 +102,14 @@ def extract_features(
     extractor: Extractor,
     *,
     threads: int,
+    segmenter: Segmenter | None = None,
     progress: Callable[[int, int], None] | None = None,
     cancel: Callable[[], bool] | None = None,
 ) -> list[ImageFeatures]:
     """Features of every image of the drive, in the order of `drive.images`.
 
-    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car.
+    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car. Images without
+    one get theirs from `segmenter`, if there is one.
 
     Raises
     ------
@@ -126,6 +134,8 @@ def extract_features(
         usable = None
         if image.mask is not None:
             usable = usable_pixels(read_mask(drive.root / image.mask, drive.manifest.label_map), label_map)
+        elif segmenter is not None:
+            usable = usable_pixels(segmenter.segment(rgb), label_map)
         return extractor.extract(rgb, usable)
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()

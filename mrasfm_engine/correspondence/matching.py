@@ -17,8 +17,8 @@ Matches = NDArray[np.int32]
 class Matcher(Protocol):
     """Matches two images' features."""
 
-    def prepare(self, features: ImageFeatures) -> Any:
-        """What the matcher needs of one image, computed once."""
+    def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Any:
+        """What the matcher needs of one image of width x height pixels, computed once."""
         ...
 
     def match(self, a: Any, b: Any) -> Matches:
@@ -60,8 +60,8 @@ class NearestNeighbourMatcher:
     def __init__(self, config: MatchConfig) -> None:
         self._ratio2 = config.ratio**2
 
-    def prepare(self, features: ImageFeatures) -> NDArray[np.float32]:
-        """Unit-length descriptors (n, 128)."""
+    def prepare(self, features: ImageFeatures, *, width: int = 0, height: int = 0) -> NDArray[np.float32]:
+        """Unit-length descriptors (n, D); the image's size does not matter."""
         d = features.descriptors.astype(np.float32)
         result: NDArray[np.float32] = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-6)
         return result

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import PairConfig
+from mrasfm_engine.correspondence.features import DESCRIPTOR_SCALE
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -59,15 +60,15 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
 
 
 def _vlad(features: Sequence[ImageFeatures]) -> Floats:
-    """Unit-length VLAD vectors (images, WORDS * 128) with intra-normalisation (Arandjelovic and Zisserman, 2013)."""
-    strongest = [f.descriptors[:KEYPOINTS_PER_IMAGE].astype(np.float32) / 512.0 for f in features]
+    """Unit-length VLAD vectors (images, WORDS * D) with intra-normalisation (Arandjelovic and Zisserman, 2013)."""
+    strongest = [_unit_length(f.descriptors[:KEYPOINTS_PER_IMAGE]) for f in features]
     everything = np.concatenate(strongest)
     sample = everything[np.linspace(0, len(everything) - 1, min(len(everything), TRAINING_DESCRIPTORS)).astype(int)]
     words = min(WORDS, max(1, len(sample) // 10))
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 12, 1e-3)
     _, _, centres = cv2.kmeans(sample, words, np.empty(0), criteria, 1, cv2.KMEANS_PP_CENTERS)
-    result = np.zeros((len(features), words, 128), np.float32)
+    result = np.zeros((len(features), words, sample.shape[1]), np.float32)
     half_norms = 0.5 * (centres**2).sum(1)
     for row, d in zip(result, strongest, strict=True):
         if len(d):
@@ -77,3 +78,9 @@ def _vlad(features: Sequence[ImageFeatures]) -> Floats:
     flat = result.reshape(len(features), -1)
     normalised: Floats = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6)
     return normalised
+
+
+def _unit_length(descriptors: NDArray[np.uint8] | NDArray[np.float32]) -> Floats:
+    """Descriptors (n, D) as unit vectors: SIFT's are stored as 512 times that, networks give them so."""
+    scale = np.float32(DESCRIPTOR_SCALE if descriptors.dtype == np.uint8 else 1.0)
+    return descriptors.astype(np.float32) / scale

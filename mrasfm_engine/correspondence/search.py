@@ -50,7 +50,8 @@ def match_pairs(
     Between units an essential matrix must explain the matches. Between cameras of one unit the calibration gives the
     geometry, up to its error: matches far from its epipolar lines or behind a camera are out as well.
     """
-    prepared = [matcher.prepare(f) for f in features]
+    cameras = [drive.cameras[i.camera] for i in drive.images]
+    prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
     kinds, params = pack_cameras(drive.cameras)
     rays = [
         unproject_pixels(int(kinds[i.camera]), params[i.camera], f.xy_px)

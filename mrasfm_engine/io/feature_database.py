@@ -15,7 +15,7 @@ import pycolmap
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.export_colmap import REFERENCE_SENSOR_ID, RIG_ID, frame_of_image
-from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.scene.scene import ImageFeatures, Scene
 
 
 def write_features(scene: Scene, path: Path) -> None:
@@ -64,16 +64,22 @@ def _write_images(scene: Scene, database: pycolmap.Database) -> None:
         written = pycolmap.Image(name=image.file, camera_id=image.camera + 1, image_id=i + 1)
         database.write_image(written, use_image_id=True)
         database.write_keypoints(i + 1, np.ascontiguousarray(features.xy_px, dtype=np.float32))
-        descriptors = pycolmap.FeatureDescriptors(
-            type=pycolmap.FeatureExtractorType.SIFT, data=np.ascontiguousarray(features.descriptors)
-        )
-        database.write_descriptors(i + 1, descriptors)
+        database.write_descriptors(i + 1, _descriptors(features))
         frame_id = frame_of_image(scene, i)
         frame = frames.setdefault(frame_id, pycolmap.Frame(frame_id=frame_id, rig_id=RIG_ID))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, image.camera + 1)
         frame.add_data_id(pycolmap.data_t(sensor, i + 1))
     for _, frame in sorted(frames.items()):
         database.write_frame(frame, use_frame_id=True)
+
+
+def _descriptors(features: ImageFeatures) -> pycolmap.FeatureDescriptors:
+    """COLMAP keeps bytes and what they are: of float descriptors it takes four bytes a number."""
+    data = np.ascontiguousarray(features.descriptors)
+    if data.dtype == np.uint8:
+        return pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=data)
+    # COLMAP has no name for most networks; its matchers refuse descriptors of another kind than their own.
+    return pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.UNDEFINED, data=data.view(np.uint8))
 
 
 def _write_pairs(scene: Scene, database: pycolmap.Database) -> None:

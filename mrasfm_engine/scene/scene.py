@@ -21,8 +21,10 @@ class ImageFeatures:
     """
 
     xy_px: NDArray[np.float32]  # (n, 2)
-    descriptors: NDArray[np.uint8]  # (n, 128) RootSIFT scaled by 512 and clipped to 255, as COLMAP stores it
+    # uint8 (n, 128): RootSIFT scaled by 512 and clipped to 255, as COLMAP stores it; float32 (n, D): of a network
+    descriptors: NDArray[np.uint8] | NDArray[np.float32]
     colors: NDArray[np.uint8]  # (n, 3) red, green, blue at the keypoint
+    scores: NDArray[np.float32] | None = None  # (n,) a trained network's confidence
 
 
 @dataclass(frozen=True, kw_only=True)

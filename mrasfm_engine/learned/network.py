@@ -1,0 +1,107 @@
+"""Runs a model: one session for all our threads, whose own threads it does not add to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import InputError, ReconstructionError
+from mrasfm_engine.learned.signatures import Signature, Tensor
+
+Array = NDArray[Any]
+
+GPU_PROVIDERS = ("CUDAExecutionProvider", "ROCMExecutionProvider", "DmlExecutionProvider")
+CPU_PROVIDER = "CPUExecutionProvider"
+_ELEMENT_TYPES = {"float": "float32", "double": "float64", "float16": "float16"}
+_QUIET = 3  # errors only: they become our own
+
+
+class Network:
+    """A model that is ready to run.
+
+    `run` may be called from many threads at once: each call computes on its caller's thread alone, so that a pool of
+    ours is all there is. Images and pairs are what is parallel; all known models take them one by one. Memory is that
+    of the largest input times the number of threads, until the network is dropped.
+
+    Parameters
+    ----------
+    name
+        For messages.
+    data
+        The model's bytes, see `onnx_file.read_model`.
+    gpu
+        Use a GPU where this onnxruntime has a provider that starts; else the CPU.
+
+    Raises
+    ------
+    InputError
+        Where this runtime cannot load the model, as when it lacks an operator.
+    """
+
+    def __init__(self, name: str, data: bytes, *, gpu: bool) -> None:
+        # Loads in half a second; who uses no model does not wait for it.
+        import onnxruntime
+
+        self.name = name
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        # The number of keypoints differs from call to call: plans of memory for one shape would not be used again.
+        options.enable_mem_pattern = False
+        options.log_severity_level = _QUIET
+        there = onnxruntime.get_available_providers()
+        providers = [p for p in GPU_PROVIDERS if gpu and p in there] + [CPU_PROVIDER]
+        try:
+            self._session = onnxruntime.InferenceSession(data, options, providers=providers)
+        except Exception as error:  # onnxruntime raises a dozen kinds without a common root
+            raise InputError(
+                f"model {name} cannot be run by onnxruntime {onnxruntime.__version__}: {_first_line(error)}",
+                remedy="Export it with operators and an opset that this onnxruntime has, or install a newer one.",
+                code="bad-model",
+            ) from error
+        self.provider: str = self._session.get_providers()[0]
+        self.signature = Signature(
+            inputs=tuple(_tensor(node) for node in self._session.get_inputs()),
+            outputs=tuple(_tensor(node) for node in self._session.get_outputs()),
+        )
+        self._outputs = [tensor.name for tensor in self.signature.outputs]
+
+    def run(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
+        """Outputs by name.
+
+        Raises
+        ------
+        ReconstructionError
+            Where the runtime fails.
+        """
+        try:
+            found = self._session.run(self._outputs, dict(inputs))
+        except MemoryError:
+            raise
+        except Exception as error:
+            shapes = ", ".join(f"{name} {list(np.shape(value))}" for name, value in inputs.items())
+            raise ReconstructionError(
+                f"model {self.name} failed on {shapes}: {_first_line(error)}",
+                remedy="Lower features.max_side_px or matching.max_keypoints, or use another model.",
+                code="model-failed",
+            ) from error
+        return dict(zip(self._outputs, found, strict=True))
+
+    def fixed_size(self, image: str) -> tuple[int, int] | None:
+        """Rows and columns that the model's image must have, None where they are free."""
+        shape = next(tensor.shape for tensor in self.signature.inputs if tensor.name == image)
+        rows, columns = shape[-2:]
+        return (rows, columns) if isinstance(rows, int) and isinstance(columns, int) else None
+
+
+def _tensor(node: Any) -> Tensor:
+    kind = node.type.removeprefix("tensor(").removesuffix(")")
+    shape = tuple(size if isinstance(size, int) else str(size) for size in node.shape)
+    return Tensor(node.name, (_ELEMENT_TYPES.get(kind, kind),), shape)
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
