@@ -33,6 +33,7 @@ from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
@@ -127,6 +128,7 @@ def features(run: Run) -> list[ImageFeatures]:
             run.drive,
             SiftExtractor(run.config.features),
             threads=run.config.threads,
+            class_margin_px=run.config.features.class_margin_px,
             progress=run.step("features"),
             cancel=run.cancel,
         )
@@ -138,8 +140,15 @@ def features(run: Run) -> list[ImageFeatures]:
                 "xy_px": np.concatenate([f.xy_px for f in found]),
                 "descriptors": np.concatenate([f.descriptors for f in found]),
                 "colors": np.concatenate([f.colors for f in found]),
+                "classes": np.concatenate([f.classes for f in found]),
             },
-            {"images": len(found), "keypoints": int(counts.sum()), "images_with_under_100_keypoints": poor},
+            {
+                "images": len(found),
+                "keypoints": int(counts.sum()),
+                "keypoints_by_class": count_classes([f.classes for f in found]),
+                "images_with_mask": sum(image.mask is not None for image in run.drive.images),
+                "images_with_under_100_keypoints": poor,
+            },
         )
 
     arrays, _ = run.stage("features", run.config.features.model_dump(), work)
@@ -155,6 +164,7 @@ def features(run: Run) -> list[ImageFeatures]:
             xy_px=arrays["xy_px"][hi - n : hi],
             descriptors=arrays["descriptors"][hi - n : hi],
             colors=arrays["colors"][hi - n : hi],
+            classes=arrays["classes"][hi - n : hi],
         )
         for n, hi in zip(arrays["counts"], ends, strict=True)
     ]
@@ -183,6 +193,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             "candidate_pairs": len(pairs),
             "verified_pairs": len(result.pairs),
             "rejected_pairs": {"few matches": result.few_matches, "few inliers": result.few_inliers},
+            "dropped_between_classes": result.across_classes,
             "matches": sum(len(p.matches) for p in result.pairs),
             "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Protocol
 
 import cv2
@@ -16,7 +17,7 @@ from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.scene.semantics import usable_pixels
+from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
 from schemas import LabelMap
 
 DESCRIPTOR_SCALE = 512.0  # COLMAP stores unit-length descriptors times 512 in bytes
@@ -96,12 +97,14 @@ def extract_features(
     extractor: Extractor,
     *,
     threads: int,
+    class_margin_px: int = 2,
     progress: Callable[[int, int], None] | None = None,
     cancel: Callable[[], bool] | None = None,
 ) -> list[ImageFeatures]:
     """Features of every image of the drive, in the order of `drive.images`.
 
-    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car.
+    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
+    have the class of what they show; within `class_margin_px` of another class they are unknown.
 
     Raises
     ------
@@ -123,10 +126,19 @@ def extract_features(
                 f"{camera.width}x{camera.height}",
                 remedy="Give the calibration of images of this size, or images of the calibration's size.",
             )
-        usable = None
-        if image.mask is not None:
-            usable = usable_pixels(read_mask(drive.root / image.mask, drive.manifest.label_map), label_map)
-        return extractor.extract(rgb, usable)
+        if image.mask is None:
+            return extractor.extract(rgb, None)
+        mask = read_mask(drive.root / image.mask, drive.manifest.label_map)
+        if mask.shape != rgb.shape[:2]:
+            raise InputError(
+                f"mask {image.mask} has {mask.shape[1]}x{mask.shape[0]} pixels, its image has "
+                f"{rgb.shape[1]}x{rgb.shape[0]}",
+                remedy="Give masks of their images' size, without interpolating between ids.",
+                code="mask-size",
+            )
+        codes = class_codes(mask, label_map)
+        found = extractor.extract(rgb, usable_pixels(codes))
+        return replace(found, classes=classes_at(confident_classes(codes, class_margin_px), found.xy_px))
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()
     result: list[ImageFeatures] = []

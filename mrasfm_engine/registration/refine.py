@@ -21,6 +21,7 @@ from mrasfm_engine.registration.calibration import (
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
 
 Floats = NDArray[np.float64]
@@ -46,6 +47,7 @@ class Refinement:
     points_dropped: int = 0
     units_dropped: list[int] = field(default_factory=list)
     certainty: Covariances | None = None
+    road: RoadJudgement | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
     def georeferenced(self) -> bool:
@@ -114,7 +116,11 @@ def refine(
         )
         if done < ROUNDS - 1:
             model.complete()
+        else:
+            model.readmit()
         observations, points = model.filter(model.config.mapping.filter_error_px)
+        if model.config.mapping.semantic_triangulation:
+            result.road = drop_off_road(model)
         result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points

@@ -23,6 +23,12 @@ class ImageFeatures:
     xy_px: NDArray[np.float32]  # (n, 2)
     descriptors: NDArray[np.uint8]  # (n, 128) RootSIFT scaled by 512 and clipped to 255, as COLMAP stores it
     colors: NDArray[np.uint8]  # (n, 3) red, green, blue at the keypoint
+    # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
+    classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    def __post_init__(self) -> None:
+        if not len(self.classes):
+            object.__setattr__(self, "classes", np.zeros(len(self.xy_px), np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True)
