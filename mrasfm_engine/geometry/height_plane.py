@@ -1,4 +1,4 @@
-"""A plane as heights over a horizontal plane, found by locally optimised RANSAC (Chum, Matas and Kittler, DAGM 2003)."""
+"""A plane as heights over horizontal coordinates, by locally optimised RANSAC (Chum, Matas and Kittler, DAGM 2003)."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ def _hypotheses(
     rng: np.random.Generator,
 ) -> Floats:
     """The best few planes (k, 3) of offset and slope through random points."""
-    chance = weight / sigma
-    chance = chance / chance.sum()
+    chance: Floats = weight / sigma
+    chance /= chance.sum()
     some = rng.choice(len(height), (HYPOTHESES, 3), p=chance)
     a, b = xy[some[:, 1]] - xy[some[:, 0]], xy[some[:, 2]] - xy[some[:, 0]]
     det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
@@ -136,7 +136,8 @@ def _optimise(
         right = rows.T @ (w * height) + np.append(0.0, expected_slope) / sigma_slope**2
         if not w.any():
             return plane
-        before, plane = plane, np.linalg.solve(normal, right)
+        before = plane
+        plane = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
         if np.abs(plane - before).max() < CONVERGED_M:
             break
     return plane

@@ -1,7 +1,8 @@
 """Writes a scene's files, checks them, and puts them in place.
 
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
-`poses.json`, `calibration.json`, `frame.json`, `features.db` and `report.json`. One with a `report.json` is complete.
+`poses.json`, `calibration.json`, `frame.json`, `features.db` and `report.json`, and where the road was found
+`road.json` and `pictures/`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -28,12 +29,16 @@ from mrasfm_engine.io import (
     export_frame,
     export_ply,
     export_poses,
+    export_road,
     feature_database,
+    road_pictures,
 )
 from mrasfm_engine.scene.scene import Scene
 
 COMPLETE_MARK = "report.json"
 LEFTOVER_AGE_S = 3600.0
+ROAD_FILE = "road.json"
+PICTURES = "pictures"
 
 
 def write_scene(scene: Scene, out: Path, report: Mapping[str, Any]) -> None:
@@ -107,6 +112,10 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
     export_check.check_ply(scene, work / "points.ply")
     feature_database.write_features(scene, work / "features.db")
     export_check.check_features(scene, work / "features.db")
+    if scene.road is not None:
+        _write_json(work / ROAD_FILE, export_road.road_document(scene))
+        export_check.check_road(scene, work / ROAD_FILE)
+        road_pictures.write_pictures(scene, work / PICTURES)
     (work / "poses.tum").write_text(export_poses.poses_text(scene), encoding="utf-8")
     _write_json(work / "poses.json", export_poses.poses_document(scene))
     _write_json(work / "calibration.json", export_calibration.calibration_document(scene))
@@ -163,6 +172,10 @@ def _put_in_place(work: Path, out: Path) -> None:
         work.rename(out)
         return
     (out / COMPLETE_MARK).unlink(missing_ok=True)
+    # An older scene's that this one does not have: it would be taken for this scene's.
+    for stale in (Path(ROAD_FILE), *(Path(PICTURES, name) for name in road_pictures.NAMES)):
+        if not (work / stale).exists():
+            (out / stale).unlink(missing_ok=True)
     for item in sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK):
         target = out / item.name
         if item.is_dir() and target.is_dir():
@@ -191,6 +204,8 @@ def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
         (scene.image_registered.shape, (images,)),
         (scene.point_colors.shape, (points, 3)),
         (scene.point_error_px.shape, (points,)),
+        (scene.point_classes.shape, (points,)),
+        (scene.point_patches.shape, (points,)),
         (len(scene.calibration), len(scene.drive.cameras)),
     ]
     unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)
@@ -201,6 +216,8 @@ def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
     yield "a registered unit's pose is not finite", _finite(scene.world_from_rig[scene.unit_registered])
     yield "an image is registered without its unit", not (scene.image_registered & ~scene.unit_registered[unit]).any()
     yield "a point is not finite", _finite(scene.points_m) and _finite(scene.point_error_px)
+    patches = 0 if scene.road is None else len(scene.road.surface)
+    yield "a point lies on no patch of the road", _inside(scene.point_patches.astype(np.int64) + 1, patches + 1)
     yield "an observation names no point", _inside(point, points)
     yield "observations are not sorted by point", not (np.diff(point) < 0).any()
     yield "an observation names no image", _inside(image, images)

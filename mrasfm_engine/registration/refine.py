@@ -21,8 +21,8 @@ from mrasfm_engine.registration.calibration import (
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
+from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -120,7 +120,7 @@ def refine(
             model.readmit()
         observations, points = model.filter(model.config.mapping.filter_error_px)
         if model.config.mapping.semantic_triangulation:
-            result.road = drop_off_road(model)
+            result.road = drop_off_road(model, final=done == ROUNDS - 1)
         result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points

@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+MAX_SLOPE_CHANGE = 0.1  # of the road beyond its last patch
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show
 
 
@@ -36,20 +37,30 @@ class RoadJudgement:
     tracks: Ints
     points_m: Floats
     distance_m: Floats  # signed, to the surface; NaN where there is none
+    patch: Ints  # -1 where there is none
     limit_m: Floats  # how far from the surface a point of its uncertainty may be
     kept: Bools
 
-    def scene_road(self, colors: NDArray[np.uint8]) -> Road:
-        """For the scene; `colors` (n, 3) are the points'."""
+    @property
+    def road(self) -> Road:
+        """What the scene says of the road."""
         return Road(
             source=self.source,
             surface=self.fitted.surface,
-            before=RoadPoints(points_m=self.points_m, colors=colors, distance_m=self.distance_m, kept=self.kept),
+            roughness_m=self.fitted.roughness_m,
+            rig_height_m=self.fitted.rig_height_m,
+            before=RoadPoints(points_m=self.points_m, distance_m=self.distance_m, kept=self.kept),
         )
 
 
-def judge_road(model: Model) -> RoadJudgement | str:
-    """Fit the road's surface to the model's points and judge each that is taken for the road's; else why not."""
+def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
+    """Fit the road's surface to the model's points and judge each that is taken for the road's; else why not.
+
+    Parameters
+    ----------
+    final
+        Whether the points are for the map. Before, only those are off that are by their own uncertainty.
+    """
     config = model.config.mapping
     world_from_rig = model.state.world_from_rig[model.registered]
     source, tracks = RoadSource.MASKS, np.flatnonzero(model.solved & (model.track_class == ROAD))
@@ -73,11 +84,16 @@ def judge_road(model: Model) -> RoadJudgement | str:
     )
     if fitted is None:
         return f"{len(tracks)} points of the road are too few, or lie on no surface"
-    distance, _ = fitted.surface.locate(points)
+    distance, patch = fitted.surface.locate(points)
     limit = config.road_sigmas * np.hypot(sigma, fitted.roughness_m)
-    # What is too uncertain to be told from the road by its own sigma says nothing of it, and may be anything.
-    limit = np.minimum(limit, max(config.road_max_offset_m, config.road_sigmas * fitted.roughness_m))
+    if final:
+        # In the map, what is off the road is wrong however uncertain it is; to poses, weak rays do no harm.
+        limit = np.minimum(limit, max(config.road_max_offset_m, config.road_sigmas * fitted.roughness_m))
     off = np.abs(distance) > limit
+    # Where no patch reaches, the nearest one tells roughly: the farther away, the less.
+    alone = np.isnan(distance)
+    offset, beyond = fitted.surface.beyond(points[alone])
+    off[alone] = np.abs(offset) > limit[alone] + MAX_SLOPE_CHANGE * beyond
     if source is RoadSource.GEOMETRY:
         off &= standing_is_impossible(points, distance, world_from_rig)
     return RoadJudgement(
@@ -86,14 +102,15 @@ def judge_road(model: Model) -> RoadJudgement | str:
         tracks=tracks,
         points_m=points,
         distance_m=distance,
+        patch=patch,
         limit_m=limit,
         kept=~off,
     )
 
 
-def drop_off_road(model: Model) -> RoadJudgement | str:
+def drop_off_road(model: Model, *, final: bool = False) -> RoadJudgement | str:
     """Judge the road's points and drop those off its surface; they wait until `Model.complete` or `Model.readmit`."""
-    judgement = judge_road(model)
+    judgement = judge_road(model, final=final)
     if isinstance(judgement, RoadJudgement):
         model.drop(judgement.tracks[~judgement.kept])
     return judgement
@@ -106,7 +123,7 @@ def height_sigmas_m(model: Model, tracks: Ints, world_from_rig: Floats) -> Float
     place[tracks] = np.arange(len(tracks))
     owner = model.tracks.of_keypoint[rows]
     errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, owner)
-    # The squared length of a 2D normal error has the median 2 ln 2 sigma^2; each point has used up three of its numbers.
+    # The squared length of a 2D normal error has the median 2 ln 2 sigma^2; a point has used up three of its numbers.
     redundancy = max(0.1, 1.0 - 1.5 * len(tracks) / max(len(rows), 1))
     noise = float(np.sqrt(np.median(errors**2) / (2 * np.log(2)) / redundancy)) if len(rows) else 1.0
     r, t = cam_from_world(model.state, model.image_unit, model.image_camera)
@@ -120,7 +137,9 @@ def height_sigmas_m(model: Model, tracks: Ints, world_from_rig: Floats) -> Float
     )
     up = world_from_rig[:, :3, 2].mean(0)
     up /= np.linalg.norm(up)
-    return np.sqrt(np.einsum("nij,i,j->n", covariance, up, up).clip(0))
+    variance = np.maximum(covariance @ up @ up, 0.0)
+    result: Floats = np.sqrt(variance)
+    return result
 
 
 def _lowest_camera_m(model: Model) -> float:

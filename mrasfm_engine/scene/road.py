@@ -7,7 +7,8 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from mrasfm_engine.geometry.neighbours import nearest
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -49,22 +50,29 @@ class RoadSurface:
         if not len(self) or not len(points_m):
             return distance, patch
         xyz, centre, normal = points_m @ self.axes.T, self.centre_m @ self.axes.T, self.normal @ self.axes.T
-        reach, near = cKDTree(centre[:, :2]).query(
-            xyz[:, :2], k=min(NEIGHBOURS, len(centre)), distance_upper_bound=self.radius_m
-        )
-        reach, near = reach.reshape(len(xyz), -1), near.reshape(len(xyz), -1)
+        reach, near = nearest(centre[:, :2], xyz[:, :2], count=NEIGHBOURS, within_m=self.radius_m)
         found = np.isfinite(reach)
-        near = np.where(found, near, 0)
         # Distances to the patches' planes along their normals.
         offset = np.where(found, ((xyz[:, None] - centre[near]) * normal[near]).sum(2), np.inf)
-        level = np.take_along_axis(offset, np.abs(offset).argmin(1)[:, None], 1)
-        same = found & (np.abs(offset - np.where(found.any(1)[:, None], level, 0.0)) < SAME_LEVEL_M)
+        level = offset[np.arange(len(xyz)), np.abs(offset).argmin(1)]
+        level = np.where(np.isfinite(level), level, 0.0)
+        same = found & (np.abs(offset - level[:, None]) < SAME_LEVEL_M)
         weight = np.where(same, patch_weight(reach, self.radius_m), 0.0)
         total = weight.sum(1)
         inside = total > 0
         distance[inside] = (weight * np.where(same, offset, 0.0)).sum(1)[inside] / total[inside]
         patch[inside] = near[inside, weight[inside].argmax(1)]
         return distance, patch
+
+    def beyond(self, points_m: Floats) -> tuple[Floats, Floats]:
+        """Distances (p,) of points (p, 3) to the nearest patch's plane, and how far (p,) beyond its radius they are.
+
+        The first is along its normal, the second horizontal.
+        """
+        xyz, centre, normal = points_m @ self.axes.T, self.centre_m @ self.axes.T, self.normal @ self.axes.T
+        reach, near = nearest(centre[:, :2], xyz[:, :2])
+        offset: Floats = ((xyz - centre[near[:, 0]]) * normal[near[:, 0]]).sum(1)
+        return offset, np.maximum(reach[:, 0] - self.radius_m, 0.0)
 
 
 def patch_weight(reach_m: Floats, radius_m: float) -> Floats:
@@ -75,11 +83,27 @@ def patch_weight(reach_m: Floats, radius_m: float) -> Floats:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Thickness:
+    """How thick a layer points make about the surface, from their signed distances; nothing is left out."""
+
+    range90_m: float  # between the 5th and the 95th percentile
+    spread_m: float  # 1.4826 times the median absolute deviation: the standard deviation, were they normal
+
+    @staticmethod
+    def of(distance_m: Floats) -> Thickness:
+        """Of signed distances (n,), those that are NaN aside; NaN for none."""
+        known = distance_m[np.isfinite(distance_m)]
+        if not len(known):
+            return Thickness(range90_m=float("nan"), spread_m=float("nan"))
+        low, middle, high = np.percentile(known, [5, 50, 95])
+        return Thickness(range90_m=float(high - low), spread_m=float(1.4826 * np.median(np.abs(known - middle))))
+
+
+@dataclass(frozen=True, kw_only=True)
 class RoadPoints:
-    """Points that were taken for the road's before those off its surface were dropped."""
+    """Points that were taken for the road's, before those off its surface were dropped."""
 
     points_m: Floats  # (n, 3)
-    colors: NDArray[np.uint8]  # (n, 3)
     distance_m: Floats  # (n,) signed, to the surface; NaN where there is none
     kept: Bools  # (n,)
 
@@ -90,4 +114,16 @@ class Road:
 
     source: RoadSource
     surface: RoadSurface
+    roughness_m: float  # standard deviation of the road about the surface
+    rig_height_m: float  # of the rig's origin above the road
     before: RoadPoints
+
+    @property
+    def thickness_before(self) -> Thickness:
+        """Of all points that were taken for the road's."""
+        return Thickness.of(self.before.distance_m)
+
+    @property
+    def thickness_after(self) -> Thickness:
+        """Of those that were kept."""
+        return Thickness.of(self.before.distance_m[self.before.kept])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.road import Road
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -94,3 +95,13 @@ class Scene:
     # without georeference but with rough poses: rough_world_from_local is a pure translation (4, 4)
     rough_world_from_local: Floats | None = None
     notes: list[str] = field(default_factory=list)
+    # (p,) classes as `semantics.CLASS_CODES` numbers them, and patches of the road; unknown and -1 where not given
+    point_classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    point_patches: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    road: Road | None = None
+
+    def __post_init__(self) -> None:
+        if not len(self.point_classes):
+            self.point_classes = np.zeros(len(self.points_m), np.uint8)
+        if not len(self.point_patches):
+            self.point_patches = np.full(len(self.points_m), -1, np.int32)

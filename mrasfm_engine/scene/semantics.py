@@ -48,7 +48,7 @@ def usable_pixels(codes: Bytes) -> Bools:
 
 
 def confident_classes(codes: Bytes, margin_px: int) -> Bytes:
-    """The classes (h, w), unknown where another class is within `margin_px` (in a square): borders of masks are unsure."""
+    """The classes (h, w), unknown where another class is within `margin_px` in row or column: masks err at borders."""
     if margin_px <= 0:
         return codes
     window = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)

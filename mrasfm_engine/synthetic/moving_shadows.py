@@ -24,7 +24,7 @@ REACH_M = (-10.0, 14.0)  # where along the way a companion meets the vehicle, fr
 LATERAL_M = (-4.2, 4.2)  # of companions to the street's axis
 HEIGHT_M = (1.2, 2.8)  # of what they carry above the ground
 SPEED_SHARE = ((-0.9, -0.25), (0.2, 0.75))  # of the vehicle's speed: oncoming, and slower ones of the same direction
-PARTS = (6, 11)  # slats and plates of a load
+PARTS = (8, 13)  # slats and plates of a load, apart from one another: each is a blob on the road
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,13 +103,13 @@ def _companion(
     low = rng.uniform(*HEIGHT_M, count)
     parts = np.stack(
         [
-            rng.uniform(-1.1, 1.1, count),
-            rng.uniform(-0.8, 0.8, count),
+            rng.uniform(-2.6, 2.6, count),
+            rng.uniform(-1.5, 1.5, count),
             low,
             low + rng.uniform(0.04, 0.3, count),
             rng.uniform(0.0, np.pi, count),
-            rng.uniform(0.15, 0.6, count),
-            rng.uniform(0.08, 0.3, count),
+            rng.uniform(0.12, 0.45, count),
+            rng.uniform(0.06, 0.22, count),
         ],
         -1,
     )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.triangulation.road_surface import MIN_POINTS, horizontal_axes, most_frequent
 
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ def _beside_the_way(points_m: Floats, world_from_rig: Floats) -> tuple[Floats, F
     """
     axes = horizontal_axes(world_from_rig)
     way, xyz = world_from_rig[:, :3, 3] @ axes.T, points_m @ axes.T
-    _, unit = cKDTree(way[:, :2]).query(xyz[:, :2])
+    unit = nearest(way[:, :2], xyz[:, :2])[1][:, 0]
     local = np.einsum("nji,nj->ni", world_from_rig[unit, :3, :3], points_m - world_from_rig[unit, :3, 3])
     lateral = np.where(np.abs(local[:, 0]) <= AHEAD_M, local[:, 1], np.inf)
     return lateral, np.hypot(local[:, 0], local[:, 1]), local[:, 2]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry.height_plane import HeightPlane, fit_height_plane
+from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.scene.road import RoadSurface, patch_weight
 
 Floats = NDArray[np.float64]
@@ -73,12 +74,12 @@ def rig_height_above(points_m: Floats, world_from_rig: Floats, *, reach_m: float
     axes = horizontal_axes(world_from_rig)
     way = world_from_rig[:, :3, 3] @ axes.T
     xyz = points_m @ axes.T
-    reach, unit = cKDTree(way[:, :2]).query(xyz[:, :2], distance_upper_bound=reach_m)
-    near = np.isfinite(reach)
+    reach, unit = nearest(way[:, :2], xyz[:, :2], within_m=reach_m)
+    near = np.isfinite(reach[:, 0])
     if near.sum() < MIN_POINTS:
         return None
-    in_rig = points_m[near] - world_from_rig[unit[near], :3, 3]
-    height = -np.einsum("ni,ni->n", in_rig, world_from_rig[unit[near], :3, 2])
+    rig = world_from_rig[unit[near, 0]]
+    height = -((points_m[near] - rig[:, :3, 3]) * rig[:, :3, 2]).sum(1)
     return most_frequent(height)
 
 
@@ -226,7 +227,7 @@ def _append(patches: _Patches, xy: Floats, plane: HeightPlane) -> None:
 
 
 def _cover(xyz: Floats, spacing_m: float) -> Sequence[int]:
-    """Which of some places (n, 3), in their order, are at least the spacing from all chosen before, or on another level."""
+    """Which places (n, 3), in their order, are at least the spacing from all chosen before, or on another level."""
     chosen: list[int] = []
     for n in range(len(xyz)):
         away = xyz[chosen] - xyz[n]
@@ -239,7 +240,7 @@ def _spread(
     points: _Points, patches: _Patches, radius_m: float, *, roughness_m: float, rng: np.random.Generator
 ) -> None:
     """Patches over points that none reaches yet, each next to one that is known: ahead of the way, in side streets."""
-    reach = cKDTree(np.stack(patches.centre)).query(points.xy)[0]
+    reach = nearest(np.stack(patches.centre), points.xy)[0][:, 0]
     tried = np.zeros(len(reach), dtype=np.bool_)
     while True:
         open_points = np.flatnonzero(~tried & (reach >= SPACING * radius_m) & (reach < 1.5 * radius_m))
