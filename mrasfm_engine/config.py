@@ -28,6 +28,7 @@ class FeatureConfig(_Section):
     min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's keypoints; the usual if not given
     max_keypoints: Count = 2048  # a image, strongest first; 1024 costs accuracy
     contrast_threshold: Positive = 0.02  # half of SIFT's usual value, so that asphalt and shade yield keypoints too
+    class_margin_px: Annotated[int, Field(ge=0)] = 2  # keypoints nearer to the border of a class in the mask have none
     max_side_px: Count = 1600  # larger images are extracted at reduced size; coordinates stay those of the full image
 
 
@@ -52,6 +53,7 @@ class MatchConfig(_Section):
     min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's matches; the usual if not given
     ratio: Share = 0.8  # nearest: of the distances to the best and second best descriptor
     min_matches: Count = 15  # pairs with fewer matches or inliers are dropped
+    same_class: bool = True  # drop matches whose ends lie on different classes of the masks
     max_error_px: Positive = 2.0  # epipolar distance of an inlier
     calibration_error_px: Positive = 8.0  # the same between cameras of one unit, where calibration gives the geometry
 
@@ -68,6 +70,10 @@ class MappingConfig(_Section):
     min_pnp_inlier_ratio: Share = 0.2
     local_units: Count = 6  # units that vary in local adjustment
     local_every: Count = 2  # registered units between local adjustments
+    semantic_triangulation: bool = True  # points of the road that are off its surface are dropped
+    road_patch_m: Positive = 8.0  # radius of a plane patch of the road's surface
+    road_sigmas: Positive = 3.0  # how far from the surface a point of the road may be, in its own uncertainty
+    road_max_offset_m: Positive = 0.05  # farther ones are dropped however uncertain they are, except on rough roads
     global_growth: Positive = 0.4  # global adjustment when this fraction of units was registered since the last
 
 

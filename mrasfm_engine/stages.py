@@ -35,13 +35,14 @@ from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.views.birds_eye import birds_eye
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
-FEATURE_ARRAYS = ("xy_px", "descriptors", "colors")
+FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 STATE_ARRAYS = (
     "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
     "shot_rotation", "shot_position_m",
@@ -153,6 +154,7 @@ def features(run: Run) -> list[ImageFeatures]:
             run.plugins.extractor,
             threads=run.config.threads,
             segmenter=run.plugins.segmenter,
+            class_margin_px=run.config.features.class_margin_px,
             progress=run.step("features"),
             cancel=run.cancel,
         )
@@ -163,7 +165,13 @@ def features(run: Run) -> list[ImageFeatures]:
             arrays["scores"] = _joined(found, "scores")
         return (
             arrays,
-            {"images": len(found), "keypoints": int(counts.sum()), "images_with_under_100_keypoints": poor},
+            {
+                "images": len(found),
+                "keypoints": int(counts.sum()),
+                "keypoints_by_class": count_classes([f.classes for f in found]),
+                "images_with_mask": sum(image.mask is not None for image in run.drive.images),
+                "images_with_under_100_keypoints": poor,
+            },
         )
 
     arrays, _ = run.stage("features", run.feature_settings, work)
@@ -208,6 +216,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             "candidate_pairs": len(pairs),
             "verified_pairs": len(result.pairs),
             "rejected_pairs": {"few matches": result.few_matches, "few inliers": result.few_inliers},
+            "dropped_between_classes": result.across_classes,
             "matches": sum(len(p.matches) for p in result.pairs),
             "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),
         }

@@ -41,6 +41,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add("--ramp", float, "slope of a hill on the way, percent", to="ramp_percent", metavar="PERCENT")
     add("--parked-cars", int, "parked cars along each drive")
     add("--moving-cars", int, "other vehicles that drive")
+    add("--moving-shadows", int, "things out of view whose shadows move over the road, beside the vehicle's own")
     add("--shadows", float, "how dark shadows are, 0 to 1", to="shadow_strength", metavar="STRENGTH")
 
     add("--width", int, "of the images, pixels")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Protocol
 
 import cv2
@@ -17,7 +18,7 @@ from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.scene.semantics import usable_pixels
+from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
 from schemas import LabelMap
 
 DESCRIPTOR_SCALE = 512.0  # COLMAP stores unit-length descriptors times 512 in bytes
@@ -103,13 +104,15 @@ def extract_features(
     *,
     threads: int,
     segmenter: Segmenter | None = None,
+    class_margin_px: int = 2,
     progress: Callable[[int, int], None] | None = None,
     cancel: Callable[[], bool] | None = None,
 ) -> list[ImageFeatures]:
     """Features of every image of the drive, in the order of `drive.images`.
 
-    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car. Images without
-    one get theirs from `segmenter`, if there is one.
+    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
+    have the class of what they show; within `class_margin_px` of another class they are unknown. Images without a mask
+    get theirs from `segmenter`, if there is one.
 
     Raises
     ------
@@ -131,12 +134,22 @@ def extract_features(
                 f"{camera.width}x{camera.height}",
                 remedy="Give the calibration of images of this size, or images of the calibration's size.",
             )
-        usable = None
         if image.mask is not None:
-            usable = usable_pixels(read_mask(drive.root / image.mask, drive.manifest.label_map), label_map)
+            mask = read_mask(drive.root / image.mask, drive.manifest.label_map)
+            if mask.shape != rgb.shape[:2]:
+                raise InputError(
+                    f"mask {image.mask} has {mask.shape[1]}x{mask.shape[0]} pixels, its image has "
+                    f"{rgb.shape[1]}x{rgb.shape[0]}",
+                    remedy="Give masks of their images' size, without interpolating between ids.",
+                    code="mask-size",
+                )
         elif segmenter is not None:
-            usable = usable_pixels(segmenter.segment(rgb), label_map)
-        return extractor.extract(rgb, usable)
+            mask = segmenter.segment(rgb)
+        else:
+            return extractor.extract(rgb, None)
+        codes = class_codes(mask, label_map)
+        found = extractor.extract(rgb, usable_pixels(codes))
+        return replace(found, classes=classes_at(confident_classes(codes, class_margin_px), found.xy_px))
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()
     result: list[ImageFeatures] = []

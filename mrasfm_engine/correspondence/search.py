@@ -18,6 +18,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.scene.semantics import may_match
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -32,6 +33,7 @@ class SearchResult:
     pairs: list[PairMatches]
     few_matches: int  # pairs with too few matches
     few_inliers: int  # pairs whose matches fit no geometry
+    across_classes: int = 0  # matches that were dropped because their ends are of different semantic classes
 
 
 def match_pairs(
@@ -48,7 +50,8 @@ def match_pairs(
     """Match and verify image pairs (n, 2).
 
     Between units an essential matrix must explain the matches. Between cameras of one unit the calibration gives the
-    geometry, up to its error: matches far from its epipolar lines or behind a camera are out as well.
+    geometry, up to its error: matches far from its epipolar lines or behind a camera are out as well. Matches between
+    different semantic classes are dropped before either.
     """
     cameras = [drive.cameras[i.camera] for i in drive.images]
     prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
@@ -58,12 +61,17 @@ def match_pairs(
         for i, f in zip(drive.images, features, strict=True)
     ]
     focal = params[:, :2].mean(1)
+    across_classes = np.zeros(len(pairs), dtype=np.int64)
 
-    def one(pair: Ints) -> PairMatches | str:
+    def one(index: int, pair: Ints) -> PairMatches | str:
         if cancel is not None and cancel():
             raise CancelledError
         a, b = int(pair[0]), int(pair[1])
         matches = matcher.match(prepared[a], prepared[b])
+        if config.same_class:
+            fits = may_match(features[a].classes[matches[:, 0]], features[b].classes[matches[:, 1]])
+            across_classes[index] = len(fits) - int(fits.sum())
+            matches = matches[fits]
         if len(matches) < config.min_matches:
             return "few matches"
         ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
@@ -83,7 +91,7 @@ def match_pairs(
     lost = {"few matches": 0, "few inliers": 0}
     # Every thread multiplies matrices on its own core.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(one, pair) for pair in pairs]
+        futures = [pool.submit(one, index, pair) for index, pair in enumerate(pairs)]
         try:
             for done, future in enumerate(futures, 1):
                 result = future.result()
@@ -96,4 +104,9 @@ def match_pairs(
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
-    return SearchResult(pairs=found, few_matches=lost["few matches"], few_inliers=lost["few inliers"])
+    return SearchResult(
+        pairs=found,
+        few_matches=lost["few matches"],
+        few_inliers=lost["few inliers"],
+        across_classes=int(across_classes.sum()),
+    )

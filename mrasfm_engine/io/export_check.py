@@ -94,7 +94,7 @@ def check_documents(scene: Scene, folder: Path) -> None:
 
 
 def check_ply(scene: Scene, path: Path) -> None:
-    """Check vertex count, coordinates and colours."""
+    """Check vertex count, coordinates, colours, classes and patches of the road."""
     types = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
     with checking(path):
         head, _, body = path.read_bytes().partition(b"end_header\n")
@@ -106,7 +106,29 @@ def check_ply(scene: Scene, path: Path) -> None:
         require_close(xyz, scene.points_m, path=path, what="a point", tolerance=1e-3)
         colors = np.stack([rows[name] for name in ("red", "green", "blue")], -1)
         require(np.array_equal(colors, scene.point_colors), path, "a colour is not what the scene says")
+        require(np.array_equal(rows["class"], scene.point_classes), path, "a class is not what the scene says")
+        require(np.array_equal(rows["road_patch"], scene.point_patches), path, "a patch is not what the scene says")
         require(int(rows["track_length"].sum()) == len(scene.observation_point), path, "track lengths do not add up")
+
+
+def check_road(scene: Scene, path: Path) -> None:
+    """Check the patches of the road, and that points said to be on one are near its plane."""
+    assert scene.road is not None
+    with checking(path):
+        document = _read_json(path)
+        centre, normal = (
+            np.array([patch[key] for patch in document["patches"]], dtype=np.float64).reshape(-1, 3)
+            for key in ("centre_m", "normal")
+        )
+        surface = scene.road.surface
+        require_close(centre, surface.centre_m, path=path, what="a patch's centre", tolerance=1e-9)
+        require_close(normal, surface.normal, path=path, what="a patch's normal", tolerance=1e-9)
+        require_close(np.linalg.norm(normal, axis=1), np.ones(len(normal)), path=path, what="a normal", tolerance=1e-9)
+        counts = np.array([patch["points"] for patch in document["patches"]])
+        require(counts.sum() == (scene.point_patches >= 0).sum(), path, "points of patches do not add up")
+        on_road = np.flatnonzero(scene.point_patches >= 0)
+        away = np.linalg.norm(scene.points_m[on_road] - centre[scene.point_patches[on_road]], axis=1)
+        require(bool((away < 2 * document["patch_radius_m"]).all()), path, "a point is far from its patch")
 
 
 def check_features(scene: Scene, path: Path) -> None:

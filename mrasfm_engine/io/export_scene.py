@@ -1,8 +1,8 @@
 """Writes a scene's files, checks them, and puts them in place.
 
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
-`poses.json`, `calibration.json`, `frame.json`, `features.db`, `pictures/` where any were drawn, and `report.json`. One
-with a `report.json` is complete.
+`poses.json`, `calibration.json`, `frame.json`, `features.db`, `pictures/` where any were drawn, `road.json` where the
+road was found, and `report.json`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from mrasfm_engine.io import (
     export_pictures,
     export_ply,
     export_poses,
+    export_road,
     feature_database,
+    road_pictures,
 )
 from mrasfm_engine.scene.scene import Scene
 
@@ -39,6 +41,7 @@ COMPLETE_MARK = "report.json"
 PICTURES = "pictures"
 NO_PICTURES: Mapping[str, export_pictures.Picture] = MappingProxyType({})
 LEFTOVER_AGE_S = 3600.0
+ROAD_FILE = "road.json"
 
 
 def write_scene(
@@ -117,6 +120,10 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
     export_check.check_ply(scene, work / "points.ply")
     feature_database.write_features(scene, work / "features.db")
     export_check.check_features(scene, work / "features.db")
+    if scene.road is not None:
+        _write_json(work / ROAD_FILE, export_road.road_document(scene))
+        export_check.check_road(scene, work / ROAD_FILE)
+        road_pictures.write_pictures(scene, work / PICTURES)
     (work / "poses.tum").write_text(export_poses.poses_text(scene), encoding="utf-8")
     _write_json(work / "poses.json", export_poses.poses_document(scene))
     _write_json(work / "calibration.json", export_calibration.calibration_document(scene))
@@ -173,9 +180,12 @@ def _put_in_place(work: Path, out: Path) -> None:
         work.rename(out)
         return
     (out / COMPLETE_MARK).unlink(missing_ok=True)
+    # An older scene's that this one does not have: it would be taken for this scene's.
+    if not (work / ROAD_FILE).exists():
+        (out / ROAD_FILE).unlink(missing_ok=True)
     items = sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK)
     if (out / PICTURES).is_dir() and not (work / PICTURES).exists():
-        (out / PICTURES).rename(work / f"old-{PICTURES}")  # they would show another scene
+        (out / PICTURES).rename(work / f"old-{PICTURES}")
     for item in items:
         target = out / item.name
         if item.is_dir() and target.is_dir():
@@ -204,6 +214,8 @@ def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
         (scene.image_registered.shape, (images,)),
         (scene.point_colors.shape, (points, 3)),
         (scene.point_error_px.shape, (points,)),
+        (scene.point_classes.shape, (points,)),
+        (scene.point_patches.shape, (points,)),
         (len(scene.calibration), len(scene.drive.cameras)),
     ]
     unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)
@@ -214,6 +226,8 @@ def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
     yield "a registered unit's pose is not finite", _finite(scene.world_from_rig[scene.unit_registered])
     yield "an image is registered without its unit", not (scene.image_registered & ~scene.unit_registered[unit]).any()
     yield "a point is not finite", _finite(scene.points_m) and _finite(scene.point_error_px)
+    patches = 0 if scene.road is None else len(scene.road.surface)
+    yield "a point lies on no patch of the road", _inside(scene.point_patches.astype(np.int64) + 1, patches + 1)
     yield "an observation names no point", _inside(point, points)
     yield "observations are not sorted by point", not (np.diff(point) < 0).any()
     yield "an observation names no image", _inside(image, images)

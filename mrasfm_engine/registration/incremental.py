@@ -22,6 +22,7 @@ from mrasfm_engine.registration.initialise import Initialisation, initialise
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.moving_along import find_moving_along, units_to_doubt, without_keypoints
+from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.single_images import register_images_singly, retry_missing, take_over
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
@@ -45,6 +46,7 @@ class MappingLog:
     calibration_free: bool = False  # whether global adjustments vary rig_from_cam
     local_adjustments: int = 0
     global_adjustments: list[Report] = field(default_factory=list)
+    roads: list[RoadJudgement | str] = field(default_factory=list)  # after each of them; why there is none
     revisits_tried: int = 0  # pairs of units across a gap that were compared
     revisits: list[tuple[int, int]] = field(default_factory=list)  # those that were believed
     loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
@@ -240,3 +242,5 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
             scale_with_baselines(model, scale_of_baselines(model)[0])
         model.complete()
         model.filter(error_px)
+        if model.config.mapping.semantic_triangulation:
+            log.roads.append(drop_off_road(model))

@@ -13,7 +13,9 @@ from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES
 from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
+from mrasfm_engine.registration.road import RoadJudgement
 from mrasfm_engine.registration.wrong_camera import often_voted_out
+from mrasfm_engine.scene.road import RoadSource
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
@@ -52,6 +54,7 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         },
         "local_adjustments": log.local_adjustments,
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
+        "road_points_dropped": [0 if isinstance(j, str) else int((~j.kept).sum()) for j in log.roads],
     }
 
 
@@ -90,6 +93,7 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
             **_directions(model, refinement),
         },
         "georeferenced": refinement.georeferenced,
+        "road": _road(refinement.road),
     }
     if certainty is not None and np.isfinite(certainty.sigma_scale):
         result["scale"] = {
@@ -139,6 +143,33 @@ def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
             for w in refinement.wrong_cameras
         ],
     }
+
+
+def _road(judged: RoadJudgement | str) -> dict[str, Any]:
+    """Thicknesses are of all points that were taken for the road's, and of those that were kept: none else left out."""
+    if isinstance(judged, str):
+        return {"source": None, "reason": judged}
+    road, kept = judged.road, judged.kept
+    result = {
+        "source": str(road.source),
+        "patches": len(road.surface),
+        "points": len(kept),
+        "kept": int(kept.sum()),
+        "dropped": int((~kept).sum()),
+        "kept_where_no_surface_is": int((kept & np.isnan(judged.distance_m)).sum()),
+        "roughness_m": road.roughness_m,
+        "rig_height_above_road_m": road.rig_height_m,
+    }
+    for when, thickness in (("before", road.thickness_before), ("after", road.thickness_after)):
+        if np.isfinite(thickness.range90_m):
+            result[f"thickness_{when}_m"] = thickness.range90_m
+            result[f"spread_{when}_m"] = thickness.spread_m
+    if road.source is RoadSource.GEOMETRY:
+        result["confidence"] = (
+            "low: no mask says what is road. Points near the road's level in the vehicle's own lane were judged, and "
+            "dropped only where nothing can stand: below the road, or above it where the vehicle drove"
+        )
+    return result
 
 
 def _poorly_seen(model: Model) -> list[str]:

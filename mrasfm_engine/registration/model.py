@@ -45,6 +45,10 @@ class Model:
         (images,) images without a pose although their unit has one: only where images are registered one by one.
     motion
         Where the rig is at the images' own times, and poses that images have apart from it.
+    barred
+        (tracks,) which tracks were dropped for what they show: they get no point until all are tried again.
+    track_class
+        (tracks,) the class of most keypoints of a track, as `semantics.CLASS_CODES` numbers them.
     """
 
     def __init__(self, drive: Drive, keypoints: Keypoints, tracks: Tracks, config: EngineConfig) -> None:
@@ -63,6 +67,8 @@ class Model:
         self.solved = np.zeros(len(tracks), dtype=np.bool_)
         self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.missing = np.zeros(len(drive.images), dtype=np.bool_)
+        self.barred = np.zeros(len(tracks), dtype=np.bool_)
+        self.track_class = tracks.classes(keypoints.classes)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
         shots = Shots.of(drive, compensate=config.mapping.motion_compensation)
@@ -171,7 +177,8 @@ class Model:
         fits = errors < self.triangulator.max_error_px
         self.kept[rows[has_point]] = fits
         # Also points that the new view contradicts: with it, another hypothesis may win.
-        self.triangulate(np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]])))
+        again = np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]]))
+        self.triangulate(again[~self.barred[again]])
 
     def complete(self) -> None:
         """Let every point have the observations that now fit it, and try again for tracks without a point."""
@@ -182,8 +189,22 @@ class Model:
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, of_keypoint[rows])
         self.kept[:] = False
         self.kept[rows] = errors < self.triangulator.max_error_px
+        self.barred[:] = False
         self.triangulate(np.flatnonzero(~self.solved))
         self.filter(self.triangulator.max_error_px)
+
+    def drop(self, tracks: Ints) -> None:
+        """Take the points of tracks away and bar them until `complete` or `readmit`."""
+        self.solved[tracks] = False
+        self.barred[tracks] = True
+        rows = np.flatnonzero(self.kept)
+        self.kept[rows[self.barred[self.tracks.of_keypoint[rows]]]] = False
+
+    def readmit(self) -> None:
+        """Triangulate barred tracks again: poses have changed since."""
+        tracks = np.flatnonzero(self.barred)
+        self.barred[:] = False
+        self.triangulate(tracks)
 
     def filter(self, max_error_px: float) -> tuple[int, int]:
         """Drop observations with larger errors, and points left with fewer than two or without an angle.

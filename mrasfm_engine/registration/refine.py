@@ -23,6 +23,7 @@ from mrasfm_engine.registration.calibration import (
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
+from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.wrong_camera import WrongCamera, find_wrong_cameras
 
 Floats = NDArray[np.float64]
@@ -53,6 +54,7 @@ class Refinement:
     directions: Observability | None = None  # of the cameras' poses; None where it is not known
     held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
     wrong_cameras: list[WrongCamera] = field(default_factory=list)
+    road: RoadJudgement | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
     def georeferenced(self) -> bool:
@@ -124,7 +126,11 @@ def refine(
                 break
         if done < ROUNDS - 1:
             model.complete()
+        else:
+            model.readmit()
         observations, points = model.filter(model.config.mapping.filter_error_px)
+        if model.config.mapping.semantic_triangulation:
+            result.road = drop_off_road(model, final=done == ROUNDS - 1)
         result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points

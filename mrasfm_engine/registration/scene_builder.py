@@ -13,7 +13,9 @@ from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.registration.calibration import calibration_prior
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
+from mrasfm_engine.registration.road import RoadJudgement
 from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.semantics import majority_class
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +44,10 @@ def build_scene(
     if refinement.certainty is not None:
         sigma = refinement.certainty.sigma_unit_position_m
     georeferenced = refinement.georeferenced
+    patches, judged = np.full(len(model.tracks), -1, dtype=np.int32), refinement.road
+    if isinstance(judged, RoadJudgement):
+        on_surface = judged.kept & (np.abs(judged.distance_m) <= judged.limit_m)
+        patches[judged.tracks[on_surface]] = judged.patch[on_surface]
     return Scene(
         drive=model.drive,
         unit_registered=model.registered.copy(),
@@ -62,6 +68,9 @@ def build_scene(
         rough_world_from_local=None if georeferenced else prior.rough_world_from_local,
         notes=list(notes),
         unit_from_image=None if model.state.simultaneous else model.motion.unit_from_image(model.state),
+        point_classes=majority_class(model.keypoints.classes[rows], point.astype(np.int64), len(tracks)),
+        point_patches=patches[tracks],
+        road=judged.road if isinstance(judged, RoadJudgement) else None,
     )
 
 

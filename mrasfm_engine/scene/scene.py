@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.road import Road
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,6 +26,12 @@ class ImageFeatures:
     descriptors: NDArray[np.uint8] | NDArray[np.float32]
     colors: NDArray[np.uint8]  # (n, 3) red, green, blue at the keypoint
     scores: NDArray[np.float32] | None = None  # (n,) a trained network's confidence
+    # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
+    classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    def __post_init__(self) -> None:
+        if not len(self.classes):
+            object.__setattr__(self, "classes", np.zeros(len(self.xy_px), np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +112,16 @@ class Scene:
     notes: list[str] = field(default_factory=list)
     # where the rig was at every image's own timestamp, relative to its unit's pose (images, 4, 4); None: at its unit's
     unit_from_image: Floats | None = None
+    # (p,) classes as `semantics.CLASS_CODES` numbers them, and patches of the road; unknown and -1 where not given
+    point_classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    point_patches: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    road: Road | None = None
+
+    def __post_init__(self) -> None:
+        if not len(self.point_classes):
+            self.point_classes = np.zeros(len(self.points_m), np.uint8)
+        if not len(self.point_patches):
+            self.point_patches = np.full(len(self.points_m), -1, np.int32)
 
     @property
     def world_from_cam(self) -> Floats:

@@ -1,20 +1,94 @@
-"""What the ids of a semantic mask mean."""
+"""What the ids of a semantic mask mean, and the classes of keypoints and points as small integers."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas import LabelMap, SemanticClass
 
+Bytes = NDArray[np.uint8]
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
 # Keypoints on these show something that moves, is infinitely far away, or comes along with the camera.
 WITHOUT_KEYPOINTS = (SemanticClass.DYNAMIC, SemanticClass.SKY, SemanticClass.OWN_CAR)
 
+UNKNOWN = 0  # no mask, or too near to the border of a class to be sure
+# Written into files: a number is never given to another class.
+CLASS_CODES = {
+    SemanticClass.STATIC: 1,
+    SemanticClass.ROAD: 2,
+    SemanticClass.DYNAMIC: 3,
+    SemanticClass.SKY: 4,
+    SemanticClass.OWN_CAR: 5,
+}
+CLASS_NAMES = {UNKNOWN: "unknown"} | {code: str(meaning) for meaning, code in CLASS_CODES.items()}
+ROAD = CLASS_CODES[SemanticClass.ROAD]
 
-def usable_pixels(mask: NDArray[np.uint8], label_map: LabelMap) -> NDArray[np.bool_]:
-    """Where keypoints may be taken in an image with this mask (h, w)."""
-    table = np.ones(256, dtype=np.bool_)
+
+def class_codes(mask: Bytes, label_map: LabelMap) -> Bytes:
+    """The classes of a mask's pixels (h, w) as `CLASS_CODES` numbers them."""
+    table = np.full(256, UNKNOWN, dtype=np.uint8)
     for label, meaning in label_map.ids.items():
-        table[label] = meaning not in WITHOUT_KEYPOINTS
-    result: NDArray[np.bool_] = table[mask]
+        table[label] = CLASS_CODES[meaning]
+    result: Bytes = table[mask]
+    return result
+
+
+def usable_pixels(codes: Bytes) -> Bools:
+    """Where keypoints may be taken in an image with these classes (h, w)."""
+    table = np.ones(256, dtype=np.bool_)
+    table[[CLASS_CODES[meaning] for meaning in WITHOUT_KEYPOINTS]] = False
+    result: Bools = table[codes]
+    return result
+
+
+def confident_classes(codes: Bytes, margin_px: int) -> Bytes:
+    """The classes (h, w), unknown where another class is within `margin_px` in row or column: masks err at borders."""
+    if margin_px <= 0:
+        return codes
+    window = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
+    # Beyond the image's edge nothing contradicts, so that the border is replicated, not filled.
+    low = cv2.erode(codes, window, borderType=cv2.BORDER_REPLICATE)
+    high = cv2.dilate(codes, window, borderType=cv2.BORDER_REPLICATE)
+    return np.where(low == high, codes, np.uint8(UNKNOWN))
+
+
+def classes_at(codes: Bytes, xy_px: NDArray[np.floating]) -> Bytes:
+    """The classes (n,) at keypoints (n, 2) whose top left pixel's centre is at (0.5, 0.5)."""
+    height, width = codes.shape
+    column = np.clip(xy_px[:, 0].astype(np.int64), 0, width - 1)
+    row = np.clip(xy_px[:, 1].astype(np.int64), 0, height - 1)
+    result: Bytes = codes[row, column]
+    return result
+
+
+def may_match(a: Bytes, b: Bytes) -> Bools:
+    """Which pairs (n,) of keypoints can show one thing by their classes; what is unknown can be anything."""
+    result: Bools = (a == b) | (a == UNKNOWN) | (b == UNKNOWN)
+    return result
+
+
+def count_classes(classes: Sequence[Bytes]) -> dict[str, int]:
+    """How many of all keypoints have each class, by its name; classes that none has are left out."""
+    counts = np.bincount(np.concatenate([np.zeros(0, np.uint8), *classes]), minlength=len(CLASS_NAMES))
+    return {CLASS_NAMES[code]: int(n) for code, n in enumerate(counts) if n}
+
+
+def majority_class(classes: Bytes, owner: NDArray[np.int64], count: int) -> Bytes:
+    """The class (count,) of most observations of every owner; unknown ones have no vote, ties go to the smaller code.
+
+    Parameters
+    ----------
+    classes, owner
+        The class of every observation (n,), and the point or track (n,) in [0, count) that it is of.
+    """
+    codes = max(CLASS_NAMES) + 1
+    votes = np.bincount(owner * codes + classes, minlength=count * codes).reshape(count, codes)
+    votes[:, UNKNOWN] = 0
+    result: Bytes = np.where(votes.any(1), votes.argmax(1), UNKNOWN).astype(np.uint8)
     return result

@@ -22,12 +22,14 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.synthetic import gnss
 from mrasfm_engine.synthetic.calibration import given_cameras
-from mrasfm_engine.synthetic.light import daylight
+from mrasfm_engine.synthetic.light import along_street, daylight
 from mrasfm_engine.synthetic.motion import Motion, drive_motion
+from mrasfm_engine.synthetic.moving_shadows import street_heading
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
 from mrasfm_engine.synthetic.render import Lens, View, develop, render
 from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
 from mrasfm_engine.synthetic.scene_in_time import SceneInTime, build_scene
+from mrasfm_engine.synthetic.streets import GROUND_GRID_M, Ground
 from mrasfm_engine.synthetic.world import StaticWorld, build_world
 from schemas import DriveManifest, Frame, FrameImage, LabelMap, Rig, RoughPose, RoughTrajectory
 
@@ -144,13 +146,17 @@ def _render_drive(
     folder: Path,
     report: Callable[[int], None],
 ) -> None:
-    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(6)]
+    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(7)]
     motion = drive_motion(options, world.layout, drive, rng[0])
     start_us = FIRST_EPOCH_US + drive * _BETWEEN_DRIVES_US
     unit_s = np.arange(options.units) / RATE_HZ
     unit_us = start_us + np.round(unit_s * 1e6).astype(np.int64)
     shots = _plan(options, motion, rig, unit_us, start_us, rng[1])
-    scene = build_scene(options, world, drive=drive, own=motion, rig=rig, light=daylight(rng[2]), rng=rng[3])
+    light = daylight(rng[2])
+    if options.moving_shadows:
+        # In the shade of houses nothing casts a shadow: the sun stands along the street.
+        light = along_street(light, street_heading(motion, options))
+    scene = build_scene(options, world, drive=drive, own=motion, rig=rig, light=light, rng=rng[3], shadow_rng=rng[6])
     world_from_rig = motion.world_from_rig(unit_s)
     manifest = DriveManifest(
         name=f"synthetic {options.world} {drive}, seed {options.seed}",
@@ -166,7 +172,7 @@ def _render_drive(
         if options.masks:
             (folder / "masks" / camera.name).mkdir(parents=True)
     (folder / "drive.json").write_text(manifest.model_dump_json(exclude_none=True, indent=1) + "\n")
-    _write_truth(folder, options, rig, shots, world_from_rig, unit_us)
+    _write_truth(folder, options, rig, shots, world_from_rig, unit_us, world.layout.ground)
     with ThreadPoolExecutor(_WORKERS) as pool:
         tasks = [
             pool.submit(
@@ -256,6 +262,7 @@ def _write_truth(
     shots: list[Shot],
     world_from_rig: Floats,
     unit_us: NDArray[np.int64],
+    ground: Ground,
 ) -> None:
     """Write what the engine never reads."""
     lines = []
@@ -275,7 +282,16 @@ def _write_truth(
         for shot in shots
     }
     (folder / "truth_cameras.json").write_text(json.dumps(images, indent=1) + "\n")
-    origin = {"enu_origin": asdict(gnss.Origin()), "options": asdict(options)}
+    origin = {
+        "enu_origin": asdict(gnss.Origin()),
+        "options": asdict(options),
+        "ground": {
+            "direction": ground.direction.tolist(),
+            "first_m": ground.first_m,
+            "step_m": GROUND_GRID_M,
+            "heights_m": ground.nodes_m.tolist(),
+        },
+    }
     (folder / "truth_world.json").write_text(json.dumps(origin, indent=1) + "\n")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,16 @@ def daylight(rng: np.random.Generator) -> Light:
         cloudiness=float(rng.uniform(0.3, 0.8)),
         gain=1.2 * float(np.exp(rng.normal(0.0, 0.07))),
     )
+
+
+def along_street(light: Light, heading_rad: float) -> Light:
+    """The same light with the sun within 15 degrees of the street's direction, ahead or behind as it was before."""
+    azimuth = float(np.arctan2(light.to_sun[1], light.to_sun[0])) - heading_rad
+    behind = np.cos(azimuth) < 0
+    off = np.radians(15.0) * np.sin(azimuth)
+    turned = heading_rad + (np.pi - off if behind else off)
+    level = float(np.hypot(light.to_sun[0], light.to_sun[1]))
+    return replace(light, to_sun=np.array([level * np.cos(turned), level * np.sin(turned), light.to_sun[2]]))
 
 
 def cast_shadows(mesh: Mesh, atlas: Atlas, to_sun: Floats) -> ShadowMap:

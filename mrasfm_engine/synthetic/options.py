@@ -45,6 +45,7 @@ class SynthOptions:
     ramp_percent: float = 0.0  # slope of a hill that begins 10 m into the first drive
     parked_cars: int = 8
     moving_cars: int = 3
+    moving_shadows: int = 0  # things out of view whose shadows travel along the road, beside the vehicle's own
     shadow_strength: float = 1.0  # 0: no shadows, 1: as dark as they are
 
     width: int = 960
@@ -98,6 +99,7 @@ class SynthOptions:
         for name in [
             "parked_cars",
             "moving_cars",
+            "moving_shadows",
             "exposure_jitter",
             "noise",
             "blur_px",

@@ -14,6 +14,7 @@ from mrasfm_engine.synthetic.light import Light, ShadowMap, cast_shadows
 from mrasfm_engine.synthetic.materials import Materials
 from mrasfm_engine.synthetic.mesh import Mesh, concatenate
 from mrasfm_engine.synthetic.motion import Motion, traffic
+from mrasfm_engine.synthetic.moving_shadows import ShadowCaster, moving_shadows
 from mrasfm_engine.synthetic.occluder import place_truck
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
 from mrasfm_engine.synthetic.rigs import TrueCamera
@@ -56,12 +57,14 @@ class SceneInTime:
     static: Mesh
     movers: list[Mover]
     everything: Mesh  # static, then the movers in their own frames
+    casters: list[ShadowCaster]  # that move and are not drawn
 
     def at(self, time_s: float) -> tuple[Mesh, Floats]:
         """The mesh at an instant, and the moving casters (k, 8) of shadows."""
+        boxes = [np.zeros((0, 8)), *(caster.boxes(time_s) for caster in self.casters)]
         if not self.movers:
-            return self.static, np.zeros((0, 8))
-        parts, boxes = [], []
+            return self.static, np.concatenate(boxes)
+        parts = []
         for mover in self.movers:
             pose = mover.pose(time_s)
             if pose is None:
@@ -74,7 +77,7 @@ class SceneInTime:
             name: np.concatenate([getattr(self.static, name), *(getattr(part, name) for part in parts)])
             for name in ("origin", "u", "v", "normal")
         }
-        return replace(self.everything, **geometry), np.concatenate([np.zeros((0, 8)), *boxes])
+        return replace(self.everything, **geometry), np.concatenate(boxes)
 
 
 def parked_cars(
@@ -130,8 +133,9 @@ def build_scene(
     rig: list[TrueCamera],
     light: Light,
     rng: np.random.Generator,
+    shadow_rng: np.random.Generator,
 ) -> SceneInTime:
-    """The world with one drive's parked cars, traffic and light."""
+    """The world with one drive's parked cars, traffic, moving shadows and light."""
     parked = parked_cars(options, world, drive, rng)
     movers = [
         Mover(
@@ -167,4 +171,5 @@ def build_scene(
         static=static,
         movers=movers,
         everything=concatenate([static, *(mover.mesh for mover in movers)]) if movers else static,
+        casters=moving_shadows(options, world.layout, drive, own, shadow_rng),
     )

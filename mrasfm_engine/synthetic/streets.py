@@ -19,7 +19,7 @@ LANE_M = 1.65  # centre of the right lane, to the right of the street's axis
 TURN_AFTER_M, TURN_WAY_M = 4.0, 30.0  # of a street that turns; its radius is 9.5 m in the middle of it
 MARGIN_M = 75.0  # street before and after a drive
 _STEP_M = 0.25
-_HILL_GRID_M = 4.0
+GROUND_GRID_M = 4.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Ground:
     def height(self, xy: ArrayLike) -> Floats:
         """Heights (...) of points (..., 2)."""
         q = np.asarray(xy, dtype=np.float64) @ self.direction
-        at = self.first_m + np.arange(len(self.nodes_m)) * _HILL_GRID_M
+        at = self.first_m + np.arange(len(self.nodes_m)) * GROUND_GRID_M
         result: Floats = np.interp(q, at, self.nodes_m)
         return result
 
@@ -162,7 +162,7 @@ def _hill(heading: float, percent: float, length_m: float) -> Ground:
     direction = np.array([np.cos(heading), np.sin(heading)])
     if percent == 0:
         return Ground(direction, np.zeros(2), 0.0)
-    q = np.arange(-400.0, 800.0, _HILL_GRID_M)
+    q = np.arange(-400.0, 800.0, GROUND_GRID_M)
     # Flat, up from 10 m on for 60 % of the way, flat; slopes change over 12 m.
     begin, end = 10.0, 10.0 + max(20.0, 0.6 * length_m)
     fine = np.arange(-400.0, 804.0, 0.5)

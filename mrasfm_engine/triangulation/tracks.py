@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.scene.semantics import majority_class
 from mrasfm_engine.scene.shots import Shots
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +32,12 @@ class Keypoints:
     shot: Ints  # (n,) index into the drive's shots, see `scene.shots`
     xy_px: Floats  # (n, 2)
     rays: Floats  # (n, 3) unit viewing rays in camera axes under the given intrinsics
+    # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
+    classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    def __post_init__(self) -> None:
+        if not len(self.classes):
+            object.__setattr__(self, "classes", np.zeros(len(self.image), np.uint8))
 
     @staticmethod
     def of(drive: Drive, features: Sequence[ImageFeatures], shots: Shots | None = None) -> Keypoints:
@@ -53,6 +61,7 @@ class Keypoints:
             shot=image if shots is None else shots.of_rows(image, xy[:, 1]),
             xy_px=xy,
             rays=rays,
+            classes=np.concatenate([f.classes for f in features]),
         )
 
 
@@ -78,6 +87,11 @@ class Tracks:
             first=np.searchsorted(labels[order], np.arange(count + 1)).astype(np.int64),
             keypoints=members[order].astype(np.int64),
         )
+
+    def classes(self, of_keypoints: Bytes) -> Bytes:
+        """The semantic class (tracks,) of most keypoints of every track, given the keypoints' classes (n,)."""
+        owner = np.repeat(np.arange(len(self), dtype=np.int64), np.diff(self.first))
+        return majority_class(of_keypoints[self.keypoints], owner, len(self))
 
     def __len__(self) -> int:
         return len(self.first) - 1

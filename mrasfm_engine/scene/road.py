@@ -1,0 +1,129 @@
+"""The road's surface as overlapping plane patches, and what a scene says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry.neighbours import nearest
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SAME_LEVEL_M = 1.0  # patches farther apart in height are of different roads, above one another
+NEIGHBOURS = 12  # patches that are asked for at one place
+
+
+class RoadSource(StrEnum):
+    """How points of the road were told from others."""
+
+    MASKS = "masks"
+    GEOMETRY = "geometry"  # below the vehicle's way, where no mask says what is road: less sure
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadSurface:
+    """Plane patches whose weighted mean is the surface. All lengths are metres of the scene's frame.
+
+    A patch holds within `radius_m` of its centre, horizontally; its weight falls to zero there, so that the surface has
+    no steps.
+    """
+
+    axes: Floats  # (3, 3) rows: two horizontal directions and up
+    centre_m: Floats  # (n, 3)
+    normal: Floats  # (n, 3) unit, upwards
+    radius_m: float
+
+    def __len__(self) -> int:
+        return len(self.centre_m)
+
+    def locate(self, points_m: Floats) -> tuple[Floats, Ints]:
+        """Signed distances (p,) of points (p, 3) to the surface, up positive, and the nearest patches (p,).
+
+        Where roads lie above one another, the nearer one counts. Beyond all patches the distance is NaN, the patch -1.
+        """
+        distance, patch = np.full(len(points_m), np.nan), np.full(len(points_m), -1, dtype=np.int64)
+        if not len(self) or not len(points_m):
+            return distance, patch
+        xyz, centre, normal = points_m @ self.axes.T, self.centre_m @ self.axes.T, self.normal @ self.axes.T
+        reach, near = nearest(centre[:, :2], xyz[:, :2], count=NEIGHBOURS, within_m=self.radius_m)
+        found = np.isfinite(reach)
+        # Distances to the patches' planes along their normals.
+        offset = np.where(found, ((xyz[:, None] - centre[near]) * normal[near]).sum(2), np.inf)
+        level = offset[np.arange(len(xyz)), np.abs(offset).argmin(1)]
+        level = np.where(np.isfinite(level), level, 0.0)
+        same = found & (np.abs(offset - level[:, None]) < SAME_LEVEL_M)
+        weight = np.where(same, patch_weight(reach, self.radius_m), 0.0)
+        total = weight.sum(1)
+        inside = total > 0
+        distance[inside] = (weight * np.where(same, offset, 0.0)).sum(1)[inside] / total[inside]
+        patch[inside] = near[inside, weight[inside].argmax(1)]
+        return distance, patch
+
+    def beyond(self, points_m: Floats) -> tuple[Floats, Floats]:
+        """Distances (p,) of points (p, 3) to the nearest patch's plane, and how far (p,) beyond its radius they are.
+
+        The first is along its normal, the second horizontal.
+        """
+        xyz, centre, normal = points_m @ self.axes.T, self.centre_m @ self.axes.T, self.normal @ self.axes.T
+        reach, near = nearest(centre[:, :2], xyz[:, :2])
+        offset: Floats = ((xyz - centre[near[:, 0]]) * normal[near[:, 0]]).sum(1)
+        return offset, np.maximum(reach[:, 0] - self.radius_m, 0.0)
+
+
+def patch_weight(reach_m: Floats, radius_m: float) -> Floats:
+    """How much a patch counts at a horizontal distance from its centre: 1 there, 0 from its radius on."""
+    scaled = np.minimum(np.where(np.isfinite(reach_m), reach_m, radius_m) / radius_m, 1.0)
+    result: Floats = np.maximum((1.0 - scaled**2) ** 2, 1e-9) * (scaled < 1.0)
+    return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thickness:
+    """How thick a layer points make about the surface, from their signed distances; nothing is left out."""
+
+    range90_m: float  # between the 5th and the 95th percentile
+    spread_m: float  # 1.4826 times the median absolute deviation: the standard deviation, were they normal
+
+    @staticmethod
+    def of(distance_m: Floats) -> Thickness:
+        """Of signed distances (n,), those that are NaN aside; NaN for none."""
+        known = distance_m[np.isfinite(distance_m)]
+        if not len(known):
+            return Thickness(range90_m=float("nan"), spread_m=float("nan"))
+        low, middle, high = np.percentile(known, [5, 50, 95])
+        return Thickness(range90_m=float(high - low), spread_m=float(1.4826 * np.median(np.abs(known - middle))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadPoints:
+    """Points that were taken for the road's, before those off its surface were dropped."""
+
+    points_m: Floats  # (n, 3)
+    distance_m: Floats  # (n,) signed, to the surface; NaN where there is none
+    kept: Bools  # (n,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Road:
+    """The road of a scene."""
+
+    source: RoadSource
+    surface: RoadSurface
+    roughness_m: float  # standard deviation of the road about the surface
+    rig_height_m: float  # of the rig's origin above the road
+    before: RoadPoints
+
+    @property
+    def thickness_before(self) -> Thickness:
+        """Of all points that were taken for the road's."""
+        return Thickness.of(self.before.distance_m)
+
+    @property
+    def thickness_after(self) -> Thickness:
+        """Of those that were kept."""
+        return Thickness.of(self.before.distance_m[self.before.kept])

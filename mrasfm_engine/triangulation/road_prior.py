@@ -1,0 +1,73 @@
+"""Which points are the road's where no mask says so: those on one level below the vehicle's way."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry.neighbours import nearest
+from mrasfm_engine.triangulation.road_surface import MIN_POINTS, horizontal_axes, most_frequent
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+CORRIDOR_M = 3.0  # to both sides of the way: a lane
+DRIVEN_M = 0.8  # to both sides of the way: where the vehicle itself was
+VEHICLE_HEIGHT_M = 1.2  # above the road, in which nothing was where the vehicle drove
+AHEAD_M = 12.0  # how far beyond the ends of the way the road is believed to go on
+BELOW_CAMERAS_M = 0.3  # the road is at least that far below the lowest camera
+LEVEL_M = 0.5  # half the thickness of the layer that holds the road and what is wrong about it
+LEVEL_PER_M = 0.08  # what slopes add to it a metre of distance from the vehicle
+MIN_SHARE = 0.2  # of the points below the cameras on the way that must be on one level
+
+
+def points_below_the_way(points_m: Floats, world_from_rig: Floats, lowest_camera_m: float) -> Bools | None:
+    """Which points (n, 3) are near the road's level in the lane that the vehicle drove.
+
+    Parameters
+    ----------
+    points_m, world_from_rig
+        Points (n, 3) and the vehicle's poses (u, 4, 4), x forward, z up, in one frame.
+    lowest_camera_m
+        Height of the lowest camera over the rig's origin.
+
+    Returns
+    -------
+    Marks (n,), or None where no level stands out: the cameras do not see the road.
+    """
+    if not len(points_m):
+        return None
+    lateral, away, height = _beside_the_way(points_m, world_from_rig)
+    lane = (np.abs(lateral) < CORRIDOR_M) & (height < lowest_camera_m - BELOW_CAMERAS_M)
+    if lane.sum() < MIN_POINTS:
+        return None
+    level = most_frequent(height[lane])
+    near = lane & (np.abs(height - level) < LEVEL_M + LEVEL_PER_M * away)
+    on_level = lane & (np.abs(height - level) < 0.1 + LEVEL_PER_M * away)
+    if on_level.sum() < max(MIN_POINTS, MIN_SHARE * lane.sum()):
+        return None
+    return near
+
+
+def standing_is_impossible(points_m: Floats, distance_m: Floats, world_from_rig: Floats) -> Bools:
+    """Where (n,) nothing that stands can be: below the road, or above it where the vehicle itself drove.
+
+    `distance_m` (n,) is signed, to the road's surface. Kerbs, bollards and parked cars beside the way may be there.
+    """
+    lateral, _, _ = _beside_the_way(points_m, world_from_rig)
+    driven = (np.abs(lateral) < DRIVEN_M) & (distance_m < VEHICLE_HEIGHT_M)
+    result: Bools = (distance_m < 0) | driven
+    return result
+
+
+def _beside_the_way(points_m: Floats, world_from_rig: Floats) -> tuple[Floats, Floats, Floats]:
+    """For points (n, 3): lateral offset from the way, distance from its nearest pose, and height in that pose's rig.
+
+    Points farther than AHEAD_M beyond the ends of the way have an infinite offset.
+    """
+    axes = horizontal_axes(world_from_rig)
+    way, xyz = world_from_rig[:, :3, 3] @ axes.T, points_m @ axes.T
+    unit = nearest(way[:, :2], xyz[:, :2])[1][:, 0]
+    local = np.einsum("nji,nj->ni", world_from_rig[unit, :3, :3], points_m - world_from_rig[unit, :3, 3])
+    lateral = np.where(np.abs(local[:, 0]) <= AHEAD_M, local[:, 1], np.inf)
+    return lateral, np.hypot(local[:, 0], local[:, 1]), local[:, 2]
