@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera
-from mrasfm_engine.io.export_poses import world_from_cam
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.scene.semantics import usable_pixels
+from mrasfm_engine.scene.semantics import class_codes, usable_pixels
 from mrasfm_engine.views.agreement import Agreement, measure_agreement
 from mrasfm_engine.views.drawing import Framed, framed
 from mrasfm_engine.views.exposure import camera_gains, exposure_gains
@@ -109,7 +108,7 @@ def _mosaic_of(
     scene: Scene, plan_from_world: Floats, ground: GroundHeights, progress: Callable[[int, int], None] | None
 ) -> Mosaic:
     images = _nearest_first(scene)
-    refined = world_from_cam(scene)
+    refined = scene.world_from_cam
     gains = exposure_gains(scene)
     given = scene.drive.rig_from_cam
     views = []
@@ -172,7 +171,7 @@ def _read(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
     if image.mask is None:
         return rgb, None
     label_map = scene.drive.manifest.label_map
-    usable = usable_pixels(read_mask(root / image.mask, label_map), label_map or LabelMap.cityscapes())
+    usable = usable_pixels(class_codes(read_mask(root / image.mask, label_map), label_map or LabelMap.cityscapes()))
     side = 2 * max(1, round(MASK_MARGIN_SHARE * rgb.shape[1])) + 1
     return rgb, cv2.erode(usable.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
