@@ -236,6 +236,9 @@ class Model:
             ),
             terms=terms,
             options=options,
+            motion=None
+            if self.state.simultaneous
+            else self.motion.in_adjustment(self.state, self.registered, free_units),
         )
         return problem, tracks
 
@@ -250,6 +253,7 @@ class Model:
         cancel: Callable[[], bool] | None = None,
     ) -> Report:
         """Solve the adjustment and take over its result."""
+        self.renew_motion(np.flatnonzero(free_units & self.registered))
         problem, tracks = self.problem(
             free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
         )
@@ -259,5 +263,4 @@ class Model:
         points = self.state.points_m
         points[tracks] = solution.points_m
         self.state = replace(solution, points_m=points)
-        self.renew_motion(np.flatnonzero(free_units & self.registered))
         return report
