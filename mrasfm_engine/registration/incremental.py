@@ -19,6 +19,7 @@ from mrasfm_engine.registration.calibration import (
 )
 from mrasfm_engine.registration.camera_set import Registration, register_unit
 from mrasfm_engine.registration.initialise import Initialisation, initialise
+from mrasfm_engine.registration.keyframes import select_keyframes
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.scene.drive import Drive
@@ -70,7 +71,7 @@ def grow(
     since_local, at_global = 0, 2
     recent: list[int] = list(log.initialisation.units)
     adjust_globally(model, log, cancel)
-    while not model.registered.all():
+    while not model.registered[model.keyframe].all():
         if cancel is not None and cancel():
             raise CancelledError
         registration = _register_next(model, log)
@@ -88,7 +89,7 @@ def grow(
             adjust_globally(model, log, cancel)
             at_global = int(model.registered.sum())
         if progress is not None:
-            progress(int(model.registered.sum()), len(model.registered))
+            progress(int(model.registered.sum()), int(model.keyframe.sum()))
     return log
 
 
@@ -114,6 +115,7 @@ def map_units(
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
     model = Model(drive, keypoints, build_tracks(keypoints, near), config)
+    model.keyframe = select_keyframes(model)
     if prior_world_from_rig is not None:
         model.motion.follow_prior(prior_world_from_rig)
     log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
@@ -127,7 +129,7 @@ def map_units(
     across = [p for p in far if (*sorted((int(image_unit[p.image_a]), int(image_unit[p.image_b]))),) in believed]
     closed = Model(drive, keypoints, build_tracks(keypoints, [*near, *across]), config)
     closed.state = replace(model.state, points_m=closed.state.points_m)
-    closed.registered, closed.motion = model.registered, model.motion
+    closed.registered, closed.keyframe, closed.motion = model.registered, model.keyframe, model.motion
     closed.renew_motion()
     closed.triangulate()
     adjust_globally(closed, log, cancel)
@@ -139,7 +141,7 @@ def _register_next(model: Model, log: MappingLog) -> Registration | None:
     counts = model.visible_counts()
     for unit in np.argsort(-counts, kind="stable"):
         unit = int(unit)
-        if model.registered[unit] or counts[unit] < model.config.mapping.min_pnp_inliers:
+        if model.registered[unit] or not model.keyframe[unit] or counts[unit] < model.config.mapping.min_pnp_inliers:
             continue
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:

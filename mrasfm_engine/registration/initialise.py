@@ -46,6 +46,8 @@ def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.
     between: dict[tuple[int, int], int] = {}
     for pair in pairs:
         u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
+        if not model.keyframe[[u, v]].all():
+            continue
         count = int(pair.inliers.sum())
         if u == v:
             inside[u] += count

@@ -37,6 +37,8 @@ class Model:
         Poses and calibration; `state.points_m` has a row for every track, valid where `solved`.
     registered
         (units,) which units have a pose.
+    keyframe
+        (units,) which units mapping uses, see `registration.keyframes`.
     solved
         (tracks,) which tracks have a point.
     kept
@@ -58,6 +60,7 @@ class Model:
             points_m=np.zeros((len(tracks), 3)),
         )
         self.registered = np.zeros(units, dtype=np.bool_)
+        self.keyframe = np.ones(units, dtype=np.bool_)
         self.solved = np.zeros(len(tracks), dtype=np.bool_)
         self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)

@@ -28,9 +28,8 @@ PRIOR_WINDOW_S = 1.0  # over which the velocity of noisy prior poses is averaged
 
 @dataclass(frozen=True, kw_only=True)
 class LargestMotion:
-    """The most that images are apart from their unit, over the registered units."""
+    """The most that shots are apart from their unit, over the registered units."""
 
-    time_offset_s: float
     translation_m: float
     rotation_deg: float
 
@@ -152,9 +151,8 @@ class RigMotion:
         """How far apart images and units are."""
         rows = np.flatnonzero(registered[self.shots.unit])
         if state.simultaneous or not len(rows):
-            return LargestMotion(time_offset_s=0.0, translation_m=0.0, rotation_deg=0.0)
+            return LargestMotion(translation_m=0.0, rotation_deg=0.0)
         return LargestMotion(
-            time_offset_s=float(np.abs(self.shots.time_offset_s[rows]).max()),
             translation_m=float(np.linalg.norm(state.shot_position_m[rows], axis=1).max()),
             rotation_deg=float(se3.rotation_angle_deg(state.shot_rotation[rows]).max()),
         )

@@ -12,6 +12,7 @@ from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
 from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.registration.calibration import calibration_prior
+from mrasfm_engine.registration.keyframes import nearest_keyframes
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
 from mrasfm_engine.scene.scene import CameraCalibration, ImageFeatures, PairMatches, Scene
@@ -41,6 +42,8 @@ def build_scene(
     sigma = np.full((units, 3), np.nan)
     if refinement.certainty is not None:
         sigma = refinement.certainty.sigma_unit_position_m
+        between = ~model.keyframe & model.registered
+        sigma[between] = sigma[nearest_keyframes(model)[between]]
     georeferenced = refinement.georeferenced
     return Scene(
         drive=model.drive,
