@@ -42,12 +42,9 @@ def select_keyframes(model: Model) -> Bools:
 
 def _displacement_px(model: Model, before: int, now: int) -> float:
     """Median way (px) of the tracks that the same cameras see in both units; NaN with too few of them."""
-    keys, rows = [], []
-    for unit in (before, now):
-        own = model.rows_of_unit[unit]
-        keys.append(model.tracks.of_keypoint[own] * len(model.camera_kind) + model.keypoints.camera[own])
-        rows.append(own)
-    _, a, b = np.intersect1d(*keys, return_indices=True)
+    rows = [model.rows_of_unit[unit] for unit in (before, now)]
+    keys = [model.tracks.of_keypoint[r] * len(model.camera_kind) + model.keypoints.camera[r] for r in rows]
+    _, a, b = np.intersect1d(keys[0], keys[1], return_indices=True)
     if len(a) < MIN_COMMON:
         return float("nan")
     moved = model.keypoints.xy_px[rows[1][b]] - model.keypoints.xy_px[rows[0][a]]

@@ -41,7 +41,7 @@ def build_scene(
     poses[~model.registered] = np.nan
     sigma = np.full((units, 3), np.nan)
     if refinement.certainty is not None:
-        sigma = refinement.certainty.sigma_unit_position_m
+        sigma = refinement.certainty.sigma_unit_position_m.copy()
         between = ~model.keyframe & model.registered
         sigma[between] = sigma[nearest_keyframes(model)[between]]
     georeferenced = refinement.georeferenced
