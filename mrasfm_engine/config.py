@@ -13,6 +13,7 @@ from mrasfm_engine.errors import InputError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+Threshold = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
 
@@ -62,6 +63,7 @@ class MappingConfig(_Section):
     """The incremental loop."""
 
     camera_set_registration: bool = True  # false: every image by its own PnP, as without a rig; for comparison
+    keyframe_motion_px: Threshold = 2.0  # units whose keypoints moved less are registered at the end; 0: map with all
     motion_compensation: bool = True  # images (and rows, where a readout time is declared) are posed at their own times
     max_error_px: Positive = 4.0  # reprojection error of an observation while poses still settle
     filter_error_px: Positive = 3.0  # and in the final scene

@@ -30,6 +30,7 @@ from mrasfm_engine.io.preflight import require_sound
 from mrasfm_engine.io.preflight_content import inspect_drive
 from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
 from mrasfm_engine.registration import incremental, mapping_report, wrong_camera
+from mrasfm_engine.registration.keyframes import register_between_keyframes
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import refine
 from mrasfm_engine.registration.scene_builder import build_scene
@@ -272,6 +273,7 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
         arrays = {
             "of_keypoint": model.tracks.of_keypoint,
             "registered": model.registered,
+            "keyframe": model.keyframe,
             "solved": model.solved,
             "kept": model.kept,
             "missing": model.missing,
@@ -285,6 +287,7 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     arrays, _ = run.stage("mapping", settings, work)
     model = Model(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
     model.registered, model.solved, model.kept = arrays["registered"], arrays["solved"], arrays["kept"]
+    model.keyframe = arrays["keyframe"]
     model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
     model.missing = arrays["missing"]
     for image in np.flatnonzero(arrays["has_own_pose"]):
@@ -305,6 +308,7 @@ def scene(
         progress=run.step("refinement"),
         cancel=run.cancel,
     )
+    between = register_between_keyframes(model, max_error_px=run.config.mapping.filter_error_px)
     if refinement.placement is not None:
         run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
     run.report["findings"] += [
@@ -316,6 +320,7 @@ def scene(
             "seconds": round(time.perf_counter() - started, 3),
             "reused": False,
             **mapping_report.describe_refinement(model, refinement),
+            **mapping_report.describe_between(model, between),
         }
     )
     return build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)

@@ -29,8 +29,11 @@ RIG_FROM_FORWARD_CAM = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 MODELS = {"PINHOLE": [800.0, 810.0, 480.0, 300.0], "OPENCV": [700.0, 705.0, 470.0, 310.0, -0.05, 0.01, 1e-3, -5e-4]}
 
 
-def make_scene(*, georeferenced: bool = True, folder: str = "images") -> Scene:
-    """Two cameras, five units of which one is missing, and points projected exactly by pycolmap."""
+def make_scene(*, georeferenced: bool = True, folder: str = "images", moving: bool = False) -> Scene:
+    """Two cameras, five units of which one is missing, and points projected exactly by pycolmap.
+
+    `moving`: the images of a unit are not taken at one time.
+    """
     rng = np.random.default_rng(3)
     given = [
         se3.transform(se3.exp_so3([0, 0, yaw]) @ RIG_FROM_FORWARD_CAM, [1.5, y, 1.6])
@@ -72,11 +75,14 @@ def make_scene(*, georeferenced: bool = True, folder: str = "images") -> Scene:
     image_registered = np.array([unit_registered[image.unit] for image in drive.images])
     image_registered[MISSING_IMAGE] = False
     features, rows = [], []
+    steps = np.random.default_rng(4).normal(size=(len(drive.images), 6)) * [0.01, 0.01, 0.02, 0.4, 0.02, 0.02]
+    unit_from_image = se3.exp_se3(steps if moving else 0 * steps)
     for i, image in enumerate(drive.images):
         xy = rng.uniform(0, 600, (POINTS + EXTRA_KEYPOINTS, 2))
         if image_registered[i]:
             places = rng.permutation(len(xy))[:POINTS]
-            cam_from_world = se3.inverse(world_from_rig[image.unit] @ calibration[image.camera].rig_from_cam)
+            world_from_image = world_from_rig[image.unit] @ unit_from_image[i]
+            cam_from_world = se3.inverse(world_from_image @ calibration[image.camera].rig_from_cam)
             model = pycolmap.Camera(
                 model=cameras[image.camera].model, width=960, height=600, params=calibration[image.camera].params
             )
@@ -125,6 +131,7 @@ def make_scene(*, georeferenced: bool = True, folder: str = "images") -> Scene:
         georeference=georeference if georeferenced else None,
         rough_world_from_local=None if georeferenced else se3.transform(np.eye(3), [100.0, 200.0, 3.0]),
         notes=["an example"],
+        unit_from_image=unit_from_image if moving else None,
     )
 
 

@@ -13,7 +13,12 @@ row by row,
     d/dtau_c = -M                       d/domega_c = M x (x_shot - t_c)
     d/dphi   =  pixel - principal point
 
-(A, b) is held. Where all images are taken at their unit's time, shot_r, shot_t and obs_shot are None: numba compiles
+Where the motion within a unit follows from the trajectory, a shot's pose takes part in steps of up to three units
+(`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_shot). Left out is that a turned unit
+also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A shot
+that is held to its unit has no other support, and the derivatives above.
+
+Where all images are taken at their unit's time, shot_r, shot_t, support, weight and obs_shot are None: numba compiles
 the kernels without them, so that nobody pays for what is not there.
 
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
@@ -43,10 +48,10 @@ MIN_DEPTH_M = 1e-3
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _camera_point(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, cam_r: Any, cam_t: Any, x: Any,
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
     from_unit: Any, rig: Any, cam: Any,
 ) -> None:  # fmt: skip
-    """from_unit = X - t_u, rig = x_shot - t_c, cam = x_cam."""
+    """from_unit = X - t_u (X - t_shot where the shot follows several units), rig = x_shot - t_c, cam = x_cam."""
     for i in range(3):
         from_unit[i] = x[i] - unit_t[i]
     if shot_r is None:
@@ -58,6 +63,9 @@ def _camera_point(
                 unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2]
                 - shot_t[shot, i]
             )  # fmt: skip
+        if follows:
+            for i in range(3):
+                from_unit[i] = unit_r[i, 0] * cam[0] + unit_r[i, 1] * cam[1] + unit_r[i, 2] * cam[2]
         for i in range(3):
             rig[i] = shot_r[shot, 0, i] * cam[0] + shot_r[shot, 1, i] * cam[1] + shot_r[shot, 2, i] * cam[2] - cam_t[i]
     for i in range(3):
@@ -74,7 +82,9 @@ def squared_errors(
     for n in range(lo, hi):
         u, c = obs_unit[n], obs_camera[n]
         shot = 0 if obs_shot is None else obs_shot[n]
-        _camera_point(unit_r[u], unit_t[u], shot_r, shot_t, shot, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam)
+        _camera_point(
+            unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam
+        )
         if cam[2] < MIN_DEPTH_M:
             out[n] = BEHIND_PX * BEHIND_PX
             continue
@@ -84,12 +94,12 @@ def squared_errors(
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _linearise(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, cam_r: Any, cam_t: Any,
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any,
     kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, ju: Any, jc: Any, jx: Any,
 ) -> bool:  # fmt: skip
     """Weighted residual and Jacobians of one observation; False behind the camera."""
-    _camera_point(unit_r, unit_t, shot_r, shot_t, shot, cam_r, cam_t, x, d, rig, cam)
+    _camera_point(unit_r, unit_t, shot_r, shot_t, shot, follows, cam_r, cam_t, x, d, rig, cam)
     if cam[2] < MIN_DEPTH_M:
         return False
     project(kind, k, cam[0], cam[1], cam[2], work, proj)
@@ -148,8 +158,9 @@ def _invert3(v: Any, out: Any) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any,
-    num_units: int, sigma: float, loss2: float, damping: float, lo: int, hi: int, s: Any, diagonal: Any, g: Any,
+    support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any,
+    unit_slot: Any, camera_slot: Any, num_units: int,
+    sigma: float, loss2: float, damping: float, lo: int, hi: int, s: Any, diagonal: Any, g: Any,
     v_inverse: Any, v_gradient: Any,
 ) -> None:  # fmt: skip
     """Add the reduced normal equations of points lo..hi to s (n, n), the undamped diagonal of the unreduced ones to
@@ -166,8 +177,9 @@ def accumulate(
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
             shot = 0 if obs_shot is None else obs_shot[n]
+            follows = False if weight is None else weight[shot, 0] != 1.0
             if not _linearise(
-                unit_r[u], unit_t[u], shot_r, shot_t, shot, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], shot_r, shot_t, shot, follows, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, ju, jc, jx,
             ):  # fmt: skip
@@ -185,21 +197,49 @@ def accumulate(
             e[2] += a2 * res[0] + b2 * res[1]
             su, sc = unit_slot[u], camera_slot[c]
             ou, oc = 6 * su, 6 * num_units + 7 * sc
-            if su >= 0:
-                slot = _slot_of(ids, count, su)
-                if slot < 0 and count < MAX_BLOCKS:
-                    slot = count
-                    ids[slot], offsets[slot], sizes[slot] = su, ou, 6
-                    w[slot] = 0.0
-                    count += 1
-                for i in range(6):
-                    g[ou + i] += ju[0, i] * res[0] + ju[1, i] * res[1]
-                    diagonal[ou + i] += ju[0, i] * ju[0, i] + ju[1, i] * ju[1, i]
-                    for j in range(i + 1):
-                        s[ou + i, ou + j] += ju[0, i] * ju[0, j] + ju[1, i] * ju[1, j]
-                    if slot >= 0:
-                        for j in range(3):
-                            w[slot, i, j] += ju[0, i] * jx[0, j] + ju[1, i] * jx[1, j]
+            if weight is None:
+                if su >= 0:
+                    slot = _slot_of(ids, count, su)
+                    if slot < 0 and count < MAX_BLOCKS:
+                        slot = count
+                        ids[slot], offsets[slot], sizes[slot] = su, ou, 6
+                        w[slot] = 0.0
+                        count += 1
+                    for i in range(6):
+                        g[ou + i] += ju[0, i] * res[0] + ju[1, i] * res[1]
+                        diagonal[ou + i] += ju[0, i] * ju[0, i] + ju[1, i] * ju[1, i]
+                        for j in range(i + 1):
+                            s[ou + i, ou + j] += ju[0, i] * ju[0, j] + ju[1, i] * ju[1, j]
+                        if slot >= 0:
+                            for j in range(3):
+                                w[slot, i, j] += ju[0, i] * jx[0, j] + ju[1, i] * jx[1, j]
+            else:
+                for a in range(3):
+                    wa = weight[shot, a]
+                    sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
+                    if sa < 0:
+                        continue
+                    oa = 6 * sa
+                    slot = _slot_of(ids, count, sa)
+                    if slot < 0 and count < MAX_BLOCKS:
+                        slot = count
+                        ids[slot], offsets[slot], sizes[slot] = sa, oa, 6
+                        w[slot] = 0.0
+                        count += 1
+                    for i in range(6):
+                        g[oa + i] += wa * (ju[0, i] * res[0] + ju[1, i] * res[1])
+                        diagonal[oa + i] += wa * wa * (ju[0, i] * ju[0, i] + ju[1, i] * ju[1, i])
+                        if slot >= 0:
+                            for j in range(3):
+                                w[slot, i, j] += wa * (ju[0, i] * jx[0, j] + ju[1, i] * jx[1, j])
+                    for b in range(3):
+                        wb = weight[shot, b]
+                        sb = -1 if wb == 0.0 else unit_slot[support[shot, b]]
+                        if sb < 0 or sb > sa:
+                            continue
+                        for i in range(6):
+                            for j in range(i + 1 if sb == sa else 6):
+                                s[oa + i, 6 * sb + j] += wa * wb * (ju[0, i] * ju[0, j] + ju[1, i] * ju[1, j])
             if sc >= 0:
                 slot = _slot_of(ids, count, num_units + sc)
                 if slot < 0 and count < MAX_BLOCKS:
@@ -212,9 +252,17 @@ def accumulate(
                     diagonal[oc + i] += jc[0, i] * jc[0, i] + jc[1, i] * jc[1, i]
                     for j in range(i + 1):
                         s[oc + i, oc + j] += jc[0, i] * jc[0, j] + jc[1, i] * jc[1, j]
-                    if su >= 0:
-                        for j in range(6):
-                            s[oc + i, ou + j] += jc[0, i] * ju[0, j] + jc[1, i] * ju[1, j]
+                    if weight is None:
+                        if su >= 0:
+                            for j in range(6):
+                                s[oc + i, ou + j] += jc[0, i] * ju[0, j] + jc[1, i] * ju[1, j]
+                    else:
+                        for a in range(3):
+                            wa = weight[shot, a]
+                            oa = -1 if wa == 0.0 else 6 * unit_slot[support[shot, a]]
+                            if oa >= 0:
+                                for j in range(6):
+                                    s[oc + i, oa + j] += wa * (jc[0, i] * ju[0, j] + jc[1, i] * ju[1, j])
                     if slot >= 0:
                         for j in range(3):
                             w[slot, i, j] += jc[0, i] * jx[0, j] + jc[1, i] * jx[1, j]
@@ -251,8 +299,9 @@ def accumulate(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, unit_slot: Any, camera_slot: Any,
-    num_units: int, sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
+    support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any,
+    unit_slot: Any, camera_slot: Any, num_units: int,
+    sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
@@ -263,20 +312,30 @@ def substitute(
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
             su, sc = unit_slot[u], camera_slot[c]
-            if su < 0 and sc < 0:
+            if weight is None and su < 0 and sc < 0:
                 continue
             shot = 0 if obs_shot is None else obs_shot[n]
+            follows = False if weight is None else weight[shot, 0] != 1.0
             if not _linearise(
-                unit_r[u], unit_t[u], shot_r, shot_t, shot, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], shot_r, shot_t, shot, follows, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, ju, jc, jx,
             ):  # fmt: skip
                 continue
             m0, m1 = 0.0, 0.0
-            if su >= 0:
-                for i in range(6):
-                    m0 += ju[0, i] * step[6 * su + i]
-                    m1 += ju[1, i] * step[6 * su + i]
+            if weight is None:
+                if su >= 0:
+                    for i in range(6):
+                        m0 += ju[0, i] * step[6 * su + i]
+                        m1 += ju[1, i] * step[6 * su + i]
+            else:
+                for a in range(3):
+                    wa = weight[shot, a]
+                    sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
+                    if sa >= 0:
+                        for i in range(6):
+                            m0 += wa * ju[0, i] * step[6 * sa + i]
+                            m1 += wa * ju[1, i] * step[6 * sa + i]
             if sc >= 0:
                 o = 6 * num_units + 7 * sc
                 for i in range(7):

@@ -14,6 +14,7 @@ cameras, in this order, make up the reduced vector of unknowns:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -45,6 +46,22 @@ class Observations:
     def __post_init__(self) -> None:
         first = np.searchsorted(self.point, np.arange(self.num_points + 1))
         object.__setattr__(self, "first_of_point", first.astype(np.int64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotMotion:
+    """How shots follow the trajectory of the units that are adjusted."""
+
+    support: Ints  # (s, 3) units whose steps move a shot; -1 where weight is 0
+    weight: Floats  # (s, 3) by how much; (1, 0, 0) where it is held to its unit
+    follow: Callable[[State], State]  # the state with its shots computed anew from its units
+
+    @staticmethod
+    def held(shot_unit: Ints) -> ShotMotion:
+        """Shots (s,) that stay where they are relative to their units."""
+        support = np.full((len(shot_unit), 3), -1, dtype=np.int64)
+        support[:, 0] = shot_unit
+        return ShotMotion(support=support, weight=np.tile([1.0, 0.0, 0.0], (len(support), 1)), follow=lambda s: s)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.adjustment.normal_equations import accumulate, squared_errors, substitute
 from mrasfm_engine.adjustment.priors import Term
-from mrasfm_engine.adjustment.problem import Layout, Observations, retract
+from mrasfm_engine.adjustment.problem import Layout, Observations, ShotMotion, retract
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
@@ -66,6 +66,7 @@ class Problem:
     layout: Layout
     terms: Sequence[Term] = ()
     options: SolverOptions = field(default_factory=SolverOptions)
+    motion: ShotMotion | None = None  # needed where the state has shots
 
     def errors_px2(self, state: State) -> Floats:
         """Squared reprojection errors (n,) of all observations."""
@@ -79,6 +80,14 @@ class Problem:
             ),
         )
         return out
+
+    def _motion(self) -> tuple[NDArray[np.generic] | None, ...]:
+        return (None, None) if self.motion is None else (self.motion.support, self.motion.weight)
+
+    def retract(self, state: State, step: Floats, points_m: Floats) -> State:
+        """The state after a step of the reduced vector, with new points."""
+        after = retract(state, self.layout, step, points_m)
+        return after if self.motion is None else self.motion.follow(after)
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares."""
@@ -98,7 +107,7 @@ class Problem:
             parts,
             p,
             lambda lo, hi, t: accumulate(
-                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
                 layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
                 damping, lo, hi, s[t], diagonal[t], g[t], v_inverse, v_gradient,
             ),
@@ -123,7 +132,7 @@ class Problem:
             options.threads,
             o.num_points,
             lambda lo, hi, _: substitute(
-                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
                 layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
                 step, reduced.v_inverse, reduced.v_gradient, lo, hi, out,
             ),
@@ -210,7 +219,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
         reduced = problem.normal_equations(state, damping)
         step = _damped_step(reduced, free, damping)
         if step is not None:
-            trial = retract(state, layout, step, problem.points_after(state, reduced, step))
+            trial = problem.retract(state, step, problem.points_after(state, reduced, step))
             trial_cost = problem.cost(trial)
         if step is None or not trial_cost < cost:
             if damping > 1e8:

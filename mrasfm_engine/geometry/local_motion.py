@@ -33,46 +33,77 @@ class LocalMotion:
     bend: Floats  # (u, 6) half an acceleration, 1/s^2
     earliest_s: Floats  # (u,) as far back, and
     latest_s: Floats  # (u,) as far forward, as anything is known: beyond, the vehicle is taken to stand
-    known: Bools  # (u,) whether any other pose says something
+    support: Ints  # (u, 3) the units that tell the motion: itself, and one or two others; -1 where there is none
+    support_s: Floats  # (u, 2) times of the others, from the unit's own on
+
+    @property
+    def known(self) -> Bools:
+        """Whether any other pose says something (u,)."""
+        result: Bools = self.support[:, 1] >= 0
+        return result
 
     def at(self, unit: Ints, offset_s: Floats) -> Floats:
         """`unit_from_then` (n, 4, 4) of units (n,) at seconds (n,) from their timestamps."""
-        t = np.clip(offset_s, self.earliest_s[unit], self.latest_s[unit])[:, None]
+        t = self._clipped(unit, offset_s)[:, None]
         return se3.exp_se3(t * (self.velocity[unit] + t * self.bend[unit]))
+
+    def weights(self, unit: Ints, offset_s: Floats) -> Floats:
+        """How far the pose then follows small steps of the `support` units' poses (n, 3): Lagrange's polynomials."""
+        t, (a, b) = self._clipped(unit, offset_s), self.support_s[unit].T
+        result = np.zeros((len(unit), 3))
+        one, two = self.support[unit, 1] >= 0, self.support[unit, 2] >= 0
+        line, bow = one & ~two, one & two
+        result[line, 1] = t[line] / a[line]
+        result[bow, 1] = (t * (t - b))[bow] / (a * (a - b))[bow]
+        result[bow, 2] = (t * (t - a))[bow] / (b * (b - a))[bow]
+        result[:, 0] = 1.0 - result.sum(1)
+        return result
+
+    def _clipped(self, unit: Ints, offset_s: Floats) -> Floats:
+        return np.clip(offset_s, self.earliest_s[unit], self.latest_s[unit])
 
 
 def local_motion(world_from_rig: Floats, time_s: Floats, known: Bools) -> LocalMotion:
     """The motion around poses (u, 4, 4) at ascending times (u,), from those that are known (u,).
 
-    With a known pose on both sides the twist is the parabola through both; with one, it goes there and changes as it
-    does there. A pose that is itself not known, or has no other within `MAX_GAP_S`, does not move.
+    It is the parabola in the tangent space through a pose and those before and after it; at the ends of the drive the
+    next two; with one other pose a constant twist. A pose that is itself not known, or has no other within
+    `MAX_GAP_S`, does not move.
     """
-    count = len(time_s)
     before, after = _neighbours(time_s, known)
-    has_before, has_after = before >= 0, after >= 0
-    own = se3.inverse(world_from_rig)
-    back = np.where(has_before, time_s[before] - time_s, -1.0)[:, None]
-    ahead = np.where(has_after, time_s[after] - time_s, 1.0)[:, None]
-    rate_back, rate_ahead = np.zeros((count, 6)), np.zeros((count, 6))
-    rate_back[has_before] = se3.log_se3(own[has_before] @ world_from_rig[before[has_before]]) / back[has_before]
-    rate_ahead[has_after] = se3.log_se3(own[has_after] @ world_from_rig[after[has_after]]) / ahead[has_after]
-    both = has_before & has_after
-    bend = np.where(both[:, None], (rate_ahead - rate_back) / (ahead - back), 0.0)
-    velocity = np.where(both[:, None], rate_ahead - bend * ahead, rate_back + rate_ahead)
+    middle = (before >= 0) & (after >= 0)
+    first = np.where(before >= 0, before, after)
+    # At an end of the drive, that neighbour's neighbour on its other side.
+    beyond = np.where(before >= 0, before[np.maximum(before, 0)], after[np.maximum(after, 0)])
+    support = np.stack([np.arange(len(time_s)), first, np.where(middle, after, beyond)], axis=1)
+    support[first < 0, 2] = -1
+    rates, gaps = [], []
+    for other in support[:, 1:].T:
+        there = other >= 0
+        gap = np.where(there, time_s[other] - time_s, np.nan)
+        rate = np.zeros((len(time_s), 6))
+        rate[there] = se3.log_se3(se3.inverse(world_from_rig[there]) @ world_from_rig[other[there]])
+        rate[there] /= gap[there, None]
+        rates.append(rate)
+        gaps.append(gap)
+    both = support[:, 2] >= 0
+    bend = np.zeros((len(time_s), 6))
+    bend[both] = (rates[1] - rates[0])[both] / (gaps[1] - gaps[0])[both, None]
+    velocity = rates[0].copy()
+    velocity[both] -= bend[both] * gaps[0][both, None]
     for axes, limit in ((slice(0, 3), MAX_TURN_ACCELERATION_RADPS2), (slice(3, 6), MAX_ACCELERATION_MPS2)):
         norm = 2.0 * np.linalg.norm(bend[:, axes], axis=1, keepdims=True)
         bend[:, axes] *= np.minimum(1.0, limit / np.maximum(norm, 1e-12))
-    # At an end of the drive, speed changes as it does at the next unit.
-    for end, inner, gap in ((has_after & ~has_before, after, ahead), (has_before & ~has_after, before, back)):
-        bend[end] = bend[inner[end]]
-        velocity[end] -= bend[end] * gap[end]
-    back, ahead = back[:, 0], ahead[:, 0]
+    ends = both & ~middle
+    velocity[ends] = rates[0][ends] - bend[ends] * gaps[0][ends, None]
+    reach = np.where(first >= 0, np.abs(gaps[0]), 0.0)
     return LocalMotion(
         velocity=velocity,
         bend=bend,
-        earliest_s=np.where(has_before, back, np.where(has_after, -ahead, 0.0)),
-        latest_s=np.where(has_after, ahead, np.where(has_before, -back, 0.0)),
-        known=has_before | has_after,
+        earliest_s=-reach,
+        latest_s=np.where(middle, gaps[1], reach),
+        support=support,
+        support_s=np.stack(gaps, axis=1),
     )
 
 

@@ -19,6 +19,7 @@ from mrasfm_engine.registration.calibration import (
 )
 from mrasfm_engine.registration.camera_set import Registration, register_unit
 from mrasfm_engine.registration.initialise import Initialisation, initialise
+from mrasfm_engine.registration.keyframes import select_keyframes
 from mrasfm_engine.registration.loop_closure import close_loops, find_revisits, split_pairs
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.moving_along import find_moving_along, units_to_doubt, without_keypoints
@@ -84,9 +85,9 @@ def register_all(
     progress: Callable[[int, int], None] | None = None,
     cancel: Callable[[], bool] | None = None,
 ) -> None:
-    """Register what can be registered of the units that have no pose yet."""
+    """Register what can be registered of the keyframes that have no pose yet."""
     config, since_local, at_global = model.config, 0, int(model.registered.sum())
-    while not model.registered.all():
+    while not model.registered[model.keyframe].all():
         if cancel is not None and cancel():
             raise CancelledError
         registration = _register_next(model, log)
@@ -103,7 +104,7 @@ def register_all(
             adjust_globally(model, log, cancel)
             at_global = int(model.registered.sum())
         if progress is not None:
-            progress(int(model.registered.sum()), len(model.registered))
+            progress(int(model.registered.sum()), int(model.keyframe.sum()))
     if not config.mapping.camera_set_registration:
         retry_missing(model)
 
@@ -130,6 +131,7 @@ def map_units(
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
     model = Model(drive, keypoints, build_tracks(keypoints, near), config)
+    model.keyframe = select_keyframes(model)
     if prior_world_from_rig is not None:
         model.motion.follow_prior(prior_world_from_rig)
     log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
@@ -160,6 +162,7 @@ def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:
     result = Model(model.drive, model.keypoints, build_tracks(model.keypoints, pairs), model.config)
     result.state = replace(model.state, points_m=result.state.points_m)
     result.registered, result.missing, result.motion = model.registered, model.missing, model.motion
+    result.keyframe = model.keyframe
     result.renew_motion()
     result.triangulate()
     return result
@@ -170,7 +173,7 @@ def _register_next(model: Model, log: MappingLog) -> Registration | None:
     counts = model.visible_counts()
     for unit in np.argsort(-counts, kind="stable"):
         unit = int(unit)
-        if model.registered[unit] or counts[unit] < model.config.mapping.min_pnp_inliers:
+        if model.registered[unit] or not model.keyframe[unit] or counts[unit] < model.config.mapping.min_pnp_inliers:
             continue
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:

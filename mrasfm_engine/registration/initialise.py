@@ -24,7 +24,7 @@ CANDIDATES = 4  # pairs of units that are tried
 MAX_RELATIVE_MATCHES = 1200
 RELATIVE_ERROR_PX = 4.0
 ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
-MOTION_ROUNDS = 5
+MOTION_ROUNDS = 3
 FULL_PARALLAX_RAD = np.radians(0.5)
 MIN_POINTS = 30
 GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
@@ -46,6 +46,8 @@ def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.
     between: dict[tuple[int, int], int] = {}
     for pair in pairs:
         u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
+        if not model.keyframe[[u, v]].all():
+            continue
         count = int(pair.inliers.sum())
         if u == v:
             inside[u] += count

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from mrasfm_engine.adjustment.solver import Report
 from mrasfm_engine.registration.calibration import heading_change_deg
-from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES
+from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES, Registration
 from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
 from mrasfm_engine.registration.road import RoadJudgement
 from mrasfm_engine.registration.wrong_camera import often_voted_out
 from mrasfm_engine.scene.road import RoadSource
+from mrasfm_engine.scene.shots import Shots
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
@@ -32,13 +34,14 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
             "source_frame": frames[u].source_frame,
             "reason": log.failures[int(u)].reason if int(u) in log.failures else "it sees no point of the scene",
         }
-        for u in np.flatnonzero(~model.registered)
+        for u in np.flatnonzero(~model.registered & model.keyframe)
     ]
     return {
         "initial_units": None if start is None else list(start.units),
         "initial_pose_from": None if start is None else start.method,
         "registered_units": int(model.registered.sum()),
         "units_not_registered": missing,
+        "units_without_motion": int((~model.keyframe).sum()),
         "registered_by": dict(Counter(r.method for r in log.registrations)),
         "cameras_voted_out": often_voted_out(log.registrations, {(c["unit"], c["camera"]) for c in covered}),
         "cameras_without_a_vote": dict(unclear),
@@ -94,6 +97,7 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
         },
         "georeferenced": refinement.georeferenced,
         "road": _road(refinement.road),
+        "motion_within_units": _motion(model),
     }
     if certainty is not None and np.isfinite(certainty.sigma_scale):
         result["scale"] = {
@@ -169,6 +173,38 @@ def _road(judged: RoadJudgement | str) -> dict[str, Any]:
             "low: no mask says what is road. Points near the road's level in the vehicle's own lane were judged, and "
             "dropped only where nothing can stand: below the road, or above it where the vehicle drove"
         )
+    return result
+
+
+def describe_between(model: Model, registrations: Sequence[Registration]) -> dict[str, Any]:
+    """The units that are no keyframes, and those of them that the finished scene gave no pose."""
+    frames = model.drive.manifest.frames
+    return {
+        "between_keyframes": {
+            "units": int((~model.keyframe).sum()),
+            "registered": sum(r.world_from_rig is not None for r in registrations),
+            "units_not_registered": [
+                {"unit": r.unit, "source_frame": frames[r.unit].source_frame, "reason": r.reason}
+                for r in registrations
+                if r.world_from_rig is None
+            ],
+        }
+    }
+
+
+def _motion(model: Model) -> dict[str, Any]:
+    """How far images are from their unit in time and, where that was taken into account, in space."""
+    shots = Shots.of(model.drive)
+    if shots.simultaneous:
+        return {"simultaneous": True}
+    largest = model.motion.largest(model.state, model.registered)
+    result: dict[str, Any] = {
+        "simultaneous": False,
+        "largest_time_offset_s": float(np.abs(shots.time_offset_s).max()),
+        "compensated": not model.motion.shots.simultaneous,
+    }
+    if result["compensated"]:
+        result |= {"largest_translation_m": largest.translation_m, "largest_rotation_deg": largest.rotation_deg}
     return result
 
 

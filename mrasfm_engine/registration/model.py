@@ -37,6 +37,8 @@ class Model:
         Poses and calibration; `state.points_m` has a row for every track, valid where `solved`.
     registered
         (units,) which units have a pose.
+    keyframe
+        (units,) which units mapping uses, see `registration.keyframes`.
     solved
         (tracks,) which tracks have a point.
     kept
@@ -64,6 +66,7 @@ class Model:
             points_m=np.zeros((len(tracks), 3)),
         )
         self.registered = np.zeros(units, dtype=np.bool_)
+        self.keyframe = np.ones(units, dtype=np.bool_)
         self.solved = np.zeros(len(tracks), dtype=np.bool_)
         self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.missing = np.zeros(len(drive.images), dtype=np.bool_)
@@ -267,6 +270,9 @@ class Model:
             ),
             terms=terms,
             options=options,
+            motion=None
+            if self.state.simultaneous
+            else self.motion.in_adjustment(self.state, self.registered, free_units),
         )
         return problem, tracks
 
@@ -281,6 +287,7 @@ class Model:
         cancel: Callable[[], bool] | None = None,
     ) -> Report:
         """Solve the adjustment and take over its result."""
+        self.renew_motion(np.flatnonzero(free_units & self.registered))
         problem, tracks = self.problem(
             free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
         )
@@ -290,5 +297,4 @@ class Model:
         points = self.state.points_m
         points[tracks] = solution.points_m
         self.state = replace(solution, points_m=points)
-        self.renew_motion(np.flatnonzero(free_units & self.registered))
         return report

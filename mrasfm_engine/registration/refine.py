@@ -31,8 +31,6 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering
-MAX_MOTION_ROUNDS = 6  # of adjusting and renewing the motion within units, which depend on one another
-MOTION_TOLERANCE_M = 2e-4
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 1e-6  # scale is a weak direction: it must arrive as well
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
@@ -111,19 +109,16 @@ def refine(
     for done in range(ROUNDS):
         result.sigma_px = _observation_sigma(model)
         terms = _terms(model, positions, result)
-        for _ in range(MAX_MOTION_ROUNDS):
-            result.adjustments.append(
-                model.adjust(
-                    free_units & model.registered,
-                    free_cameras=np.full(len(model.camera_kind), result.calibration.free),
-                    free_focal=result.focal_free,
-                    terms=terms,
-                    options=_options(model, result.sigma_px, iterations=40 if done == ROUNDS - 1 else 15),
-                    cancel=cancel,
-                )
+        result.adjustments.append(
+            model.adjust(
+                free_units & model.registered,
+                free_cameras=np.full(len(model.camera_kind), result.calibration.free),
+                free_focal=result.focal_free,
+                terms=terms,
+                options=_options(model, result.sigma_px, iterations=40 if done == ROUNDS - 1 else 15),
+                cancel=cancel,
             )
-            if model.motion.last_change_m < MOTION_TOLERANCE_M:
-                break
+        )
         if done < ROUNDS - 1:
             model.complete()
         else:

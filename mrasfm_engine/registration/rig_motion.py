@@ -1,17 +1,19 @@
 """Where the rig stands when an image is taken, relative to its unit's timestamp.
 
 `State.unit_from_shot` comes from the units' own trajectory: the motion around a unit is interpolated from the
-registered units before and after it. It is held while units are adjusted, and renewed between adjustments. The same
-place holds poses that images have of their own, apart from the rig.
+registered units before and after it, and follows them when they are adjusted: were it held meanwhile, baselines between
+cameras that are not simultaneous would hold on to the scale that it has, and adjusting and renewing in turns need not
+converge. The same place holds poses that images have of their own, apart from the rig.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.adjustment.problem import ShotMotion
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.local_motion import LocalMotion, local_motion, smoothed_velocity
 from mrasfm_engine.scene.shots import Shots
@@ -26,9 +28,8 @@ PRIOR_WINDOW_S = 1.0  # over which the velocity of noisy prior poses is averaged
 
 @dataclass(frozen=True, kw_only=True)
 class LargestMotion:
-    """The most that images are apart from their unit, over the registered units."""
+    """The most that shots are apart from their unit, over the registered units."""
 
-    time_offset_s: float
     translation_m: float
     rotation_deg: float
 
@@ -50,7 +51,6 @@ class RigMotion:
         self._own = np.zeros(len(shots.middle_of_image), dtype=np.bool_)
         self._unit_from_image = np.tile(np.eye(4), (len(self._own), 1, 1))
         self._shot_range = np.searchsorted(shots.unit, np.arange(len(timestamps_us) + 1))
-        self.last_change_m = 0.0  # how far the last renewal moved the rig at a shot
         self._prior_velocity = np.zeros((len(timestamps_us), 6))  # of units without registered neighbours
 
     def follow_prior(self, world_from_rig: Floats) -> None:
@@ -85,14 +85,37 @@ class RigMotion:
         """
         if state.simultaneous:
             return 0.0
+        motion = self._motion(state, registered)
+        chosen = np.flatnonzero(registered) if units is None else _with_neighbours(units, registered)
+        return self._apply(state, motion, self._shots_of(chosen))
+
+    def _motion(self, state: State, registered: Bools) -> LocalMotion:
         motion = local_motion(state.world_from_rig, self._time_s, registered)
         motion.velocity[~motion.known] = self._prior_velocity[~motion.known]
         gap = np.where(motion.known, 0.0, np.inf)  # nothing bounds a prior's motion but the images' own times
         motion.earliest_s[:] -= gap
         motion.latest_s[:] += gap
-        chosen = np.flatnonzero(registered) if units is None else _with_neighbours(units, registered)
-        self.last_change_m = self._apply(state, motion, self._shots_of(chosen))
-        return self.last_change_m
+        return motion
+
+    def in_adjustment(self, state: State, registered: Bools, free_units: Bools) -> ShotMotion | None:
+        """How shots follow the free units while these are adjusted; images with poses of their own do not."""
+        if state.simultaneous:
+            return None
+        rows = self._shots_of(_with_neighbours(np.flatnonzero(free_units & registered), registered))
+        motion = self._motion(state, registered)
+        moving = rows[~self._own[self.shots.image[rows]]]
+        held = ShotMotion.held(self.shots.unit)
+        held.support[moving] = motion.support[self.shots.unit[moving]]
+        held.weight[moving] = motion.weights(self.shots.unit[moving], self.shots.time_offset_s[moving])
+
+        def follow(after: State) -> State:
+            after = replace(
+                after, shot_rotation=after.shot_rotation.copy(), shot_position_m=after.shot_position_m.copy()
+            )
+            self._apply(after, self._motion(after, registered), rows)
+            return after
+
+        return ShotMotion(support=held.support, weight=held.weight, follow=follow)
 
     def predict(self, state: State, registered: Bools, unit: int) -> None:
         """Set `unit_from_shot` of a unit that has no pose yet: it moves as its registered neighbours do."""
@@ -133,9 +156,8 @@ class RigMotion:
         """How far apart images and units are."""
         rows = np.flatnonzero(registered[self.shots.unit])
         if state.simultaneous or not len(rows):
-            return LargestMotion(time_offset_s=0.0, translation_m=0.0, rotation_deg=0.0)
+            return LargestMotion(translation_m=0.0, rotation_deg=0.0)
         return LargestMotion(
-            time_offset_s=float(np.abs(self.shots.time_offset_s[rows]).max()),
             translation_m=float(np.linalg.norm(state.shot_position_m[rows], axis=1).max()),
             rotation_deg=float(se3.rotation_angle_deg(state.shot_rotation[rows]).max()),
         )

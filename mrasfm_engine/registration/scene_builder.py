@@ -11,6 +11,7 @@ from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
 from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.registration.calibration import calibration_prior
+from mrasfm_engine.registration.keyframes import nearest_keyframes
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
 from mrasfm_engine.registration.road import RoadJudgement
@@ -42,7 +43,9 @@ def build_scene(
     poses[~model.registered] = np.nan
     sigma = np.full((units, 3), np.nan)
     if refinement.certainty is not None:
-        sigma = refinement.certainty.sigma_unit_position_m
+        sigma = refinement.certainty.sigma_unit_position_m.copy()
+        between = ~model.keyframe & model.registered
+        sigma[between] = sigma[nearest_keyframes(model)[between]]
     georeferenced = refinement.georeferenced
     patches, judged = np.full(len(model.tracks), -1, dtype=np.int32), refinement.road
     if isinstance(judged, RoadJudgement):

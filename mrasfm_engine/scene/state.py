@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A value of all variables, free or not, and the units' motion, which is held while they are adjusted.
+    """A value of all variables, free or not, and the units' motion, which follows from them.
 
     The camera of a shot (see `scene.shots`) stands at world_from_rig * unit_from_shot * rig_from_cam. Without shots all
     images are taken at their unit's timestamp.

@@ -116,6 +116,7 @@ def simulate_observations(
     image_size_px: tuple[int, int] = (960, 540),
     time_offset_s: ArrayLike = 0.0,
     readout_s: float = 0.0,
+    way_m: Floats | None = None,
     rng: np.random.Generator,
 ) -> SimulatedObservations:
     """Random points around a trajectory and what the cameras see of them.
@@ -141,6 +142,8 @@ def simulate_observations(
         When each camera (cameras,) takes its image, from its unit's timestamp on; for a rolling shutter its middle row.
     readout_s
         Time from the first row of an image to the last.
+    way_m
+        Way driven until every unit (units,), instead of equal steps of `spacing_m`: a car that stands or creeps.
     rng
         Source of everything random.
 
@@ -159,8 +162,12 @@ def simulate_observations(
     rig = true_cameras(cameras, width=width, height=height, rng=rng)
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
     params = np.array([camera.params for camera in rig])
-    world_from_rig = simulate_trajectory(units, spacing_m=spacing_m, straight=straight)
-    world = _points_along(world_from_rig, points, rng)
+    steady_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
+    way = steady_m if way_m is None else np.asarray(way_m, dtype=np.float64)
+    world_from_rig = poses_along(way, spacing_m=spacing_m, straight=straight)
+    steps = max(2, round(float(np.ptp(way)) / spacing_m) + 1)
+    along = world_from_rig if way_m is None else simulate_trajectory(steps, spacing_m=spacing_m, straight=straight)
+    world = _points_along(along, points, rng)
 
     cam_from_world = se3.inverse(world_from_rig[:, None] @ rig_from_cam[None])
     in_camera = se3.apply(cam_from_world, world)  # (units, cameras, points, 3)
@@ -175,7 +182,10 @@ def simulate_observations(
         for _ in range(_ROW_ROUNDS):
             # The row tells the time, and the time the row.
             at_s = time_s + (xy[which][:, 1] / height - 0.5) * readout_s
-            then = poses_along(at_s * RATE_HZ * spacing_m, spacing_m=spacing_m, straight=straight)
+            way_then = at_s * RATE_HZ * spacing_m
+            if way_m is not None:
+                way_then = np.interp(at_s * RATE_HZ, np.arange(units), way)
+            then = poses_along(way_then, spacing_m=spacing_m, straight=straight)
             local = se3.apply(se3.inverse(then @ rig_from_cam[which[1]]), world[which[2], None])[:, 0]
             xy[which] = local[:, :2] / local[:, 2:].clip(0.3) * params[which[1], :2] + params[which[1], 2:]
         seen[which] = (local[:, 2] > 0.3) & np.all((xy[which] > 0) & (xy[which] < np.array([width, height])), -1)

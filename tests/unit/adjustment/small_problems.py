@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.adjustment.priors import Term
-from mrasfm_engine.adjustment.problem import Layout, Observations, retract
+from mrasfm_engine.adjustment.problem import Layout, Observations
 from mrasfm_engine.adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL, project_points
@@ -137,7 +137,7 @@ def perturbed(
 def moved(problem: Problem, state: State, step: np.ndarray) -> State:
     """The state after a step of the full vector: units and cameras as in the layout, then points."""
     n = problem.layout.size
-    return retract(state, problem.layout, step[:n], state.points_m + step[n:].reshape(-1, 3))
+    return problem.retract(state, step[:n], state.points_m + step[n:].reshape(-1, 3))
 
 
 def weighted_residuals(problem: Problem, state: State) -> np.ndarray:

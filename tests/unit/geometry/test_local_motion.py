@@ -98,3 +98,23 @@ def test_velocity_of_noisy_poses_is_averaged_and_zero_where_nothing_is_known() -
     error = np.linalg.norm(velocity[15:30, 3:] - twist[3:], axis=1)
     assert 0.005 < np.median(error) < 0.4  # from one unit to the next it would be 4 m/s
     np.testing.assert_allclose(velocity[15:30, :3], np.tile(twist[:3], (15, 1)), atol=1e-9)
+
+
+def test_weights_tell_how_the_pose_follows_its_neighbours() -> None:
+    time_s = np.array([0.0, 0.1, 0.25, 0.33])
+    poses = driven(time_s, np.array([0.0, 0.0, 0.0, 8.0, 0.0, 0.0]))
+    motion = local_motion(poses, time_s, all_known(time_s))
+    unit, offset_s = np.array([0, 1, 2, 3, 1]), np.array([-0.04, 0.05, -0.06, 0.03, 0.0])
+    weight, support = motion.weights(unit, offset_s), motion.support[unit]
+    np.testing.assert_array_equal(np.sort(support, axis=1), [[0, 1, 2], [0, 1, 2], [1, 2, 3], [1, 2, 3], [0, 1, 2]])
+    np.testing.assert_allclose(weight.sum(1), 1.0)
+    np.testing.assert_array_equal(weight[4], [1.0, 0.0, 0.0])
+    before = (poses[unit] @ motion.at(unit, offset_s))[:, :3, 3]
+    for other in range(4):
+        moved = poses.copy()
+        moved[other, :3, 3] += [1e-4, 2e-4, -1e-4]
+        after = (moved[unit] @ local_motion(moved, time_s, all_known(time_s)).at(unit, offset_s))[:, :3, 3]
+        share = np.where(support == other, weight, 0.0).sum(1)
+        np.testing.assert_allclose(after - before, share[:, None] * [1e-4, 2e-4, -1e-4], atol=1e-9)
+    alone = local_motion(poses, time_s, np.array([False, True, True, False]))
+    np.testing.assert_allclose(alone.weights(np.array([1, 0]), np.array([0.03, 0.03])), [[0.8, 0.2, 0.0], [1, 0, 0]])

@@ -81,6 +81,37 @@ def test_colmap_reads_the_model_and_its_points_project_onto_their_keypoints(
     assert 0 < model.compute_mean_reprojection_error() < 1e-4
 
 
+def test_images_that_are_not_simultaneous_are_frames_of_their_own(tmp_path: Path) -> None:
+    scene = make_scene(moving=True)
+    write_scene(scene, tmp_path / "out", {})
+    model = pycolmap.Reconstruction(str(tmp_path / "out" / "model"))
+    registered = (np.flatnonzero(scene.image_registered) + 1).tolist()
+    assert sorted(model.frames) == registered
+    errors = [
+        np.linalg.norm(
+            model.images[e.image_id].project_point(p.xyz) - model.images[e.image_id].points2D[e.point2D_idx].xy
+        )
+        for p in model.points3D.values()
+        for e in p.track.elements
+        for image in [model.images[e.image_id]]
+    ]
+    assert 0 < max(errors) < 1e-3
+    poses = read_poses(tmp_path / "out")
+    np.testing.assert_allclose(poses.trajectory.world_from_rig, scene.world_from_rig[scene.unit_registered], atol=1e-9)
+    for i, image in enumerate(scene.drive.images):
+        if scene.image_registered[i]:
+            np.testing.assert_allclose(poses.world_from_cam[image.file], scene.world_from_cam[i], atol=1e-9)
+            pose = model.images[i + 1].cam_from_world().inverse().matrix()
+            np.testing.assert_allclose(pose, scene.world_from_cam[i][:3], atol=1e-9)
+    apart = scene.world_from_cam[0][:3, 3] - (scene.world_from_rig[0] @ scene.calibration[0].rig_from_cam)[:3, 3]
+    assert 0.05 < np.linalg.norm(apart) < 2.0
+    document = json.loads((tmp_path / "out" / "poses.json").read_text())
+    assert "at its own" in document["pose_time"]
+    database = pycolmap.Database.open(str(tmp_path / "out" / "features.db"))
+    assert [image.frame_id for image in database.read_all_images()] == list(range(1, 2 * UNITS + 1))
+    database.close()
+
+
 def test_the_rig_is_the_vehicle(scene: Scene, written: Path) -> None:
     model = pycolmap.Reconstruction(str(written / "model"))
     rig = model.rigs[1]

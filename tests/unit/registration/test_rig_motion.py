@@ -66,7 +66,6 @@ def test_the_motion_between_a_units_images_follows_from_its_neighbours() -> None
     assert 1e-6 < np.linalg.norm(error[:, :3, 3], axis=1).max() < 0.005
     assert 1e-4 < se3.rotation_angle_deg(error[:, :3, :3]).max() < 0.1
     largest = model.motion.largest(model.state, model.registered)
-    assert largest.time_offset_s == pytest.approx(0.05)
     assert 0.5 < largest.translation_m < 0.6
     assert 0.1 < largest.rotation_deg < 3.0
 

@@ -89,6 +89,36 @@ def test_truth_agrees_with_itself(drive: Path) -> None:
         np.testing.assert_allclose(given[name], matrix_from_pose(Pose(**pose)), atol=1e-12)
 
 
+def test_a_turn_is_a_quarter_of_a_circle_and_smooth() -> None:
+    options = SynthOptions(world=World.TURN, units=40, speed_profile=SpeedProfile.VARYING)
+    poses = poses_of(options)
+    yaw = np.degrees(np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])))
+    assert 40 < yaw[-1] - yaw[0] < 100
+    rate = np.diff(yaw) * 10
+    assert 30 < rate.max() < 110
+    assert np.abs(np.diff(rate)).max() * 10 < 250  # deg/s^2
+    speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) * 10
+    assert 2.5 < speed.min() < 5
+    assert 9 < speed.max() < 15  # the outer lane is longer than the street
+
+
+def test_rows_of_a_rolling_shutter_are_rendered_at_their_own_times(tmp_path: Path) -> None:
+    same = {"cameras": 1, "moving_cars": 0, "noise": 0.0, "blur_px": 0.0, "spacing_m": 1.5}
+    rolling, still = (
+        render_drives(small_options(**TINY, **same, readout_ms=ms), tmp_path / f"{ms}")[0] for ms in (90.0, 0.0)
+    )
+    assert load(rolling).rig.cameras[0].readout_us == 90_000
+    assert load(still).rig.cameras[0].readout_us is None
+    name = load(still).rig.cameras[0].name
+    a, b = (cv2.imread(str(d / "images" / name / "000001.jpg")).astype(float) for d in (rolling, still))
+    assert a.shape == b.shape
+    rows = np.abs(a - b).mean((1, 2))
+    third = len(rows) // 10
+    middle, outside = rows[len(rows) // 2 - third // 2 :][:third].mean(), rows[-third:].mean()
+    assert middle < 0.5 * outside  # the middle row is at the image's timestamp
+    assert outside > 5
+
+
 def test_images_obey_the_true_epipolar_geometry(drive: Path) -> None:
     manifest = load(drive)
     images = json.loads((drive / "truth_cameras.json").read_text())

@@ -6,7 +6,24 @@ import pytest
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic import simulate_observations
-from mrasfm_engine.synthetic.simulate import simulate_trajectory
+from mrasfm_engine.synthetic.simulate import poses_along, simulate_trajectory
+
+
+def test_cameras_and_rows_have_their_own_times() -> None:
+    offset_s = np.array([0.0, 0.04, -0.03])
+    rng = np.random.default_rng(0)
+    s = simulate_observations(
+        units=5, cameras=3, points=300, noise_px=0.0, time_offset_s=offset_s, readout_s=0.03, rng=rng
+    )
+    time_s = s.unit / 10 + offset_s[s.camera] + (s.xy_px[:, 1] / s.image_size_px[1] - 0.5) * 0.03
+    then = poses_along(time_s * 10 * 1.1)
+    local = se3.apply(se3.inverse(then @ s.rig_from_cam[s.camera]), s.points_m[s.point][:, None])[:, 0]
+    pixels = local[:, :2] / local[:, 2:] * s.camera_params[s.camera, :2] + s.camera_params[s.camera, 2:]
+    np.testing.assert_allclose(pixels, s.xy_px, atol=0.01)
+    world_from_cam = s.world_from_rig[s.unit] @ s.rig_from_cam[s.camera]
+    at_unit = se3.apply(se3.inverse(world_from_cam), s.points_m[s.point][:, None])[:, 0]
+    skewed = np.abs(at_unit[:, :2] / at_unit[:, 2:] - local[:, :2] / local[:, 2:]).max(1) * s.camera_params[0, 0]
+    assert np.median(skewed[s.camera == 1]) > 3
 
 
 def test_exact_observations_are_projections() -> None:
