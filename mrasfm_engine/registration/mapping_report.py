@@ -13,7 +13,7 @@ from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES
 from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
-from mrasfm_engine.registration.wrong_camera import often_voted_out
+from mrasfm_engine.registration.wrong_camera import voted_out
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
@@ -38,7 +38,7 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "registered_units": int(model.registered.sum()),
         "units_not_registered": missing,
         "registered_by": dict(Counter(r.method for r in log.registrations)),
-        "cameras_voted_out": often_voted_out(log.registrations, {(c["unit"], c["camera"]) for c in covered}),
+        "cameras_voted_out": voted_out(log.registrations, {image["unit"] for image in covered}),
         "cameras_without_a_vote": dict(unclear),
         "images_occluded": covered,
         "images_posed_by_their_unit_alone": _poorly_seen(model),
@@ -126,7 +126,7 @@ def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
             for c, camera in enumerate(cameras)
         },
         "held_for_all_cameras_together": [*DIRECTIONS],
-        "scale_of_the_rig": "observed by positions" if directions.scale_observed else "only the prior",
+        "scale_of_the_rig": directions.scale_in_words,
         "cameras_wrong": [
             {
                 "camera": cameras[w.camera].name,

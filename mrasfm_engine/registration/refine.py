@@ -19,6 +19,8 @@ from mrasfm_engine.registration.calibration import (
     CalibrationVerdict,
     calibration_prior,
     judge_calibration,
+    scale_of_baselines,
+    scale_with_baselines,
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
@@ -134,8 +136,10 @@ def refine(
     result.certainty = _certainty(model, positions, result)
     result.directions = _directions(model, result.certainty)
     if result.calibration.free and result.directions is not None and result.certainty is not None:
-        if not result.directions.observed.all():
+        if result.directions.to_hold.any():
             _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
+        if result.georeferenced and result.directions.scale_only_prior:
+            scale_with_baselines(model, scale_of_baselines(model)[0])
         result.wrong_cameras = find_wrong_cameras(
             calibration_prior(model), model.state, result.certainty, result.directions
         )
@@ -168,7 +172,7 @@ def _hold_unobserved(
     finding.
     """
     assert result.directions is not None
-    result.held = ~result.directions.observed
+    result.held = result.directions.to_hold
     result.adjustments.append(
         model.adjust(
             free_units,

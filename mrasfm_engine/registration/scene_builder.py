@@ -71,6 +71,9 @@ def _verdict(refinement: Refinement) -> CalibrationVerdict:
         adjusted=refinement.calibration.free,
         reason=refinement.calibration.reason,
         scale_observed=refinement.calibration.free and directions is not None and directions.scale_observed,
+        scale_rests_on="what was given"
+        if directions is None or not refinement.calibration.free
+        else directions.scale_in_words,
         sigma_scale=np.nan if directions is None else directions.sigma_scale,
     )
 

@@ -24,8 +24,6 @@ BEYOND_PRIOR_SIGMAS = 5.0  # of the prior: what was declared cannot be true
 UNUSUAL = 5.0  # times the other cameras' median correction, where that is more than
 MIN_UNUSUAL_DEG, MIN_UNUSUAL_M = 1.0, 0.1  # what mountings and calibrations are off by as a rule
 MIN_OTHERS = 2  # cameras that say what is usual
-VOTED_OUT_SHARE = 0.5  # of the units registered by vote, where calibration is held
-MIN_VOTED_OUT = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +83,9 @@ def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Flo
     return bool(np.linalg.norm(own) > usual)
 
 
-def often_voted_out(registrations: Sequence[Registration], covered: set[tuple[int, str]]) -> dict[str, int]:
-    """How often cameras were voted out, by name; `covered` are units and cameras with something else to blame."""
-    return dict(Counter(name for r in registrations for name in r.voted_out if (r.unit, name) not in covered))
+def voted_out(registrations: Sequence[Registration], covered_units: set[int]) -> dict[str, int]:
+    """How often cameras were voted out, by name; in a unit with a covered image that is no fault of a camera."""
+    return dict(Counter(name for r in registrations for name in r.voted_out if r.unit not in covered_units))
 
 
 def finding(name: str, wrong: WrongCamera) -> Finding:
