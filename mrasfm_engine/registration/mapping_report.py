@@ -85,6 +85,9 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
         "adjustments": [_adjustment(r) for r in refinement.adjustments],
         "calibration": {
             "adjusted": refinement.calibration.free,
+            "adjusted_cameras": [
+                c.name for c, a in zip(model.drive.cameras, refinement.recalibrated, strict=True) if a
+            ],
             "reason": refinement.calibration.reason,
             "heading_change_deg": heading_change_deg(model),
             **_directions(model, refinement),
@@ -115,7 +118,7 @@ def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
     cameras, directions = model.drive.cameras, refinement.directions
     if directions is None:
         return {}
-    observed = directions.observed & refinement.calibration.free
+    observed = directions.observed & refinement.recalibrated[:, None]
     return {
         "observed": {
             camera.name: [d for d, seen in zip(DIRECTIONS, observed[c], strict=True) if seen]

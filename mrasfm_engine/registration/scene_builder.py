@@ -87,8 +87,8 @@ def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibratio
         sigma = refinement.certainty.sigma_camera[:, :6]
         if refinement.focal_free:
             focal = refinement.certainty.sigma_camera[:, 6] * model.state.camera_params[:, 0]
-    if refinement.calibration.free and refinement.directions is not None:
-        observed = refinement.directions.observed
+    if refinement.directions is not None:
+        observed = refinement.directions.observed & refinement.recalibrated[:, None]
     wrong = {w.camera for w in refinement.wrong_cameras}
     return [
         CameraCalibration(
