@@ -45,7 +45,11 @@ def find_wrong_cameras(
 
     Only directions count that the drive observes.
     """
-    corrections = np.where(directions.observed, prior.corrections(state), 0.0)
+    corrections = prior.corrections(state)
+    if len(corrections) > MIN_OTHERS:
+        # What all cameras share is held, not observed, and one that is wrong has its part in how it is held.
+        corrections = corrections - np.median(corrections, axis=0)
+    corrections = np.where(directions.observed, corrections, 0.0)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
     # The common scale may be off: it moves all cameras, and is no fault of one.
     posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
