@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+ONLY_PRIOR_RATIO = 0.9  # of the scale: above, positions say nothing that its prior does not
 OBSERVED_RATIO = 0.5  # a direction counts as observed when its posterior sigma is below this share of the prior's
 MIN_OWN_SHARE = 0.1  # of a direction's prior variance that is left when the motions that no image shows are held
 
@@ -31,8 +32,22 @@ class Observability:
         Floats  # (c, 6) posterior over prior sigma of the same; NaN where nothing of the direction is the camera's own
     )
     scale_observed: bool  # whether positions know the size of the rig better than its prior does
+    scale_only_prior: bool  # or say nothing of it at all
     sigma_scale: float  # posterior, relative, of the cameras' distances
     prior_sigma_scale: float  # by the priors of the cameras' places; infinite where these are one
+
+    @property
+    def to_hold(self) -> Bools:
+        """Directions (c, 6) to leave as given; what is nothing but scale only where positions say nothing of that."""
+        result: Bools = ~self.observed & (np.isfinite(self.ratio) | self.scale_only_prior)
+        return result
+
+    @property
+    def scale_in_words(self) -> str:
+        """What the size of the rig rests on."""
+        if self.scale_observed:
+            return "observed by positions"
+        return "only the prior" if self.scale_only_prior else "the prior and positions"
 
 
 def judge_directions(
@@ -56,6 +71,7 @@ def judge_directions(
             observed=np.zeros((cameras, 6), dtype=np.bool_),
             ratio=np.full((cameras, 6), np.inf),
             scale_observed=False,
+            scale_only_prior=False,
             sigma_scale=np.inf,
             prior_sigma_scale=np.inf,
         )
@@ -81,6 +97,7 @@ def judge_directions(
         observed=np.nan_to_num(ratio, nan=np.inf) < OBSERVED_RATIO,
         ratio=ratio,
         scale_observed=scale_observed,
+        scale_only_prior=posterior_scale > ONLY_PRIOR_RATIO * prior_scale,
         sigma_scale=posterior_scale,
         prior_sigma_scale=prior_scale,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,12 +91,31 @@ def _say(report: dict[str, Any], out: Path) -> None:
         print(f"  scale sigma:      {refinement['scale']['sigma_relative']:.2%}")
     calibration = refinement["calibration"]
     print(f"  calibration:      {'refined' if calibration['adjusted'] else 'held'} ({calibration['reason']})")
+    for line in _verdicts(calibration):
+        print(f"    {line}")
     if "pictures" in stages:
         print(f"  road from above:  {_birds_eye(stages['pictures']['birds_eye'], out)}")
+    for camera, images in Counter(image["camera"] for image in mapping["images_occluded"]).items():
+        print(f"  occluded:         {camera} in {images} images, by something that moves along")
     for finding in report["findings"]:
         print(f"  {finding['severity']}: {finding['what']}")
     for missing in mapping["units_not_registered"]:
         print(f"  not registered: frame {missing['source_frame']}: {missing['reason']}")
+
+
+def _verdicts(calibration: dict[str, Any]) -> list[str]:
+    """What the refined calibration rests on, a line for cameras that have the same in common."""
+    if not calibration["adjusted"] or "observed" not in calibration:
+        return []
+    by_directions: dict[tuple[str, ...], list[str]] = {}
+    for camera, directions in calibration["only_the_prior"].items():
+        by_directions.setdefault(tuple(directions), []).append(camera)
+    lines = [
+        f"{', '.join(cameras)}: "
+        + (f"only the prior for {', '.join(names)}" if names else "observed in all directions")
+        for names, cameras in by_directions.items()
+    ]
+    return [*lines, f"all cameras together: held; scale of the rig: {calibration['scale_of_the_rig']}"]
 
 
 def _birds_eye(seen: dict[str, Any], out: Path) -> str:

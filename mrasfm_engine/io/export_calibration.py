@@ -42,7 +42,7 @@ def _common(verdict: CalibrationVerdict) -> dict[str, Any]:
     return {
         "rotation": {"observed": [False] * 3, "verdict": ["held"] * 3},
         "translation": {"observed": [False] * 3, "verdict": ["held"] * 3},
-        "scale": scale | {"verdict": "observed by positions" if verdict.scale_observed else ONLY_PRIOR},
+        "scale": scale | {"verdict": verdict.scale_rests_on},
     }
 
 

@@ -15,7 +15,7 @@ from mrasfm_engine.registration.incremental import MappingLog
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement
 from mrasfm_engine.registration.road import RoadJudgement
-from mrasfm_engine.registration.wrong_camera import often_voted_out
+from mrasfm_engine.registration.wrong_camera import voted_out
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.shots import Shots
 
@@ -43,7 +43,7 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "units_not_registered": missing,
         "units_without_motion": int((~model.keyframe).sum()),
         "registered_by": dict(Counter(r.method for r in log.registrations)),
-        "cameras_voted_out": often_voted_out(log.registrations, {(c["unit"], c["camera"]) for c in covered}),
+        "cameras_voted_out": voted_out(log.registrations, {image["unit"] for image in covered}),
         "cameras_without_a_vote": dict(unclear),
         "images_occluded": covered,
         "images_posed_by_their_unit_alone": _poorly_seen(model),
@@ -91,6 +91,9 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
         "adjustments": [_adjustment(r) for r in refinement.adjustments],
         "calibration": {
             "adjusted": refinement.calibration.free,
+            "adjusted_cameras": [
+                c.name for c, a in zip(model.drive.cameras, refinement.recalibrated, strict=True) if a
+            ],
             "reason": refinement.calibration.reason,
             "heading_change_deg": heading_change_deg(model),
             **_directions(model, refinement),
@@ -123,7 +126,7 @@ def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
     cameras, directions = model.drive.cameras, refinement.directions
     if directions is None:
         return {}
-    observed = directions.observed & refinement.calibration.free
+    observed = directions.observed & refinement.recalibrated[:, None]
     return {
         "observed": {
             camera.name: [d for d, seen in zip(DIRECTIONS, observed[c], strict=True) if seen]
@@ -134,7 +137,7 @@ def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
             for c, camera in enumerate(cameras)
         },
         "held_for_all_cameras_together": [*DIRECTIONS],
-        "scale_of_the_rig": "observed by positions" if directions.scale_observed else "only the prior",
+        "scale_of_the_rig": directions.scale_in_words,
         "cameras_wrong": [
             {
                 "camera": cameras[w.camera].name,

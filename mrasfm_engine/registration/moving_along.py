@@ -82,10 +82,8 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
 
 
 def units_to_doubt(model: Model, covered: Bools) -> Ints:
-    """Units whose covered images (images,) may have outvoted the others: their pose has to be found anew."""
-    units = len(model.registered)
-    images = np.bincount(model.image_unit, minlength=units)
-    doubt = model.registered & (2 * np.bincount(model.image_unit[covered], minlength=units) >= images)
+    """Units with covered images (images,): these may have outvoted the others, so their pose has to be found anew."""
+    doubt = model.registered & (np.bincount(model.image_unit[covered], minlength=len(model.registered)) > 0)
     # A scene of two units is the least to register others against.
     return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.calibration_verdict import Observability, judge_directions
 from mrasfm_engine.adjustment.observability import Covariances, covariances
-from mrasfm_engine.adjustment.priors import FocalPrior, PositionPrior, Term, UprightPrior
-from mrasfm_engine.adjustment.solver import Report, SolverOptions
+from mrasfm_engine.adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.adjustment.solver import Report, SolverOptions, solve
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.registration.calibration import (
@@ -19,12 +19,14 @@ from mrasfm_engine.registration.calibration import (
     CalibrationVerdict,
     calibration_prior,
     judge_calibration,
+    scale_of_baselines,
+    scale_with_baselines,
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
 from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
-from mrasfm_engine.registration.wrong_camera import WrongCamera, find_wrong_cameras
+from mrasfm_engine.registration.wrong_camera import MIN_OTHERS, WrongCamera, find_wrong_cameras
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,6 +46,7 @@ class Refinement:
     placement: Placement | None = None  # by GNSS, where it was to be used
     calibration: CalibrationVerdict = field(default_factory=lambda: CalibrationVerdict(False, ""))
     focal_free: bool = False
+    recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
     points_dropped: int = 0
@@ -103,6 +106,9 @@ def refine(
         georeferenced=positions is not None,
         options=_options(model, result.sigma_px, iterations=1),
     )
+    result.recalibrated = np.full(len(model.camera_kind), result.calibration.free)
+    if not result.calibration.free:
+        result.recalibrated = _wrong_although_held(model, free_units, positions, result, cancel)
     result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
     if result.calibration.free and result.placement is not None:
         share_scale(model, result.placement)
@@ -112,7 +118,7 @@ def refine(
         result.adjustments.append(
             model.adjust(
                 free_units & model.registered,
-                free_cameras=np.full(len(model.camera_kind), result.calibration.free),
+                free_cameras=result.recalibrated,
                 free_focal=result.focal_free,
                 terms=terms,
                 options=_options(model, result.sigma_px, iterations=40 if done == ROUNDS - 1 else 15),
@@ -134,13 +140,48 @@ def refine(
     result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _certainty(model, positions, result)
     result.directions = _directions(model, result.certainty)
-    if result.calibration.free and result.directions is not None and result.certainty is not None:
-        if not result.directions.observed.all():
+    if result.recalibrated.any() and result.directions is not None and result.certainty is not None:
+        if result.calibration.free and result.directions.to_hold.any():
             _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
+        if result.georeferenced and result.directions.scale_only_prior:
+            scale_with_baselines(model, scale_of_baselines(model)[0])
         result.wrong_cameras = find_wrong_cameras(
             calibration_prior(model), model.state, result.certainty, result.directions
         )
     return result
+
+
+def _wrong_although_held(
+    model: Model,
+    free_units: Bools,
+    positions: PositionPrior | None,
+    result: Refinement,
+    cancel: Callable[[], bool] | None,
+) -> Bools:
+    """Cameras (c,) that are clearly wrong although the drive may not change the calibration as a whole.
+
+    A straight street leaves the scale to the calibration, but shows very well that one camera looks elsewhere than the
+    others say. It is tried with all cameras free; the result is used for nothing else.
+    """
+    cameras = len(model.camera_kind)
+    wrong = np.zeros(cameras, dtype=np.bool_)
+    if cameras <= MIN_OTHERS or not model.config.adjustment.refine_calibration or model.drive.has_single_camera:
+        return wrong
+    problem, _ = model.problem(
+        free_units,
+        free_cameras=np.ones(cameras, dtype=np.bool_),
+        terms=[calibration_prior(model), *_terms(model, positions, result)],
+        options=_options(model, result.sigma_px, iterations=15),
+    )
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
+        return wrong
+    solution, _ = solve(problem, cancel=cancel)
+    certainty = covariances(problem, solution)
+    directions = _directions(model, certainty)
+    if directions is not None:
+        for found in find_wrong_cameras(calibration_prior(model), solution, certainty, directions):
+            wrong[found.camera] = True
+    return wrong if (~wrong).sum() >= MIN_OTHERS else np.zeros_like(wrong)
 
 
 def _directions(model: Model, certainty: Covariances | None) -> Observability | None:
@@ -169,7 +210,7 @@ def _hold_unobserved(
     finding.
     """
     assert result.directions is not None
-    result.held = ~result.directions.observed
+    result.held = result.directions.to_hold
     result.adjustments.append(
         model.adjust(
             free_units,
@@ -223,6 +264,9 @@ def _terms(model: Model, positions: PositionPrior | None, result: Refinement) ->
     terms: list[Term] = []
     if result.calibration.free:
         terms.append(calibration_prior(model, result.held))
+    elif result.recalibrated.any():
+        # The cameras that stay hold the gauge.
+        terms.append(replace(calibration_prior(model), gauge_weights=(~result.recalibrated).astype(np.float64)))
     if result.focal_free:
         terms.append(_focal_prior(model))
     if positions is not None:
@@ -246,7 +290,11 @@ def _focal_prior(model: Model) -> FocalPrior:
 def _certainty(model: Model, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
     """Covariances with the calibration free under its prior, also where it was held: its error is there as well."""
     several = not model.drive.has_single_camera
-    terms = _terms(model, positions, result)
+    terms = [
+        term
+        for term in _terms(model, positions, result)
+        if result.calibration.free or not isinstance(term, CalibrationPrior)
+    ]
     if several and not result.calibration.free:
         terms.append(calibration_prior(model))
     problem, _ = model.problem(

@@ -83,6 +83,9 @@ def _verdict(refinement: Refinement) -> CalibrationVerdict:
         adjusted=refinement.calibration.free,
         reason=refinement.calibration.reason,
         scale_observed=refinement.calibration.free and directions is not None and directions.scale_observed,
+        scale_rests_on="what was given"
+        if directions is None or not refinement.calibration.free
+        else directions.scale_in_words,
         sigma_scale=np.nan if directions is None else directions.sigma_scale,
     )
 
@@ -96,8 +99,8 @@ def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibratio
         sigma = refinement.certainty.sigma_camera[:, :6]
         if refinement.focal_free:
             focal = refinement.certainty.sigma_camera[:, 6] * model.state.camera_params[:, 0]
-    if refinement.calibration.free and refinement.directions is not None:
-        observed = refinement.directions.observed
+    if refinement.directions is not None:
+        observed = refinement.directions.observed & refinement.recalibrated[:, None]
     wrong = {w.camera for w in refinement.wrong_cameras}
     return [
         CameraCalibration(

@@ -24,8 +24,6 @@ BEYOND_PRIOR_SIGMAS = 5.0  # of the prior: what was declared cannot be true
 UNUSUAL = 5.0  # times the other cameras' median correction, where that is more than
 MIN_UNUSUAL_DEG, MIN_UNUSUAL_M = 1.0, 0.1  # what mountings and calibrations are off by as a rule
 MIN_OTHERS = 2  # cameras that say what is usual
-VOTED_OUT_SHARE = 0.5  # of the units registered by vote, where calibration is held
-MIN_VOTED_OUT = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +45,11 @@ def find_wrong_cameras(
 
     Only directions count that the drive observes.
     """
-    corrections = np.where(directions.observed, prior.corrections(state), 0.0)
+    corrections = prior.corrections(state)
+    if len(corrections) > MIN_OTHERS:
+        # What all cameras share is held, not observed, and one that is wrong has its part in how it is held.
+        corrections = corrections - np.median(corrections, axis=0)
+    corrections = np.where(directions.observed, corrections, 0.0)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
     # The common scale may be off: it moves all cameras, and is no fault of one.
     posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
@@ -85,9 +87,9 @@ def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Flo
     return bool(np.linalg.norm(own) > usual)
 
 
-def often_voted_out(registrations: Sequence[Registration], covered: set[tuple[int, str]]) -> dict[str, int]:
-    """How often cameras were voted out, by name; `covered` are units and cameras with something else to blame."""
-    return dict(Counter(name for r in registrations for name in r.voted_out if (r.unit, name) not in covered))
+def voted_out(registrations: Sequence[Registration], covered_units: set[int]) -> dict[str, int]:
+    """How often cameras were voted out, by name; in a unit with a covered image that is no fault of a camera."""
+    return dict(Counter(name for r in registrations for name in r.voted_out if r.unit not in covered_units))
 
 
 def finding(name: str, wrong: WrongCamera) -> Finding:

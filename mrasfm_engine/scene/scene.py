@@ -80,6 +80,7 @@ class CalibrationVerdict:
     adjusted: bool  # whether `rig_from_cam` varied at all
     reason: str
     scale_observed: bool  # whether positions tell the cameras' distances better than their priors
+    scale_rests_on: str  # the same in words
     sigma_scale: float  # relative, of the cameras' distances; NaN where not known
 
 

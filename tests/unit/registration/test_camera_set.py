@@ -5,6 +5,7 @@ import pytest
 from simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.registration import camera_set
 from mrasfm_engine.registration.camera_set import cameras_of, matrix_of, register_unit, rigid3d
 from mrasfm_engine.registration.model import Model
 
@@ -69,6 +70,50 @@ def test_pitfall_5_an_occluded_camera_gets_its_pose_from_the_unit() -> None:
     camera_pose = model.state.world_from_rig[UNIT] @ model.state.rig_from_cam[0]
     true = simulated.world_from_rig[UNIT] @ simulated.truth.rig_from_cam[0]
     assert 1e-6 < np.linalg.norm(camera_pose[:3, 3] - true[:3, 3]) < 0.05
+
+
+def test_where_the_joint_pose_fails_the_cameras_vote(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulated, model = scene()
+    monkeypatch.setattr(camera_set, "_joint_pose", lambda model, seen: None)
+    result = register_unit(model, UNIT)
+    assert result.method == "vote"
+    assert result.voted_out == result.unclear == ()
+    assert result.world_from_rig is not None
+    position_m, rotation_deg = errors(result.world_from_rig, simulated)
+    assert 1e-5 < position_m < 0.05
+    assert 1e-5 < rotation_deg < 0.1
+
+
+def test_two_cameras_against_two() -> None:
+    """Two are turned alike, so each half agrees in itself: the pose is that of one half, never in between."""
+    simulated, model = scene(cameras=4)
+    for camera in (1, 2):
+        turn_camera(model, camera, 6.0)
+    result = register_unit(model, UNIT)
+    assert result.world_from_rig is not None
+    names = [c.name for c in simulated.drive.cameras]
+    assert set(result.voted_out) in ({names[1], names[2]}, {names[0], names[3]})
+    turn = errors(result.world_from_rig, simulated)[1]
+    assert turn < 0.3 or 5.7 < turn < 6.3
+
+
+def test_all_cameras_but_one_are_covered() -> None:
+    """What covers them shows points that fit no pose of the unit; they have no vote, and are not called wrong."""
+    simulated, model = scene()
+    names = [c.name for c in simulated.drive.cameras]
+    rng = np.random.default_rng(3)
+    rows = model.rows_of_unit[UNIT]
+    nonsense = rows[model.keypoints.camera[rows] != 0]
+    model.keypoints.xy_px[nonsense] = rng.uniform(0, 1, (len(nonsense), 2)) * [960, 540]
+    keep = np.concatenate([rows[model.keypoints.camera[rows] == 0], nonsense[::2]])
+    model.rows_of_unit[UNIT] = np.sort(keep)
+    result = register_unit(model, UNIT)
+    assert result.world_from_rig is not None
+    position_m, rotation_deg = errors(result.world_from_rig, simulated)
+    assert 1e-5 < position_m < 0.15
+    assert 1e-5 < rotation_deg < 0.3
+    assert result.voted_out == ()
+    assert set(result.unclear) == set(names[1:])
 
 
 def test_wrong_correspondences_are_outvoted() -> None:
