@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera
-from mrasfm_engine.io.export_poses import world_from_cam
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import usable_pixels
@@ -109,7 +108,7 @@ def _mosaic_of(
     scene: Scene, plan_from_world: Floats, ground: GroundHeights, progress: Callable[[int, int], None] | None
 ) -> Mosaic:
     images = _nearest_first(scene)
-    refined = world_from_cam(scene)
+    refined = scene.world_from_cam
     gains = exposure_gains(scene)
     given = scene.drive.rig_from_cam
     views = []
