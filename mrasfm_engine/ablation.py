@@ -36,7 +36,7 @@ Progress = Callable[[str, str, int, int], None]  # row, stage, done, total
 
 @dataclass(frozen=True)
 class Switch:
-    """A part of the method that a setting turns off."""
+    """A part of the method that a setting turns off; the title is a heading in a table."""
 
     section: str
     field: str
@@ -61,11 +61,11 @@ class Switch:
 SWITCHES = tuple(
     switch
     for switch in (
-        Switch("adjustment", "camera_set_adjustment", "without camera set adjustment"),
-        Switch("mapping", "camera_set_registration", "without camera set registration"),
-        Switch("mapping", "semantic_triangulation", "without semantic triangulation"),
-        Switch("pairs", "selection", "without selection of pairs"),
-        Switch("adjustment", "priors", "without priors"),
+        Switch("adjustment", "camera_set_adjustment", "no CSBA"),
+        Switch("mapping", "camera_set_registration", "no camera set PnP"),
+        Switch("mapping", "semantic_triangulation", "no road surface"),
+        Switch("pairs", "selection", "all pairs"),
+        Switch("adjustment", "priors", "no priors"),
     )
     if switch.exists
 )
@@ -152,7 +152,7 @@ def ablate(
     base = _Store(work / FULL)
     seconds: dict[str, float] = {}
     for name, title, settings, remark in [
-        (FULL, "the full method", config, ""),
+        (FULL, FULL, config, ""),
         *((s.name, s.title, s.turned_off(config), _remark(s, drive, config)) for s in switches),
     ]:
         run = stages.Run(

@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -24,6 +24,7 @@ from mrasfm_engine.io.trajectory_file import read_tum
 
 if TYPE_CHECKING:
     from mrasfm_engine.ablation import Row
+    from mrasfm_engine.evaluation.pose_errors import PoseErrors
 
 RESULT = "ablation.json"
 TRUE_CALIBRATION = "truth_calibration.json"  # as `mrasfm synth` calls it
@@ -120,36 +121,40 @@ def _document(rows: Sequence[Row], source: str) -> dict[str, Any]:
 
 
 def _print_table(rows: Sequence[Row], source: str) -> None:
-    table = Table(title=f"Units and images against the truth; true calibration: {source}")
-    for name in ("", "images"):
-        table.add_column(name)
-    for name in (
-        "units:\nrotation\ndeg", "one to next\ndeg", "metric\nRMSE m", "similar\nRMSE m",
-        "images:\nrotation\ndeg", "camera to\ncamera deg", "metric\nRMSE m", "similar\nRMSE m",
-        "mapping\ns", "whole\ns", "para-\nmeters", "itera-\ntions",
-    ):  # fmt: skip
-        table.add_column(name, justify="right")
+    """Measures down, reconstructions across: so it fits into a terminal."""
+    console, table = Console(), Table()
+    table.add_column("")
     for row in rows:
-        title = row.title + (f"\n  ({row.remark})" if row.remark else "")
-        table.add_row(title, f"{row.registered_images} of {row.total_images}", *_cells(row))
-    Console().print(table)
+        table.add_column(row.title, justify="right")
+    for measure, of in MEASURES.items():
+        table.add_row(measure, *(of(row) for row in rows))
+    console.print(table)
+    console.print(f"Images are compared under the calibration {source}.", soft_wrap=True)
+    for row in rows:
+        if row.remark:
+            console.print(f"{row.title}: {row.remark}", soft_wrap=True)
 
 
-def _cells(row: Row) -> list[str]:
-    if row.errors is None:
-        return ["-"] * 8 + [_number(row.mapping_s, 1), _number(row.whole_s, 1), "-", "-"]
-    units, images = row.errors.units, row.errors.images
-    degrees = (units.rotation_median_deg, row.errors.relative_rotation_median_deg)
-    degrees_images = (images.rotation_median_deg, row.errors.camera_rotation_median_deg)
-    return [
-        *(_number(v, 4) for v in (*degrees, units.metric_rmse_m, units.similarity_rmse_m)),
-        *(_number(v, 4) for v in (*degrees_images, images.metric_rmse_m, images.similarity_rmse_m)),
-        _number(row.mapping_s, 1),
-        _number(row.whole_s, 1),
-        str(row.parameters),
-        str(row.iterations),
-    ]
+def _error(of: Callable[[PoseErrors], float]) -> Callable[[Row], str]:
+    return lambda row: "-" if row.errors is None else _number(of(row.errors), 4)
 
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+MEASURES: Mapping[str, Callable[[Row], str]] = {
+    "images registered": lambda row: str(row.registered_images),
+    "units: metric RMSE, m": _error(lambda e: e.units.metric_rmse_m),
+    "  after similarity, m": _error(lambda e: e.units.similarity_rmse_m),
+    "  rotation, deg": _error(lambda e: e.units.rotation_median_deg),
+    "  one to next, deg": _error(lambda e: e.relative_rotation_median_deg),
+    "images: metric RMSE, m": _error(lambda e: e.images.metric_rmse_m),
+    "  similarity, m": _error(lambda e: e.images.similarity_rmse_m),
+    "  rotations, deg": _error(lambda e: e.images.rotation_median_deg),
+    "  camera to camera, deg": _error(lambda e: e.camera_rotation_median_deg),
+    "parameters": lambda row: str(row.parameters),
+    "iterations": lambda row: str(row.iterations),
+    "mapping, s": lambda row: _number(row.mapping_s, 1),
+    "whole, s": lambda row: _number(row.whole_s, 1),
+}
