@@ -85,8 +85,8 @@ class Row:
         Seconds of mapping and refinement.
     whole_s
         With features and matches, also those that were taken from another row; None where they were finished before.
-    parameters, iterations
-        Of the final adjustment.
+    parameters, pose_parameters, iterations
+        Of the final adjustment; pose parameters are those of units (or images) and cameras.
     """
 
     name: str
@@ -98,6 +98,7 @@ class Row:
     mapping_s: float = float("nan")
     whole_s: float | None = None
     parameters: int = 0
+    pose_parameters: int = 0
     iterations: int = 0
 
 
@@ -239,6 +240,7 @@ def _row(
         mapping_s=done["mapping"]["seconds"] + done["refinement"]["seconds"],
         whole_s=None if None in took.values() else sum(s for s in took.values() if s is not None),
         parameters=final["parameters"],
+        pose_parameters=final["pose_parameters"],
         iterations=final["iterations"],
     )
 

@@ -154,6 +154,7 @@ MEASURES: Mapping[str, Callable[[Row], str]] = {
     "  rotations, deg": _error(lambda e: e.images.rotation_median_deg),
     "  camera to camera, deg": _error(lambda e: e.camera_rotation_median_deg),
     "parameters": lambda row: str(row.parameters),
+    "  of poses": lambda row: str(row.pose_parameters),
     "iterations": lambda row: str(row.iterations),
     "mapping, s": lambda row: _number(row.mapping_s, 1),
     "whole, s": lambda row: _number(row.whole_s, 1),
