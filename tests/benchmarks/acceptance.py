@@ -7,6 +7,8 @@
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
+| 6 | ablation: the method without each of its parts |
+| 8 | the road from above, before and after recalibration |
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from pathlib import Path
 from rich.console import Console
 
 from mrasfm_engine import __version__
+from tests.benchmarks.ablation import ablation
+from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.real_drives import accuracy, speed
@@ -42,6 +46,8 @@ def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
         "3": lambda data, work: rendered(work, seeds),
         "4": fresh_clone,
         "5": service,
+        "6": ablation,
+        "8": birds_eye,
     }
 
 
@@ -55,7 +61,7 @@ def main() -> int:
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()
-    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5"]
+    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5", "6", "8"]
     lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
     known = lines_for([int(seed) for seed in arguments.seeds.split(",")])
     if unknown := set(lines) - set(known):
