@@ -36,6 +36,7 @@ class FeatureConfig(_Section):
 class PairConfig(_Section):
     """Which image pairs are matched."""
 
+    selection: bool = True  # by overlap of views; false: all images of units at most window_units apart
     window_units: Count = 4  # without a prior: how many following units a camera is matched with
     cross_window_units: Annotated[int, Field(ge=0)] = 2  # the same across cameras that look in similar directions
     pairs_per_image: Count = 16  # with a prior: best pairs by overlap an image
@@ -82,6 +83,8 @@ class MappingConfig(_Section):
 class AdjustmentConfig(_Section):
     """Camera set bundle adjustment."""
 
+    camera_set_adjustment: bool = True  # false: every image is adjusted on its own, as without a rig
+    priors: bool = True  # of calibration, positions and gravity; without them GNSS aligns the scene and does no more
     loss_scale: Positive = 2.0  # of the Cauchy loss, in standard deviations of an observation
     sigma_rotation_deg: Positive = 2.0  # prior of rig_from_cam where the manifest gives none
     sigma_translation_m: Positive = 0.05

@@ -19,7 +19,7 @@ from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.correspondence.calibration_check import require_calibration_direction
 from mrasfm_engine.correspondence.features import extract_features
-from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window
+from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window, pairs_without_selection
 from mrasfm_engine.correspondence.plugins import Plugins, load_plugins
 from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.correspondence.revisits import revisit_pairs
@@ -198,7 +198,9 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
     """Candidate pairs by the prior (or by window and likeness), matched and verified."""
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        if known.world_from_rig is not None:
+        if not run.config.pairs.selection:
+            pairs = pairs_without_selection(run.drive, run.config.pairs)
+        elif known.world_from_rig is not None:
             pairs = pairs_from_poses(run.drive, known.world_from_rig, run.config.pairs)
         else:
             window = pairs_from_window(run.drive, run.config.pairs)

@@ -53,7 +53,8 @@ class Report:
     iterations: int
     termination: Termination
     observations: int
-    parameters: int
+    parameters: int  # all unknowns
+    pose_parameters: int  # those of units and cameras: the size of the reduced system
 
 
 @dataclass(kw_only=True)
@@ -242,6 +243,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
         termination=termination,
         observations=len(problem.observations.unit),
         parameters=len(free) + 3 * problem.observations.num_points,
+        pose_parameters=len(free),
     )
 
 

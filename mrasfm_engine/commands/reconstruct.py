@@ -34,14 +34,14 @@ def run(arguments: argparse.Namespace) -> int:
     from mrasfm_engine.pipeline import reconstruct
 
     console = Console(stderr=True)
-    with _cancel_on_interrupt(console) as cancelled, _bars(console) as progress:
+    with cancel_on_interrupt(console) as cancelled, progress_bars(console) as progress:
         report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled)
     _say(report, arguments.out)
     return 0
 
 
 @contextmanager
-def _cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
+def cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
     """Ctrl-C asks the run to stop where it leaves nothing half-written; a second one stops at once."""
     asked = threading.Event()
 
@@ -59,7 +59,8 @@ def _cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def _bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar for every stage, moved by calling with stage, done and total."""
     columns = (TextColumn("{task.description:<11}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tasks: dict[str, TaskID] = {}
     with Progress(*columns, console=console) as bars:

@@ -73,6 +73,14 @@ def pairs_from_window(drive: Drive, config: PairConfig) -> Ints:
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
+def pairs_without_selection(drive: Drive, config: PairConfig) -> Ints:
+    """Pairs (n, 2) of all images of units at most `window_units` apart, whichever way their cameras look."""
+    unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+    last = np.searchsorted(unit, unit + config.window_units, side="right")
+    pairs = [np.column_stack([np.full(stop - i - 1, i), np.arange(i + 1, stop)]) for i, stop in enumerate(last)]
+    return np.concatenate(pairs or [np.zeros((0, 2))]).astype(np.int64)
+
+
 def _cameras_with_common_view(drive: Drive, views: _Views, gap: int, config: PairConfig) -> NDArray[np.bool_]:
     """(cameras, cameras): which of now and which of `gap` units later may see the same."""
     n = len(drive.cameras)

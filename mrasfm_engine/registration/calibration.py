@@ -68,6 +68,10 @@ def judge_calibration(
     settings = model.config.adjustment
     if not settings.refine_calibration:
         return CalibrationVerdict(False, "held by the settings")
+    if not settings.camera_set_adjustment:
+        return CalibrationVerdict(
+            False, "held as given: images that are adjusted on their own have no common calibration"
+        )
     if model.drive.has_single_camera:
         return CalibrationVerdict(False, "a single camera has no calibration to others")
     if not georeferenced and heading_change_deg(model) < settings.min_heading_change_deg:

@@ -230,17 +230,17 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
         log.calibration_free
         or judge_calibration(model, free_units=free_units, terms=(), georeferenced=False, options=options).free
     )
-    free = log.calibration_free
+    free, priors = log.calibration_free, model.config.adjustment.priors
     for error_px in (model.config.mapping.max_error_px, model.config.mapping.filter_error_px):
         report = model.adjust(
             free_units,
             free_cameras=np.full(len(model.camera_kind), free),
-            terms=[calibration_prior(model)] if free else (),
+            terms=[calibration_prior(model)] if free and priors else (),
             options=options,
             cancel=cancel,
         )
         log.global_adjustments.append(report)
-        if free:
+        if free and priors:
             # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
             scale_with_baselines(model, scale_of_baselines(model)[0])
         model.complete()

@@ -233,4 +233,5 @@ def _adjustment(report: Report) -> dict[str, Any]:
         "termination": str(report.termination),
         "observations": report.observations,
         "parameters": report.parameters,
+        "pose_parameters": report.pose_parameters,
     }

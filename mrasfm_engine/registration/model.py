@@ -15,6 +15,7 @@ from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solv
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.registration.image_adjustment import adjust_images
 from mrasfm_engine.registration.rig_motion import RigMotion
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
@@ -103,10 +104,15 @@ class Model:
 
         The image's camera then is at world_from_rig * unit_from_image * rig_from_cam, also after further adjustments.
         """
-        self.motion.set_image_pose(image, unit_from_image)
+        self.set_image_poses(np.array([image]), unit_from_image[None])
+        self.renew_motion(np.array([self.image_unit[image]]))
+
+    def set_image_poses(self, images: Ints, unit_from_image: Floats) -> None:
+        """As `set_image_pose` for images (n,) and poses (n, 4, 4); they take effect when the motion is renewed."""
+        for image, pose in zip(images, unit_from_image, strict=True):
+            self.motion.set_image_pose(int(image), pose)
         if self.state.simultaneous:
             self._place_shots()
-        self.renew_motion(np.array([self.image_unit[image]]))
 
     def _place_shots(self) -> None:
         count = len(self.motion.shots)
@@ -238,6 +244,15 @@ class Model:
         result: Ints = rows[np.argsort(self.tracks.of_keypoint[rows], kind="stable")]
         return result
 
+    def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
+        """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by
+        point, the points' tracks, and the keypoints' points as rows of these."""
+        everything = everything or bool((free_units | ~self.registered).all())
+        seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
+        rows = self.observation_rows(None if seen is None else seen[self.solved[seen]])
+        tracks, point = np.unique(self.tracks.of_keypoint[rows], return_inverse=True)
+        return rows, tracks, point.astype(np.int64)
+
     def problem(
         self,
         free_units: Bools,
@@ -248,17 +263,14 @@ class Model:
         options: SolverOptions,
     ) -> tuple[Problem, Ints]:
         """The adjustment of some units (and cameras) with all points they see; also those points' tracks."""
-        everything = bool((free_units | ~self.registered).all()) or free_cameras is not None
-        seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
-        rows = self.observation_rows(None if seen is None else seen[self.solved[seen]])
-        tracks, point = np.unique(self.tracks.of_keypoint[rows], return_inverse=True)
+        rows, tracks, point = self.observed(free_units, everything=free_cameras is not None)
         problem = Problem(
             state=replace(self.state, points_m=self.state.points_m[tracks]),
             camera_kind=self.camera_kind,
             observations=Observations(
                 unit=self.keypoints.unit[rows],
                 camera=self.keypoints.camera[rows],
-                point=point.astype(np.int64),
+                point=point,
                 xy_px=self.keypoints.xy_px[rows],
                 num_points=len(tracks),
                 shot=None if self.state.simultaneous else self.keypoints.shot[rows],
@@ -287,6 +299,8 @@ class Model:
         cancel: Callable[[], bool] | None = None,
     ) -> Report:
         """Solve the adjustment and take over its result."""
+        if not self.config.adjustment.camera_set_adjustment:
+            return adjust_images(self, free_units, terms=terms, options=options, cancel=cancel)
         self.renew_motion(np.flatnonzero(free_units & self.registered))
         problem, tracks = self.problem(
             free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options

@@ -97,7 +97,7 @@ def refine(
             remedy="Give a second camera with its baseline, or positions that follow the car's way.",
             code="no-metric-scale",
         )
-    free_units = _free_units(model, georeferenced=positions is not None)
+    free_units = _free_units(model, georeferenced=positions is not None and model.config.adjustment.priors)
     result.sigma_px = _observation_sigma(model)
     result.calibration = judge_calibration(
         model,
@@ -110,7 +110,7 @@ def refine(
     if not result.calibration.free:
         result.recalibrated = _wrong_although_held(model, free_units, positions, result, cancel)
     result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
-    if result.calibration.free and result.placement is not None:
+    if result.calibration.free and result.placement is not None and model.config.adjustment.priors:
         share_scale(model, result.placement)
     for done in range(ROUNDS):
         result.sigma_px = _observation_sigma(model)
@@ -262,6 +262,8 @@ def _observation_sigma(model: Model) -> float:
 
 def _terms(model: Model, positions: PositionPrior | None, result: Refinement) -> list[Term]:
     terms: list[Term] = []
+    if not model.config.adjustment.priors:
+        return terms
     if result.calibration.free:
         terms.append(calibration_prior(model, result.held))
     elif result.recalibrated.any():
@@ -288,7 +290,12 @@ def _focal_prior(model: Model) -> FocalPrior:
 
 
 def _certainty(model: Model, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
-    """Covariances with the calibration free under its prior, also where it was held: its error is there as well."""
+    """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
+
+    None where they would not be those of what was adjusted, and where there is too much for an inverse.
+    """
+    if not (model.config.adjustment.priors and model.config.adjustment.camera_set_adjustment):
+        return None
     several = not model.drive.has_single_camera
     terms = [
         term

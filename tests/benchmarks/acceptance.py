@@ -10,6 +10,8 @@
 | 7 | rendered drives: a camera with a wrong extrinsic; what a straight street lets a drive observe |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
 | 6 | cameras that are not simultaneous, against the same drive with cameras that are |
+| 6 | ablation: the method without each of its parts |
+| 8 | the road from above, before and after recalibration |
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ from pathlib import Path
 from rich.console import Console
 
 from mrasfm_engine import __version__
+from tests.benchmarks.ablation import ablation
+from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.motion import motion
@@ -49,6 +53,8 @@ def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
         "4": fresh_clone,
         "5": service,
         "6": lambda data, work: motion(work, seeds),
+        "6": ablation,
+        "8": birds_eye,
     }
 
 
@@ -62,7 +68,7 @@ def main() -> int:
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()
-    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5", "6", "7"]
+    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5", "6", "8"]
     lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
     known = lines_for([int(seed) for seed in arguments.seeds.split(",")])
     if unknown := set(lines) - set(known):

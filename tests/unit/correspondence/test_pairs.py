@@ -5,7 +5,7 @@ import pytest
 from simulated_drive import make_drive
 
 from mrasfm_engine.config import PairConfig
-from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window
+from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window, pairs_without_selection
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.synthetic.rigs import true_cameras
@@ -169,3 +169,14 @@ def test_the_quota_per_image_is_kept() -> None:
     # Chosen by either end: at most twice the quota on average, and two neighbours.
     assert len(few) <= len(drive.images) * (4 + 2)
     assert len(few) < 0.6 * len(many)
+
+
+def test_without_selection_all_images_of_near_units_are_paired() -> None:
+    drive = drive_of(3, 6, present=lambda unit, camera: (unit, camera) != (2, 1))
+    pairs = pairs_without_selection(drive, PairConfig(window_units=2))
+    check_form(drive, pairs)
+    unit = [image.unit for image in drive.images]
+    expected = {(i, j) for i in range(17) for j in range(i + 1, 17) if unit[j] - unit[i] <= 2}
+    assert {(int(a), int(b)) for a, b in pairs} == expected
+    # Also cameras that look in opposite directions, which the selection leaves out.
+    assert set(map(tuple, pairs_from_window(drive, PairConfig(window_units=2)).tolist())) < expected
