@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.correspondence.features import colors_at
+from mrasfm_engine.correspondence.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.correspondence.tiles import Tile, cut, duplicates, lay_tiles
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -25,8 +26,6 @@ Bools = NDArray[np.bool_]
 
 STRIDE_PX = 32  # networks with free size want multiples of it
 MOST_ASKED = 65536  # keypoints of one tile
-XFEAT_HEAT = "/Reshape_1_output_0"  # name in the published file
-HEAT_RADIUS = int(__import__("os").environ.get("HR", "2"))
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Detector(Protocol):
 
     network: Network
     image: str  # its input for the image
-    max_enlargement: float  # of small images, where positions are exact to a share of the network's pixel
+    is_refined: bool  # whether its keypoints are moved to the detail that they mean
     takes_number: bool  # whether `wanted` has a meaning
 
     def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
@@ -85,7 +84,11 @@ class LearnedExtractor:
             *(np.concatenate([getattr(p, f) for p in parts]) for f in ("xy_px", "descriptors", "scores"))
         )
         found = found[~duplicates(found.xy_px, found.scores, number)]
-        found = found[np.argsort(-found.scores, kind="stable")[: self._config.max_keypoints]]
+        found = found[np.argsort(-found.scores, kind="stable")]
+        if self._detector.is_refined and self._config.refine:
+            xy, there = snap_to_extrema(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), found.xy_px)
+            found = Detections(xy, found.descriptors, found.scores)[there & usable(xy)]
+        found = found[np.arange(len(found.xy_px)) < self._config.max_keypoints]
         xy = found.xy_px * stretch
         return ImageFeatures(
             xy_px=xy.astype(np.float32),
@@ -95,11 +98,10 @@ class LearnedExtractor:
         )
 
     def _scaled(self, rgb: Bytes) -> Bytes:
-        scale = min(self._detector.max_enlargement, self._config.max_side_px / max(rgb.shape[:2]))
-        if scale == 1.0:
+        scale = self._config.max_side_px / max(rgb.shape[:2])
+        if scale >= 1.0:
             return rgb
-        method = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
-        return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=method), dtype=np.uint8)
+        return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _detect(self, pixels: Bytes, tile: Tile, usable: Callable[[Floats], Bools]) -> Detections:
         """What of a tile's detections counts: in its core, not masked, not too weak; in pixels of the scaled image."""
@@ -129,13 +131,12 @@ def _planes(pixels: Bytes) -> Floats:
 class XFeatDetector:
     """XFeat (Potje et al., CVPR 2024), exported with its own resampling to multiples of 32.
 
-    Its keypoints are whole pixels. Where the heat map that they are maxima of can be had (`XFEAT_HEAT`), each is moved
-    to the centre of mass of the heat around it, which takes a fifth off its noise.
+    Its keypoints are whole pixels of the shrunk image, and refined: see `keypoint_refinement`.
     """
 
     image = "images"
     takes_number = False
-    max_enlargement = float(__import__("os").environ.get("ENL", "1.5"))
+    is_refined = True
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -147,22 +148,8 @@ class XFeatDetector:
         # them by the shrinkage.
         rows, columns = pixels.shape[:2]
         shrinkage = np.array([columns / _down(columns), rows / _down(rows)], np.float32)
-        xy = np.round(found["keypoints"] / shrinkage)
-        if XFEAT_HEAT in found:
-            xy = xy + _centre_of_mass(found[XFEAT_HEAT][0, 0], xy.astype(np.int64))
-        return Detections((xy + np.float32(0.5)) * shrinkage, found["descriptors"], found["scores"])
-
-
-def _centre_of_mass(heat: Floats, xy: NDArray[np.int64]) -> Floats:
-    """Offsets (n, 2) from pixels (n, 2), column and row, to the centre of mass of the heat (h, w) around them."""
-    steps = np.arange(-HEAT_RADIUS, HEAT_RADIUS + 1)
-    padded = np.pad(heat, HEAT_RADIUS)
-    rows = xy[:, 1, None, None] + HEAT_RADIUS + steps[:, None]
-    columns = xy[:, 0, None, None] + HEAT_RADIUS + steps[None, :]
-    weights = padded[rows, columns]
-    weights = weights / np.maximum(weights.sum(axis=(1, 2), keepdims=True), np.float32(1e-12))
-    offsets = [(weights * steps[None, :]).sum(axis=(1, 2)), (weights * steps[:, None]).sum(axis=(1, 2))]
-    return np.stack(offsets, axis=1).astype(np.float32)
+        half = np.float32(0.5) * shrinkage
+        return Detections(found["keypoints"] + half, found["descriptors"], found["scores"])
 
 
 def _down(size: int) -> int:
@@ -174,7 +161,7 @@ class AlikedDetector:
 
     image = "image"
     takes_number = True
-    max_enlargement = 1.0
+    is_refined = False
     usual_min_score = 0.2  # COLMAP's
 
     def __init__(self, network: Network) -> None:
@@ -201,7 +188,7 @@ class SuperPointDetector:
 
     image = "image"
     takes_number = False
-    max_enlargement = 1.0
+    is_refined = False
 
     def __init__(self, network: Network) -> None:
         self.network = network

@@ -18,7 +18,6 @@ from typing import Any
 from mrasfm_engine.config import EngineConfig, FeatureConfig, MatchConfig
 from mrasfm_engine.correspondence.features import Extractor, SiftExtractor
 from mrasfm_engine.correspondence.learned_extractors import (
-    XFEAT_HEAT,
     AlikedDetector,
     Detector,
     LearnedExtractor,
@@ -39,7 +38,6 @@ from mrasfm_engine.learned import signatures
 from mrasfm_engine.learned.catalogue import CATALOGUE, default_model
 from mrasfm_engine.learned.model_folder import InstalledModel, ModelFolder, default_folder
 from mrasfm_engine.learned.network import Network
-from mrasfm_engine.learned.onnx_file import has_tensor, with_output
 from schemas import LabelMap
 
 _DETECTORS: dict[str, Callable[[Network], Detector]] = {
@@ -171,6 +169,4 @@ def _load(
             remedy=f"`mrasfm models list` shows which model is for what; {setting} may be left out.",
             code="bad-settings",
         )
-    if installed.known.signature == signatures.XFEAT and has_tensor(data, XFEAT_HEAT):
-        data = with_output(data, XFEAT_HEAT)
     return LoadedModel(installed, Network(wanted, data, gpu=gpu))

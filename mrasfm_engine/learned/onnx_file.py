@@ -15,9 +15,8 @@ from mrasfm_engine.errors import InputError
 MAX_BYTES = 2**31 - 1  # of a protobuf message
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MODEL_GRAPH, _MODEL_FUNCTIONS = 7, 25
-_GRAPH_NODE, _GRAPH_INITIALIZER, _GRAPH_OUTPUT, _GRAPH_SPARSE = 1, 5, 12, 15
-_NODE_OUTPUT, _NODE_ATTRIBUTE, _FUNCTION_NODE = 2, 5, 7
-_VALUE_NAME = 1
+_GRAPH_NODE, _GRAPH_INITIALIZER, _GRAPH_SPARSE = 1, 5, 15
+_NODE_ATTRIBUTE, _FUNCTION_NODE = 5, 7
 _ATTRIBUTE_TENSOR, _ATTRIBUTE_GRAPH, _ATTRIBUTE_TENSORS, _ATTRIBUTE_GRAPHS = 5, 6, 10, 11
 _ATTRIBUTE_SPARSE, _ATTRIBUTE_SPARSES = 22, 23
 _SPARSE_VALUES, _SPARSE_INDICES = 1, 2
@@ -74,40 +73,6 @@ def read_model(path: Path) -> bytes:
             code="bad-model",
         )
     return data
-
-
-def has_tensor(data: bytes, name: str) -> bool:
-    """Whether a node of the main graph computes a tensor of this name."""
-    wanted = name.encode()
-    for number, _, graph in _fields(memoryview(data)):
-        if number == _MODEL_GRAPH and isinstance(graph, memoryview):
-            for field, _, node in _fields(graph):
-                if field == _GRAPH_NODE and isinstance(node, memoryview):
-                    outputs = (value for key, _, value in _fields(node) if key == _NODE_OUTPUT)
-                    if any(isinstance(value, memoryview) and value == wanted for value in outputs):
-                        return True
-    return False
-
-
-def with_output(data: bytes, name: str) -> bytes:
-    """The model with an inner tensor as one more output; its type is inferred when it is loaded.
-
-    Protobuf merges a message that occurs twice, and joins what is repeated in it, so that the original is not touched.
-    """
-    info = _message(_VALUE_NAME, name.encode())
-    return data + _message(_MODEL_GRAPH, _message(_GRAPH_OUTPUT, info))
-
-
-def _message(number: int, content: bytes) -> bytes:
-    return _as_varint(number << 3 | _BYTES) + _as_varint(len(content)) + content
-
-
-def _as_varint(value: int) -> bytes:
-    result = bytearray()
-    while value > 0x7F:
-        result.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*result, value])
 
 
 def sha256_of(data: bytes) -> str:

@@ -7,6 +7,7 @@
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
+| 7 | learned keypoints and matches: accuracy on a real drive, and light that changes |
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from rich.console import Console
 from mrasfm_engine import __version__
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
+from tests.benchmarks.learned import learned
 from tests.benchmarks.real_drives import accuracy, speed
 from tests.benchmarks.rendered_drives import SEEDS, rendered
 from tests.benchmarks.service import service
@@ -42,6 +44,7 @@ def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
         "3": lambda data, work: rendered(work, seeds),
         "4": fresh_clone,
         "5": service,
+        "7": learned,
     }
 
 
@@ -55,7 +58,7 @@ def main() -> int:
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()
-    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5"]
+    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5", "7"]
     lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
     known = lines_for([int(seed) for seed in arguments.seeds.split(",")])
     if unknown := set(lines) - set(known):

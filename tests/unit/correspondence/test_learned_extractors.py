@@ -60,9 +60,7 @@ ALL = [xfeat_tiles, superpoint_tiles, superpoint_whole, aliked_whole]
 
 
 def extractor(make: MakeDetector, **settings: float) -> LearnedExtractor:
-    detector = make()
-    detector.max_enlargement = 1.0  # the dots are single pixels
-    return LearnedExtractor(detector, FeatureConfig(**settings))
+    return LearnedExtractor(make(), FeatureConfig(refine=False, **settings))
 
 
 @pytest.mark.parametrize("make", ALL)

@@ -107,22 +107,24 @@ def test_a_matcher_of_other_descriptors_is_refused_with_both_settings(
 
 
 def test_a_model_of_another_use_is_refused(folder: Path) -> None:
-    with pytest.raises(InputError, match='features.model = "own-aliked" is a model for aliked, not for xfeat'):
+    with pytest.raises(InputError, match=r'features.model = "own-aliked" is a model for aliked, not for xfeat'):
         load(folder, features={"extractor": "xfeat", "model": "own-aliked"})
-    with pytest.raises(InputError, match='matching.model = "own-aliked-lightglue" .* not for lightglue for superpoint'):
+    with pytest.raises(
+        InputError, match=r'matching.model = "own-aliked-lightglue" .* not for lightglue for superpoint'
+    ):
         load(
             folder,
             features={"extractor": "superpoint"},
             matching={"matcher": "lightglue", "model": "own-aliked-lightglue"},
         )
-    with pytest.raises(InputError, match='semantics.model = "superpoint" is a model for superpoint'):
+    with pytest.raises(InputError, match=r'semantics.model = "superpoint" is a model for superpoint'):
         load(folder, semantics={"model": "superpoint"})
 
 
 def test_a_model_that_nothing_uses_is_refused(folder: Path) -> None:
-    with pytest.raises(InputError, match='features.model = "superpoint" is given, but features.extractor = "sift"'):
+    with pytest.raises(InputError, match=r'features.model = "superpoint" is given, but features.extractor = "sift"'):
         load(folder, features={"model": "superpoint"})
-    with pytest.raises(InputError, match='matching.model = "superglue" is given, but matching.matcher = "nearest"'):
+    with pytest.raises(InputError, match=r'matching.model = "superglue" is given, but matching.matcher = "nearest"'):
         load(folder, matching={"model": "superglue"})
 
 

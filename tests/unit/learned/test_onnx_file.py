@@ -5,12 +5,11 @@ from pathlib import Path
 import learned_graphs
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 from onnx import helper, numpy_helper
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.learned.onnx_file import external_tensors, has_tensor, read_model, with_output
+from mrasfm_engine.learned.onnx_file import external_tensors, read_model
 
 
 def write(folder: Path, data: bytes) -> Path:
@@ -67,19 +66,3 @@ def test_a_damaged_model_is_no_crash(tmp_path: Path) -> None:
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.onnx cannot be read"):
         read_model(tmp_path / "nowhere.onnx")
-
-
-def test_an_inner_tensor_becomes_an_output_and_nothing_else_changes() -> None:
-    data = learned_graphs.xfeat()
-    inner = next(n.output[0] for n in onnx.load_from_string(data).graph.node if n.op_type == "MaxPool")
-    assert has_tensor(data, inner)
-    assert not has_tensor(data, f"{inner} or so")
-    image = np.random.default_rng(0).random((1, 3, 64, 96), dtype=np.float32)
-    before = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"]).run(None, {"images": image})
-    session = onnxruntime.InferenceSession(with_output(data, inner), providers=["CPUExecutionProvider"])
-    assert [o.name for o in session.get_outputs()] == ["keypoints", "descriptors", "scores", inner]
-    after = session.run(None, {"images": image})
-    for a, b in zip(before, after[:3], strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert after[3].shape == (1, 1, 64, 96)
-    assert (after[3] >= image.mean(1, keepdims=True) - 1e-6).all()
