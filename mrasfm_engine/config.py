@@ -28,6 +28,7 @@ class FeatureConfig(_Section):
     model: str | None = None  # name of the model, see `mrasfm models list`; the extractor's usual one if not given
     min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's keypoints; the usual if not given
     max_keypoints: Count = 2048  # a image, strongest first; 1024 costs accuracy
+    refine: bool = True  # xfeat: keypoints are moved to the nearest detail, those without one are dropped
     contrast_threshold: Positive = 0.02  # half of SIFT's usual value, so that asphalt and shade yield keypoints too
     class_margin_px: Annotated[int, Field(ge=0)] = 2  # keypoints nearer to the border of a class in the mask have none
     max_side_px: Count = 1600  # larger images are extracted at reduced size; coordinates stay those of the full image

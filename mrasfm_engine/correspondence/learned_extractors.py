@@ -5,6 +5,7 @@ All coordinates become COLMAP's, where the centre of the top left pixel is at (0
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.correspondence.features import colors_at
-from mrasfm_engine.correspondence.tiles import cut, duplicates, lay_tiles
+from mrasfm_engine.correspondence.keypoint_refinement import snap_to_extrema
+from mrasfm_engine.correspondence.tiles import Tile, cut, duplicates, lay_tiles
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -23,6 +25,7 @@ Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
 STRIDE_PX = 32  # networks with free size want multiples of it
+MOST_ASKED = 65536  # keypoints of one tile
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class Detector(Protocol):
 
     network: Network
     image: str  # its input for the image
-    descriptor_size: int  # D, where nothing is found
+    is_refined: bool  # whether its keypoints are moved to the detail that they mean
+    takes_number: bool  # whether `wanted` has a meaning
 
     def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
         """Detections in an image (h, w, 3) of a size that the network takes.
@@ -58,51 +62,61 @@ class LearnedExtractor:
     def __init__(self, detector: Detector, config: FeatureConfig) -> None:
         self._detector = detector
         self._config = config
-        self.fixed_size = detector.network.fixed_size(detector.image)
+        self._fixed_size = detector.network.fixed_size(detector.image)
 
     def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
         """See `Extractor`."""
-        scale = min(1.0, self._config.max_side_px / max(rgb.shape[:2]))
-        pixels = rgb
-        if scale < 1.0:
-            pixels = np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        found = self._over_tiles(pixels, None if mask is None else float(mask.mean()))
-        stretch = np.array([rgb.shape[1] / pixels.shape[1], rgb.shape[0] / pixels.shape[0]])
-        found = Detections((found.xy_px * stretch).astype(np.float32), found.descriptors, found.scores)
-        if mask is not None:
-            column, row = (np.clip(found.xy_px[:, i].astype(int), 0, rgb.shape[1 - i] - 1) for i in (0, 1))
-            found = found[mask[row, column]]
-        found = found[np.argsort(-found.scores, kind="stable")[: self._config.max_keypoints]]
+        pixels = self._scaled(rgb)
+        size = pixels.shape[0], pixels.shape[1]
+        window = self._fixed_size or (_up(size[0]), _up(size[1]))
+        stretch = np.array([rgb.shape[1] / size[1], rgb.shape[0] / size[0]])
+
+        def usable(xy: Floats) -> Bools:
+            if mask is None:
+                return np.ones(len(xy), dtype=np.bool_)
+            at = (xy * stretch).astype(int)
+            return mask[np.clip(at[:, 1], 0, mask.shape[0] - 1), np.clip(at[:, 0], 0, mask.shape[1] - 1)]
+
+        tiles = lay_tiles(size, window)
+        parts = [self._detect(cut(pixels, tile, window), tile, usable) for tile in tiles]
+        number = np.repeat(np.arange(len(parts)), [len(part.xy_px) for part in parts])
+        found = Detections(
+            *(np.concatenate([getattr(p, f) for p in parts]) for f in ("xy_px", "descriptors", "scores"))
+        )
+        found = found[~duplicates(found.xy_px, found.scores, number)]
+        found = found[np.argsort(-found.scores, kind="stable")]
+        if self._detector.is_refined and self._config.refine:
+            xy, there = snap_to_extrema(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), found.xy_px)
+            found = Detections(xy, found.descriptors, found.scores)[there & usable(xy)]
+        found = found[np.arange(len(found.xy_px)) < self._config.max_keypoints]
+        xy = found.xy_px * stretch
         return ImageFeatures(
-            xy_px=np.ascontiguousarray(found.xy_px, dtype=np.float32),
+            xy_px=xy.astype(np.float32),
             descriptors=np.ascontiguousarray(found.descriptors, dtype=np.float32),
-            colors=colors_at(rgb, found.xy_px),
+            colors=colors_at(rgb, xy),
             scores=np.ascontiguousarray(found.scores, dtype=np.float32),
         )
 
-    def _over_tiles(self, pixels: Bytes, unmasked: float | None) -> Detections:
-        """Detections in all of an image, still with those under the mask."""
-        size = pixels.shape[0], pixels.shape[1]
-        window = self.fixed_size or (_up(size[0]), _up(size[1]))
-        # Masked areas must not use up the number, so networks that can be told are asked for more.
-        wanted = round(self._config.max_keypoints / max(1.0 if unmasked is None else unmasked, 0.05))
-        parts, tiles = [], []
-        for i, tile in enumerate(lay_tiles(size, window)):
-            found = self._detector.detect(cut(pixels, tile, window), wanted, self._config.min_score)
-            found = Detections(found.xy_px + np.array([tile.column, tile.row], np.float32), *_rest(found))
-            parts.append(found[tile.owns(found.xy_px)])
-            tiles.append(np.full(len(parts[-1].xy_px), i, dtype=np.int64))
-        joined = Detections(
-            *(np.concatenate([getattr(p, f) for p in parts]) for f in ("xy_px", "descriptors", "scores"))
-        )
-        if self._config.min_score is not None:
-            enough = joined.scores >= self._config.min_score
-            joined, tiles = joined[enough], [np.concatenate(tiles)[enough]]
-        return joined[~duplicates(joined.xy_px, joined.scores, np.concatenate(tiles))]
+    def _scaled(self, rgb: Bytes) -> Bytes:
+        scale = self._config.max_side_px / max(rgb.shape[:2])
+        if scale >= 1.0:
+            return rgb
+        return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-
-def _rest(found: Detections) -> tuple[Floats, Floats]:
-    return found.descriptors, found.scores
+    def _detect(self, pixels: Bytes, tile: Tile, usable: Callable[[Floats], Bools]) -> Detections:
+        """What of a tile's detections counts: in its core, not masked, not too weak; in pixels of the scaled image."""
+        wanted = self._config.max_keypoints
+        while True:
+            found = self._detector.detect(pixels, wanted, self._config.min_score)
+            xy = found.xy_px + np.array([tile.column, tile.row], np.float32)
+            keep = tile.owns(xy) & usable(xy)
+            if self._config.min_score is not None:
+                keep &= found.scores >= self._config.min_score
+            cut_off = self._detector.takes_number and len(xy) >= wanted
+            # Masked areas and mirrored margins must not use up the number.
+            if keep.sum() >= self._config.max_keypoints or not cut_off or wanted >= MOST_ASKED:
+                return Detections(xy, found.descriptors, found.scores)[keep]
+            wanted *= 4
 
 
 def _up(size: int) -> int:
@@ -115,10 +129,14 @@ def _planes(pixels: Bytes) -> Floats:
 
 
 class XFeatDetector:
-    """XFeat (Potje et al., CVPR 2024), exported with its own resampling to multiples of 32."""
+    """XFeat (Potje et al., CVPR 2024), exported with its own resampling to multiples of 32.
+
+    Its keypoints are whole pixels of the shrunk image, and refined: see `keypoint_refinement`.
+    """
 
     image = "images"
-    descriptor_size = 64
+    takes_number = False
+    is_refined = True
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -127,9 +145,10 @@ class XFeatDetector:
         """See `Detector`; number and least score are part of the exported network."""
         found = self.network.run({"images": _planes(pixels)})
         # The network shrinks the image to multiples of 32, takes whole pixels there, counted from 0, and multiplies
-        # them by the shrinkage: half a pixel of the shrunk image is missing.
+        # them by the shrinkage.
         rows, columns = pixels.shape[:2]
-        half = 0.5 * np.array([columns / _down(columns), rows / _down(rows)], np.float32)
+        shrinkage = np.array([columns / _down(columns), rows / _down(rows)], np.float32)
+        half = np.float32(0.5) * shrinkage
         return Detections(found["keypoints"] + half, found["descriptors"], found["scores"])
 
 
@@ -141,7 +160,8 @@ class AlikedDetector:
     """ALIKED (Zhao et al., TIM 2023) as COLMAP publishes it."""
 
     image = "image"
-    descriptor_size = 128
+    takes_number = True
+    is_refined = False
     usual_min_score = 0.2  # COLMAP's
 
     def __init__(self, network: Network) -> None:
@@ -167,7 +187,8 @@ class SuperPointDetector:
     """SuperPoint (DeTone et al., CVPRW 2018) as exported for LightGlue."""
 
     image = "image"
-    descriptor_size = 256
+    takes_number = False
+    is_refined = False
 
     def __init__(self, network: Network) -> None:
         self.network = network

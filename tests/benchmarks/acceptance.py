@@ -12,6 +12,7 @@
 | 6 | cameras that are not simultaneous, against the same drive with cameras that are |
 | 6 | ablation: the method without each of its parts |
 | 8 | the road from above, before and after recalibration |
+| 7 | learned keypoints and matches: accuracy on a real drive, and light that changes |
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.motion import motion
 from tests.benchmarks.occlusion import occlusion
+from tests.benchmarks.learned import learned
 from tests.benchmarks.real_drives import accuracy, speed
 from tests.benchmarks.recalibration import recalibration
 from tests.benchmarks.rendered_drives import SEEDS, rendered
@@ -55,6 +57,7 @@ def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
         "6": lambda data, work: motion(work, seeds),
         "6": ablation,
         "8": birds_eye,
+        "7": learned,
     }
 
 

@@ -117,3 +117,27 @@ def test_the_drives_masks_keep_keypoints_off_moving_things(tmp_path: Path) -> No
     assert 50 < len(found[0].xy_px) < len(found[1].xy_px)
     assert found[0].xy_px[:, 0].max() < WIDTH // 2 + 1
     assert found[1].xy_px[:, 0].max() > WIDTH // 2 + 100
+
+
+def test_a_segmenter_masks_images_that_have_no_mask(tmp_path: Path) -> None:
+    class RightHalfIsACar:
+        def __init__(self) -> None:
+            self.images = 0
+
+        def segment(self, rgb: np.ndarray) -> np.ndarray:
+            self.images += 1
+            classes = np.full(rgb.shape[:2], 2, np.uint8)
+            classes[:, WIDTH // 2 :] = 13
+            return classes
+
+    drive = make_drive(tmp_path)
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((HEIGHT, WIDTH), 2, np.uint8))
+    first = drive.manifest.frames[0]
+    masked = first.model_copy(update={"images": {"cam": FrameImage(file="0.png", mask="mask.png")}})
+    manifest = drive.manifest.model_copy(update={"frames": [masked, *drive.manifest.frames[1:]]})
+    segmenter = RightHalfIsACar()
+    found = extract_features(Drive(tmp_path, manifest), SiftExtractor(FeatureConfig()), threads=1, segmenter=segmenter)
+    assert segmenter.images == 2
+    assert found[0].xy_px[:, 0].max() > WIDTH // 2 + 100
+    assert found[1].xy_px[:, 0].max() < WIDTH // 2 + 1
+    assert len(found[1].xy_px) > 50

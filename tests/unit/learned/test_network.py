@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import learned_graphs
+import numpy as np
+import onnxruntime
+import pytest
+
+from mrasfm_engine.errors import InputError, ReconstructionError
+from mrasfm_engine.learned import signatures
+from mrasfm_engine.learned.network import CPU_PROVIDER, GPU_PROVIDERS, Network
+
+
+def test_many_threads_share_one_network() -> None:
+    network = Network("x", learned_graphs.xfeat(), gpu=False)
+    rng = np.random.default_rng(0)
+    images = [rng.random((1, 3, 64, 96), dtype=np.float32) for _ in range(12)]
+    alone = [network.run({"images": image}) for image in images]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda image: network.run({"images": image}), images))
+    for a, b in zip(alone, together, strict=True):
+        assert 5 < len(a["keypoints"]) < 2000
+        for name in a:
+            np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_an_operator_that_this_runtime_lacks_is_named() -> None:
+    with pytest.raises(InputError, match=r"model wand cannot be run by onnxruntime .*Wizardry"):
+        Network("wand", learned_graphs.with_unknown_operator(learned_graphs.xfeat()), gpu=False)
+
+
+def test_what_the_network_cannot_compute_is_an_error_with_the_shapes() -> None:
+    network = Network("x", learned_graphs.xfeat(), gpu=False)
+    with pytest.raises(ReconstructionError, match=r"model x failed on images \[1, 3, 8, 8\]"):
+        network.run({"images": np.zeros((1, 3, 8, 8), np.float32)})
+
+
+def test_a_gpu_is_used_where_there_is_a_provider_and_the_cpu_elsewhere() -> None:
+    there = [p for p in GPU_PROVIDERS if p in onnxruntime.get_available_providers()]
+    assert Network("x", learned_graphs.xfeat(), gpu=False).provider == CPU_PROVIDER
+    assert Network("x", learned_graphs.xfeat(), gpu=True).provider in (*there, CPU_PROVIDER)
+
+
+def test_the_signature_and_the_fixed_size_are_read() -> None:
+    fixed = Network("x", learned_graphs.xfeat(32, 64), gpu=False)
+    assert fixed.fixed_size("images") == (32, 64)
+    assert signatures.XFEAT.mismatches(fixed.signature) == []
+    free = Network("s", learned_graphs.superpoint(), gpu=False)
+    assert free.fixed_size("image") is None
+    assert signatures.SUPERPOINT.mismatches(free.signature) == []
+
+
+@pytest.mark.parametrize(
+    ("graph", "signature"),
+    [
+        (learned_graphs.aliked, signatures.ALIKED),
+        (learned_graphs.lightglue, signatures.LIGHTGLUE),
+        (learned_graphs.colmap_lightglue, signatures.LIGHTGLUE_COLMAP),
+        (learned_graphs.lighterglue, signatures.LIGHTERGLUE),
+        (learned_graphs.superglue, signatures.SUPERGLUE),
+        (learned_graphs.segmenter, signatures.SEGMENTER),
+    ],
+)
+def test_every_signature_fits_its_own_graph_and_no_other(graph: object, signature: signatures.Signature) -> None:
+    assert callable(graph)
+    found = Network("x", graph(), gpu=False).signature
+    known = [s for s in vars(signatures).values() if isinstance(s, signatures.Signature)]
+    assert len(known) == 8
+    assert [s for s in known if not s.mismatches(found)] == [signature]
+
+
+def test_mismatches_say_what_is_expected_and_what_is_there() -> None:
+    found = Network("x", learned_graphs.xfeat(), gpu=False).signature
+    problems = signatures.SUPERPOINT.mismatches(found)
+    assert "input image float32[1,1,H,W] is missing" in problems
+    assert "input images float32[1,3,64,96] is not expected" in problems
+    assert "output keypoints int64|float32[1,K,2] is expected, keypoints float32[K,2] is there" in problems
