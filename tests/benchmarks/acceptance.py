@@ -7,6 +7,7 @@
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
+| 6 | the road under moving shadows, and of a real drive on held-out images, with and without semantics |
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.real_drives import accuracy, speed
 from tests.benchmarks.rendered_drives import SEEDS, rendered
+from tests.benchmarks.semantics import semantics
 from tests.benchmarks.service import service
 from tests.benchmarks.table import Figure, failed, save, show
 
@@ -42,6 +44,7 @@ def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
         "3": lambda data, work: rendered(work, seeds),
         "4": fresh_clone,
         "5": service,
+        "6": lambda data, work: semantics(data, work, seeds),
     }
 
 
@@ -51,11 +54,11 @@ def main() -> int:
         prog="acceptance", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--only", metavar="LINE[,LINE]", help="measure these lines only")
-    parser.add_argument("--seeds", default=",".join(map(str, SEEDS)), help="of line 3 (default: %(default)s)")
+    parser.add_argument("--seeds", default=",".join(map(str, SEEDS)), help="of lines 3 and 6 (default: %(default)s)")
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()
-    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5"]
+    lines = arguments.only.split(",") if arguments.only else ["1", "2", "3", "5", "6"]
     lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
     known = lines_for([int(seed) for seed in arguments.seeds.split(",")])
     if unknown := set(lines) - set(known):
