@@ -26,6 +26,7 @@ MIN_POINTS = 8  # of a patch, that agree with its plane
 LEVEL_M = 2.5  # points farther from where the road is expected are not of this patch's road
 ROUGHNESS_M = (0.008, 0.03)  # how uneven roads are, with what planes leave of their curvature: bounds
 FIRST_ROUGHNESS_M = 0.02
+STEP_M = 0.3  # of a patch's height against what its neighbours' planes say, at most
 ROUGHNESS_STEPS = 3
 SURE_SHARE = 0.33  # of the points, those of the smallest uncertainty: they tell the roughness
 SIGMA_SLOPE_RIG = 0.05  # of the road's slope against the vehicle's
@@ -291,8 +292,8 @@ def _spread(
 def _beside(
     points: _Points, at: Floats, slope: Floats, radius_m: float, *, roughness_m: float, rng: np.random.Generator
 ) -> HeightPlane | None:
-    """A patch at a place (3,) whose height and slope are expected from its neighbours."""
-    return _fit(
+    """A patch at a place (3,) whose height and slope are expected from its neighbours: no road has steps."""
+    plane = _fit(
         points,
         at,
         slope,
@@ -301,7 +302,9 @@ def _beside(
         radius_m,
         roughness_m=roughness_m,
         rng=rng,
+        level_m=STEP_M + MAX_SLOPE_NEIGHBOURS * radius_m,
     )
+    return plane if plane is not None and abs(plane.offset_m - at[2]) < STEP_M else None
 
 
 def _fit(
@@ -314,13 +317,17 @@ def _fit(
     *,
     roughness_m: float,
     rng: np.random.Generator,
+    level_m: float = LEVEL_M,
 ) -> HeightPlane | None:
-    """The plane at a place (3,) where the road is expected; None where less than MIN_SUPPORT of the points agree."""
+    """The plane at a place (3,) where the road is expected; None where less than MIN_SUPPORT of the points agree.
+
+    Points farther than `level_m` from where it is expected are not asked.
+    """
     rows = np.array(points.tree.query_ball_point(at[:2], radius_m), dtype=np.int64)
     if len(rows) < MIN_POINTS:
         return None
     local = points.xy[rows] - at[:2]
-    level = np.abs(points.height[rows] - at[2] - local @ slope) < LEVEL_M
+    level = np.abs(points.height[rows] - at[2] - local @ slope) < level_m
     rows, local = rows[level], local[level]
     plane = fit_height_plane(
         local,
