@@ -77,8 +77,11 @@ def test_shadows_that_move_are_dropped_and_the_road_stays(
     assert judgement.source is RoadSource.MASKS
     wrong = is_moving(model, simulated, moving, judgement.tracks)
     height = judgement.points_m[:, 2]
-    off = np.abs(height) > 0.1
-    assert 100 < (wrong & off).sum()  # others have moved across the rays, and still triangulate on the road
+    # Far beyond both ends of the way there are only points of shadows, which make a road of their own.
+    way = simulated.world_from_rig[:, :3, 3]
+    near = np.linalg.norm(judgement.points_m[:, None] - way[None], axis=2).min(1) < 40.0
+    off = near & (np.abs(height) > 0.1)
+    assert (wrong & off).sum() > 100
     assert (~judgement.kept)[wrong & off].mean() > (0.97 if final else 0.85)
     assert 0.9 < judgement.kept[~wrong & (np.abs(height) < 0.05)].mean() <= 1.0
     assert abs(judgement.fitted.rig_height_m) < 0.05
