@@ -124,7 +124,7 @@ def _views(road: Road, world_from_rig: Floats) -> _Views:
     surface = np.column_stack([travelled, np.where(np.isfinite(offset), ground - offset, ground) - zero])
     kept = before.kept & np.isfinite(before.distance_m)
     shown = np.concatenate([points[kept, 2] - zero, surface[:, 1]])
-    reach = np.percentile(along, [0.5, 99.5]) if len(along) else np.array([0.0, 1.0])
+    reach = np.percentile(along[kept], [0.5, 99.5]) if kept.any() else np.array([0.0, 1.0])
     low = (float(min(reach[0], 0.0)) - 1.0, float(np.percentile(shown, 0.5)) - MARGIN_M)
     high = (float(max(reach[1], travelled[-1])) + 1.0, float(np.percentile(shown, 99.5)) + MARGIN_M)
     side = _Panel(box=SIDE_VIEW, low=low, high=high)
@@ -163,7 +163,7 @@ def _along_the_picture(way: Floats) -> Floats:
 
 def _equal_scale(box: tuple[int, int, int, int], xy: Floats) -> _Panel:
     """A panel around points (n, 2) whose two axes have one scale."""
-    low, high = np.percentile(xy, 0.5, axis=0) - 1.0, np.percentile(xy, 99.5, axis=0) + 1.0
+    low, high = np.percentile(xy, 0.5, axis=0) - 1.0, np.percentile(xy, 99.5, axis=0) + 1.0  # a few may be far away
     size = np.array([box[2] - box[0], box[3] - box[1]], dtype=np.float64)
     scale = ((high - low) / size).max()
     middle = (low + high) / 2

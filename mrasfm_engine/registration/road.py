@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-MAX_SLOPE_CHANGE = 0.1  # of the road beyond its last patch
+MAX_SLOPE_CHANGE = 0.05  # of the road beyond its last patch
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show
 
 

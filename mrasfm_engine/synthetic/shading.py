@@ -150,10 +150,15 @@ def _sun_reaches(
     `shadow_frame` is the map's x0, y0 and cell size in the sun's frame. The first `casters` rows of `boxes` (k, 8)
     move: centre x, y, lower and upper z, cosine and sine of the heading, half length, half width.
     """
+    # How far a shadow reaches for every metre that its caster is higher.
+    level = math.sqrt(light[0, 0] * light[0, 0] + light[0, 1] * light[0, 1]) / max(light[0, 2], 0.05)
     for k in range(casters):
+        above = boxes[k, 3] - z
+        if above <= 0.0:
+            continue
         px, py = x - boxes[k, 0], y - boxes[k, 1]
-        # Under a sun that is not low, no shadow is farther from its vehicle than this.
-        if px * px + py * py > 200.0:
+        reach = boxes[k, 6] + boxes[k, 7] + level * above
+        if px * px + py * py > reach * reach:
             continue
         c, s = boxes[k, 4], boxes[k, 5]
         ox, oy = c * px + s * py, -s * px + c * py

@@ -8,13 +8,13 @@ the surface.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mrasfm_engine.geometry.height_plane import HeightPlane, fit_height_plane
+from mrasfm_engine.geometry.height_plane import GATE_SIGMAS, HeightPlane, fit_height_plane
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.scene.road import RoadSurface, patch_weight
 
@@ -24,9 +24,11 @@ Ints = NDArray[np.int64]
 SPACING = 0.75  # of patches' centres, in radii: neighbours overlap
 MIN_POINTS = 8  # of a patch, that agree with its plane
 LEVEL_M = 2.5  # points farther from where the road is expected are not of this patch's road
-ROUGHNESS_M = (0.005, 0.03)  # how uneven roads are, with what planes leave of their curvature: bounds
+ROUGHNESS_M = (0.008, 0.03)  # how uneven roads are, with what planes leave of their curvature: bounds
 FIRST_ROUGHNESS_M = 0.02
-NEAR_THE_SURFACE_M = 0.15  # points that tell the roughness
+STEP_M = 0.3  # of a patch's height against what its neighbours' planes say, at most
+ROUGHNESS_STEPS = 3
+SURE_SHARE = 0.33  # of the points, those of the smallest uncertainty: they tell the roughness
 SIGMA_SLOPE_RIG = 0.05  # of the road's slope against the vehicle's
 MAX_SLOPE_RIG = 0.2
 SIGMA_SLOPE_NEIGHBOURS = 0.02  # of a patch's slope against its neighbours'
@@ -129,7 +131,8 @@ def fit_road(
         fitted = _grow(points, below, slopes, axes, radius_m=radius_m, roughness_m=roughness, rng=rng)
         if fitted is None:
             return None
-        roughness = _roughness(points_m, sigma_m, fitted)
+        fitted = _settle(points, points_m, fitted, roughness_m=roughness)
+        roughness = _roughness(points_m, sigma_m, fitted, roughness)
     assert fitted is not None
     return FittedRoad(surface=fitted, roughness_m=roughness, rig_height_m=rig_height)
 
@@ -140,16 +143,21 @@ def _slopes(normal: Floats) -> Floats:
     return result
 
 
-def _roughness(points_m: Floats, sigma_m: Floats, surface: RoadSurface) -> float:
-    """Standard deviation of the road about the surface, from points whose own uncertainty is small."""
+def _roughness(points_m: Floats, sigma_m: Floats, surface: RoadSurface, roughness_m: float) -> float:
+    """Standard deviation of the road about the surface, from points whose own uncertainty is small.
+
+    `roughness_m` is what it was taken for so far. Wrong points lie near the surface too: only those within the gate of
+    the fit have a say, and the gate narrows with what they say.
+    """
     distance, _ = surface.locate(points_m)
-    near = np.flatnonzero(np.abs(distance) < NEAR_THE_SURFACE_M)
-    if len(near) < MIN_POINTS:
-        return FIRST_ROUGHNESS_M
-    sure = near[sigma_m[near] <= np.quantile(sigma_m[near], 0.33)]
-    spread = robust_sigma(distance[sure])
-    own = float(np.median(sigma_m[sure]))
-    return float(np.sqrt(np.clip(spread**2 - own**2, ROUGHNESS_M[0] ** 2, ROUGHNESS_M[1] ** 2)))
+    for _ in range(ROUGHNESS_STEPS):
+        near = np.flatnonzero(np.abs(distance) < GATE_SIGMAS * np.hypot(sigma_m, roughness_m))
+        if len(near) < MIN_POINTS:
+            return roughness_m
+        sure = near[sigma_m[near] <= np.quantile(sigma_m[near], SURE_SHARE)]
+        variance = robust_sigma(distance[sure]) ** 2 - float(np.median(sigma_m[sure])) ** 2
+        roughness_m = float(np.sqrt(np.clip(variance, ROUGHNESS_M[0] ** 2, ROUGHNESS_M[1] ** 2)))
+    return roughness_m
 
 
 def robust_sigma(values: Floats) -> float:
@@ -220,6 +228,29 @@ def _grow(
     return RoadSurface(axes=axes, centre_m=centre @ axes, normal=normal @ axes, radius_m=radius_m)
 
 
+def _settle(points: _Points, points_m: Floats, surface: RoadSurface, *, roughness_m: float) -> RoadSurface:
+    """The surface with every patch moved by the mean residual of its points, along its normal.
+
+    Planes cut through crests and span dips. What they leave of a road's curvature is the same all over a patch, so that
+    its points tell it (twicing; Tukey, Exploratory Data Analysis, 1977).
+    """
+    distance, _ = surface.locate(points_m)
+    gate = GATE_SIGMAS * np.hypot(points.sigma, roughness_m)
+    near = np.abs(distance) < gate
+    information = 1.0 / (points.sigma**2 + roughness_m**2)
+    moved = surface.centre_m.copy()
+    for n, centre in enumerate(surface.centre_m @ surface.axes.T):
+        rows = np.array(points.tree.query_ball_point(centre[:2], surface.radius_m), dtype=np.int64)
+        rows = rows[near[rows]]
+        if len(rows) < MIN_POINTS:
+            continue
+        weight = patch_weight(np.hypot(*(points.xy[rows] - centre[:2]).T), surface.radius_m) * information[rows]
+        # Tukey's weights, as in the fit: points near the gate are as likely wrong as right.
+        weight *= (1.0 - (distance[rows] / gate[rows]) ** 2) ** 2
+        moved[n] += surface.normal[n] * float(weight @ distance[rows] / weight.sum())
+    return replace(surface, centre_m=moved)
+
+
 def _append(patches: _Patches, xy: Floats, plane: HeightPlane) -> None:
     patches.centre.append(xy)
     patches.offset.append(plane.offset_m)
@@ -261,8 +292,8 @@ def _spread(
 def _beside(
     points: _Points, at: Floats, slope: Floats, radius_m: float, *, roughness_m: float, rng: np.random.Generator
 ) -> HeightPlane | None:
-    """A patch at a place (3,) whose height and slope are expected from its neighbours."""
-    return _fit(
+    """A patch at a place (3,) whose height and slope are expected from its neighbours: no road has steps."""
+    plane = _fit(
         points,
         at,
         slope,
@@ -271,7 +302,9 @@ def _beside(
         radius_m,
         roughness_m=roughness_m,
         rng=rng,
+        level_m=STEP_M + MAX_SLOPE_NEIGHBOURS * radius_m,
     )
+    return plane if plane is not None and abs(plane.offset_m - at[2]) < STEP_M else None
 
 
 def _fit(
@@ -284,13 +317,17 @@ def _fit(
     *,
     roughness_m: float,
     rng: np.random.Generator,
+    level_m: float = LEVEL_M,
 ) -> HeightPlane | None:
-    """The plane at a place (3,) where the road is expected; None where less than MIN_SUPPORT of the points agree."""
+    """The plane at a place (3,) where the road is expected; None where less than MIN_SUPPORT of the points agree.
+
+    Points farther than `level_m` from where it is expected are not asked.
+    """
     rows = np.array(points.tree.query_ball_point(at[:2], radius_m), dtype=np.int64)
     if len(rows) < MIN_POINTS:
         return None
     local = points.xy[rows] - at[:2]
-    level = np.abs(points.height[rows] - at[2] - local @ slope) < LEVEL_M
+    level = np.abs(points.height[rows] - at[2] - local @ slope) < level_m
     rows, local = rows[level], local[level]
     plane = fit_height_plane(
         local,

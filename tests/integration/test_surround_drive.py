@@ -29,16 +29,8 @@ def test_accuracy(surround_drive: Path, surround_scene: Path, mrasfm: Run) -> No
 
 
 def test_every_file_is_there_and_readable(surround_scene: Path) -> None:
-    expected = {
-        "model",
-        "points.ply",
-        "poses.tum",
-        "poses.json",
-        "calibration.json",
-        "frame.json",
-        "features.db",
-        "pictures",
-    }
+    expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration.json", "frame.json", "features.db"}
+    expected |= {"road.json", "pictures"}  # the drive has masks, and its cameras see the road
     assert {path.name for path in surround_scene.iterdir()} == {*expected, "report.json", ".stages"}
     assert leftovers(surround_scene.parent) == []
     points = read_report(surround_scene)["summary"]["points"]
@@ -51,6 +43,20 @@ def test_every_file_is_there_and_readable(surround_scene: Path) -> None:
     calibration = json.loads((surround_scene / "calibration.json").read_text())
     assert set(calibration["cameras"]) == {"front", "back", "left", "right"}
     assert len((surround_scene / "poses.tum").read_text().splitlines()) == UNITS + 1
+
+
+def test_the_road_is_found(surround_scene: Path) -> None:
+    road = read_report(surround_scene)["by_stage"]["refinement"]["road"]
+    assert road["source"] == "masks"
+    assert road["kept"] + road["dropped"] == road["points"] > 100
+    assert 0 < road["thickness_after_m"] < 0.15
+    assert abs(road["rig_height_above_road_m"]) < 0.1  # the rig's origin is on the ground below the rear axle
+    document = json.loads((surround_scene / "road.json").read_text())
+    assert len(document["patches"]) == road["patches"] > 1
+    normals = np.array([patch["normal"] for patch in document["patches"]])
+    assert (normals @ document["up"] > np.cos(np.radians(6))).all()
+    assert sum(patch["points"] for patch in document["patches"]) <= road["kept"]
+    assert {path.name for path in (surround_scene / "pictures").iterdir()} == {"road_before.png", "road_after.png"}
 
 
 def test_features_are_a_colmap_database(surround_scene: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.correspondence.features import SiftExtractor, extract_features
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from schemas import Camera, DriveManifest, Frame, FrameImage, Pose, Rig
 
 WIDTH, HEIGHT = 800, 600
@@ -141,3 +142,39 @@ def test_a_segmenter_masks_images_that_have_no_mask(tmp_path: Path) -> None:
     assert found[0].xy_px[:, 0].max() > WIDTH // 2 + 100
     assert found[1].xy_px[:, 0].max() < WIDTH // 2 + 1
     assert len(found[1].xy_px) > 50
+
+
+def masked_drive(tmp_path: Path, mask: np.ndarray) -> Drive:
+    """Of two images of which the first has a mask."""
+    drive = make_drive(tmp_path)
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    first = drive.manifest.frames[0]
+    masked = first.model_copy(update={"images": {"cam": FrameImage(file="0.png", mask="mask.png")}})
+    return Drive(tmp_path, drive.manifest.model_copy(update={"frames": [masked, *drive.manifest.frames[1:]]}))
+
+
+def test_keypoints_have_the_class_of_the_mask_and_none_near_its_borders(tmp_path: Path) -> None:
+    mask = np.full((HEIGHT, WIDTH), 2, np.uint8)  # Cityscapes: building
+    mask[HEIGHT // 2 :] = 0  # road
+    drive = masked_drive(tmp_path, mask)
+    first, second, *_ = extract_features(drive, SiftExtractor(FeatureConfig()), threads=1, class_margin_px=5)
+    # Which keypoints there are does not depend on classes that may all have keypoints.
+    np.testing.assert_array_equal(
+        first.xy_px, extract_features(make_drive(tmp_path), SiftExtractor(FeatureConfig()), threads=1)[0].xy_px
+    )
+    row = first.xy_px[:, 1]
+    assert (first.classes[row < HEIGHT // 2 - 5] == 1).all()
+    assert (first.classes[row > HEIGHT // 2 + 5] == ROAD).all()
+    near = np.abs(row - HEIGHT // 2) < 4
+    assert near.any()
+    assert (first.classes[near] == UNKNOWN).all()
+    # Masks for some images only: the others' keypoints have no class.
+    assert len(second.classes) == len(second.xy_px) > 50
+    assert (second.classes == UNKNOWN).all()
+
+
+def test_a_mask_of_another_size_is_refused_by_name(tmp_path: Path) -> None:
+    drive = masked_drive(tmp_path, np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
+    with pytest.raises(InputError, match=r"mask mask\.png has .* pixels, its image has") as caught:
+        extract_features(drive, SiftExtractor(FeatureConfig()), threads=1)
+    assert caught.value.code == "mask-size"

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated_drive import make_simulated_drive
@@ -101,3 +103,40 @@ def test_cancelling() -> None:
             threads=1,
             cancel=lambda: True,
         )
+
+
+def test_matches_between_classes_are_dropped_before_verification_and_counted() -> None:
+    simulated = make_simulated_drive(units=3, cameras=2, points=600)
+    rng = np.random.default_rng(0)
+    # A third of the keypoints has no class, the others have any.
+    features = [replace(f, classes=rng.integers(0, 3, len(f.xy_px)).astype(np.uint8)) for f in simulated.features]
+    candidates = pairs_from_window(simulated.drive, PairConfig())
+    found = {}
+    for same_class in (True, False):
+        config = MatchConfig(same_class=same_class)
+        found[same_class] = match_pairs(
+            simulated.drive, features, candidates, NearestNeighbourMatcher(config), config, threads=1
+        )
+    with_classes, without = found[True], found[False]
+    assert without.across_classes == 0
+    for pair in with_classes.pairs:
+        a, b = (features[image].classes[pair.matches[:, k]] for k, image in enumerate((pair.image_a, pair.image_b)))
+        assert ((a == b) | (a == 0) | (b == 0)).all()
+    matches = {same: sum(len(p.matches) for p in result.pairs) for same, result in found.items()}
+    # Two ninths of random pairs of classes contradict each other.
+    assert 0.7 * matches[False] < matches[True] < 0.85 * matches[False]
+    assert 0.9 < (matches[True] + with_classes.across_classes) / matches[False] < 1.1
+
+
+def test_without_classes_nothing_changes() -> None:
+    simulated = make_simulated_drive(units=2, cameras=2, points=400)
+    candidates = pairs_from_window(simulated.drive, PairConfig())
+    results = []
+    for same_class in (True, False):
+        config = MatchConfig(same_class=same_class)
+        matcher = NearestNeighbourMatcher(config)
+        results.append(match_pairs(simulated.drive, simulated.features, candidates, matcher, config, threads=1))
+    assert len(results[0].pairs) == len(results[1].pairs) > 0
+    for a, b in zip(results[0].pairs, results[1].pairs, strict=True):
+        np.testing.assert_array_equal(a.matches, b.matches)
+        np.testing.assert_array_equal(a.inliers, b.inliers)

@@ -161,7 +161,7 @@ def test_ply(scene: Scene, written: Path) -> None:
     head, _, body = (written / "points.ply").read_bytes().partition(b"end_header\n")
     assert b"property float x" in head
     assert f"element vertex {POINTS}\n".encode() in head
-    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4)
+    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4 + 1 + 4)
     np.testing.assert_allclose(np.frombuffer(body[:12], "<f4"), scene.points_m[0], rtol=1e-6)
     assert tuple(body[12:15]) == tuple(scene.point_colors[0])
     assert np.frombuffer(body[15:19], "<i4") == 7
@@ -255,6 +255,8 @@ def test_images_without_keypoints_and_scenes_without_points(scene: Scene, tmp_pa
         points_m=np.zeros((0, 3)),
         point_colors=np.zeros((0, 3), np.uint8),
         point_error_px=np.zeros(0),
+        point_classes=np.zeros(0, np.uint8),
+        point_patches=np.zeros(0, np.int32),
         observation_point=nothing,
         observation_image=nothing,
         observation_keypoint=nothing,

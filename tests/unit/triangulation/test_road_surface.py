@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.triangulation.road_surface import FittedRoad, fit_road, most_frequent, rig_height_above
+
+Profile = Callable[[np.ndarray], np.ndarray]
+LENGTH_M = 60.0
+NOISE_M = 0.01
+
+
+def level(x: np.ndarray) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def hill(x: np.ndarray) -> np.ndarray:
+    """Waves of 1.6 m, up and down by 8 %, whose crests have a radius of 125 m: as sharp as city streets get."""
+    return 0.8 * np.cos((x - 30.0) / 10.0)
+
+
+def ramp(x: np.ndarray) -> np.ndarray:
+    """Level, from 20 m on up by 6 %, the slope changing over 12 m."""
+    fine = np.arange(-40.0, 120.0, 0.1)
+    slope = 0.06 * np.clip((fine - 20.0) / 12.0, 0, 1)
+    return np.interp(x, fine, np.cumsum(slope) * 0.1)
+
+
+def poses(profile: Profile, rig_height_m: float, *, yaw: float = 0.0) -> np.ndarray:
+    """A vehicle that follows the road, its origin at a height above it."""
+    x = np.arange(0.0, LENGTH_M, 1.5)
+    pitch = -np.arctan(np.gradient(profile(x), x))
+    rotation = se3.exp_so3(pitch[:, None] * np.array([0.0, 1.0, 0.0]))
+    up = rotation[:, :, 2]
+    way = se3.transform(rotation, np.column_stack([x, np.zeros_like(x), profile(x)]) + rig_height_m * up)
+    turn = se3.transform(se3.exp_so3([0.0, 0.0, yaw]), np.zeros(3))
+    return turn @ way
+
+
+def road_points(profile: Profile, count: int = 1500, *, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-5, LENGTH_M + 5, count), rng.uniform(-5, 5, count)
+    return np.column_stack([x, y, profile(x) + rng.normal(0, NOISE_M, count)])
+
+
+def fit(points: np.ndarray, world_from_rig: np.ndarray, sigma_m: float = NOISE_M) -> FittedRoad | None:
+    return fit_road(points, np.full(len(points), sigma_m), world_from_rig, radius_m=8.0, rng=np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("profile", [level, hill, ramp])
+@pytest.mark.parametrize("rig_height_m", [0.0, 1.65, -0.4])
+def test_hills_and_ramps_survive_at_any_height_of_the_rigs_origin(profile: Profile, rig_height_m: float) -> None:
+    road = fit(road_points(profile), poses(profile, rig_height_m))
+    assert road is not None
+    assert abs(road.rig_height_m - rig_height_m) < 0.1
+    x = np.linspace(0, LENGTH_M, 200)
+    distance, _ = road.surface.locate(np.column_stack([x, np.zeros_like(x), profile(x)]))
+    inner = (x > 8) & (x < LENGTH_M - 8)  # at the ends patches have points on one side only
+    assert 0 < np.abs(distance[inner]).max() < 0.03
+    assert np.abs(distance).max() < 0.05
+    assert 0 < np.median(np.abs(distance)) < 0.015
+    assert 0.005 <= road.roughness_m < 0.03
+
+
+def test_wrong_points_are_off_the_surface_and_the_others_on_it() -> None:
+    """40 % of points hang above the road or lie below it, as those of shadows that move do."""
+    points = road_points(ramp)
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(points)) < 0.4
+    points[wrong, 2] += rng.choice([-1, 1], int(wrong.sum())) * rng.uniform(0.1, 1.5, int(wrong.sum()))
+    road = fit(points, poses(ramp, 1.5))
+    assert road is not None
+    distance, _ = road.surface.locate(points)
+    off = np.abs(distance) > 3 * np.hypot(NOISE_M, road.roughness_m)
+    assert off[wrong].mean() > 0.97
+    assert 0 <= off[~wrong].mean() < 0.03
+
+
+def test_kerbs_that_masks_call_road_do_not_lift_the_surface() -> None:
+    points = road_points(level)
+    kerb = np.abs(points[:, 1]) > 4.0
+    points[kerb, 2] += 0.12
+    road = fit(points, poses(level, 1.5))
+    assert road is not None
+    distance, _ = road.surface.locate(points)
+    assert 0 < np.median(np.abs(distance[np.abs(points[:, 1]) < 3])) < 0.012
+    assert np.median(distance[kerb]) > 0.07
+
+
+def test_slanted_walls_that_masks_call_road_are_off_it() -> None:
+    rng = np.random.default_rng(2)
+    along, up = rng.uniform(0, LENGTH_M, 700), rng.uniform(0, 3, 700)
+    wall = np.column_stack([along, 4.0 + 0.5 * up, up])
+    points = np.concatenate([road_points(level, 1200), wall])
+    road = fit(points, poses(level, 1.5))
+    assert road is not None
+    distance, _ = road.surface.locate(points)
+    assert 0 < np.median(np.abs(distance[:1200])) < 0.015
+    assert (distance[1200:][up > 0.3] > 0.15).mean() > 0.97
+
+
+def test_neighbours_hold_a_patch_that_shadows_rule() -> None:
+    """Along 8 m, seven of ten points lie on one wrong plane, 0.6 m above the road and steeper."""
+    points = road_points(level)
+    here = np.flatnonzero((np.abs(points[:, 0] - 30.0) < 4.0) & (np.random.default_rng(3).random(len(points)) < 0.7))
+    points[here, 2] += 0.6 + 0.15 * (points[here, 0] - 30.0)
+    road = fit(points, poses(level, 1.5))
+    assert road is not None
+    x = np.linspace(20, 40, 50)
+    distance, _ = road.surface.locate(np.column_stack([x, np.zeros((50, 2))]))
+    assert 0 < np.abs(distance).max() < 0.1
+
+
+def test_the_surface_goes_on_where_points_lead_away_from_the_way() -> None:
+    """A side street: patches spread over its points, 40 m from the way."""
+    rng = np.random.default_rng(4)
+    side = np.column_stack([rng.uniform(27, 33, 600), rng.uniform(5, 45, 600), rng.normal(0, NOISE_M, 600)])
+    side[:, 2] += 0.04 * (side[:, 1] - 5)
+    road = fit(np.concatenate([road_points(level), side]), poses(level, 1.5))
+    assert road is not None
+    distance, patch = road.surface.locate(side)
+    assert (patch >= 0).all()
+    assert 0 < np.percentile(np.abs(distance), 95) < 0.05
+
+
+def test_any_heading() -> None:
+    yaw = 2.3
+    turn = se3.exp_so3([0.0, 0.0, yaw])
+    points = road_points(ramp)
+    straight, turned = fit(points, poses(ramp, 1.5)), fit(points @ turn.T, poses(ramp, 1.5, yaw=yaw))
+    assert straight is not None
+    assert turned is not None
+    a, _ = straight.surface.locate(points)
+    b, _ = turned.surface.locate(points @ turn.T)
+    known = np.isfinite(a) & np.isfinite(b)
+    assert known.mean() > 0.95
+    assert 0 < np.abs(a[known] - b[known]).max() < 0.02
+
+
+def test_no_road() -> None:
+    way = poses(level, 1.5)
+    few = road_points(level, 5)
+    assert fit(few, way) is None
+    assert fit(few[:0], way) is None
+    far = road_points(level)
+    far[:, 1] += 200.0
+    assert fit(far, way) is None
+    assert rig_height_above(few, way, reach_m=16.0) is None
+    cloud = np.random.default_rng(5).uniform([0, -5, -2], [LENGTH_M, 5, 2], (60, 3))
+    assert fit(cloud, way, 0.001) is None
+
+
+def test_most_frequent_value_among_far_outliers() -> None:
+    rng = np.random.default_rng(6)
+    values = np.concatenate([rng.normal(1.6, 0.02, 100), rng.uniform(-5, 5, 80), [1e7, -1e7]])
+    assert 0 < abs(most_frequent(values) - 1.6) < 0.02
