@@ -73,7 +73,7 @@ def main() -> int:
     )
     parser.add_argument("--only", metavar="LINE[,LINE]", help="measure these lines only")
     parser.add_argument(
-        "--seeds", default=",".join(map(str, SEEDS)), help="of lines 3 and 6 to 9 (default: %(default)s)"
+        "--seeds", default=",".join(map(str, SEEDS)), help="of lines 3, 6 to 9 (default: %(default)s)"
     )
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
