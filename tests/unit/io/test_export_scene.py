@@ -33,10 +33,11 @@ from mrasfm_engine.io import (
     export_scene,
     feature_database,
 )
+from mrasfm_engine.io.export_calibration import calibration_document
 from mrasfm_engine.io.export_scene import write_scene
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
-from mrasfm_engine.scene.scene import ImageFeatures, Scene
+from mrasfm_engine.scene.scene import CalibrationVerdict, ImageFeatures, Scene
 
 
 @pytest.fixture(scope="module")
@@ -223,8 +224,22 @@ def test_calibration(scene: Scene, written: Path) -> None:
     assert left["difference"]["focal_px"] == pytest.approx(2.0)
     assert left["sigma"] == {"rotation_deg": [0.1, 0.2, 0.3], "focal_px": 1.5}
     assert left["observed"] == {"rotation": [True] * 3, "translation": [False, True, False]}
+    assert left["verdict"]["translation"] == ["only the prior", "observed", "only the prior"]
+    assert left["wrong"] is False
     read = read_calibration(written / "calibration.json")
     np.testing.assert_allclose(read["right"], scene.calibration[1].rig_from_cam, atol=1e-12)
+
+
+def test_what_all_cameras_share_is_never_called_observed(scene: Scene) -> None:
+    verdict = CalibrationVerdict(
+        adjusted=True, reason="GNSS", scale_observed=True, scale_rests_on="observed by positions", sigma_scale=0.004
+    )
+    common = calibration_document(replace(scene, calibration_verdict=verdict))["common"]
+    assert common["rotation"]["observed"] == common["translation"]["observed"] == [False] * 3
+    assert common["scale"] == {"observed": True, "sigma_relative": 0.004, "verdict": "observed by positions"}
+    unknown = replace(verdict, scale_observed=False, sigma_scale=float("nan"), scale_rests_on="what was given")
+    common = calibration_document(replace(scene, calibration_verdict=unknown))["common"]
+    assert common["scale"] == {"observed": False, "verdict": "what was given"}
 
 
 def test_report(written: Path) -> None:
