@@ -75,9 +75,8 @@ class LearnedExtractor:
             if mask is None:
                 return np.ones(len(xy), dtype=np.bool_)
             at = (xy * stretch).astype(int)
-            rows, columns = np.clip(at[:, 1], 0, mask.shape[0] - 1), np.clip(at[:, 0], 0, mask.shape[1] - 1)
-            result: Bools = mask[rows, columns]
-            return result
+            inside: Bools = mask[np.clip(at[:, 1], 0, mask.shape[0] - 1), np.clip(at[:, 0], 0, mask.shape[1] - 1)]
+            return inside
 
         tiles = lay_tiles(size, window)
         parts = [self._detect(cut(pixels, tile, window), tile, usable) for tile in tiles]

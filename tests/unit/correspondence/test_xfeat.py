@@ -112,8 +112,8 @@ def test_an_image_at_half_size_has_keypoints_at_the_same_places(
 def test_masked_areas_hold_no_keypoints_and_the_rest_all_that_are_wanted(models: Path, image: np.ndarray) -> None:
     mask = np.ones(image.shape[:2], np.bool_)
     mask[:, 300:] = False
-    masked = plugins(models, max_keypoints=512).extractor.extract(image, mask)
-    assert len(masked.xy_px) == 512
+    masked = plugins(models, max_keypoints=256).extractor.extract(image, mask)
+    assert len(masked.xy_px) == 256
     assert masked.xy_px[:, 0].max() <= 300
 
 
@@ -128,7 +128,7 @@ def test_brightness_may_be_0_to_1_or_0_to_255(models: Path, image: np.ndarray) -
 
 
 def test_lighterglue_gets_the_units_it_was_trained_with(models: Path, shared_data: Path, found: ImageFeatures) -> None:
-    """Keypoints in pixels match worse, and those of nearest neighbours are fewer: nine frames on."""
+    """Six frames on, keypoints in pixels match worse, and nearest neighbours find fewer."""
     loaded = plugins(models)
     later = np.asarray(cv2.imread(str(shared_data / "kitti06" / "image_0" / "000026.png")), dtype=np.uint8)
     pair = [found, loaded.extractor.extract(later, None)]
@@ -149,6 +149,6 @@ def test_lighterglue_gets_the_units_it_was_trained_with(models: Path, shared_dat
         ImageFeatures(xy_px=f.xy_px[:1024], descriptors=f.descriptors[:1024], colors=f.colors[:1024]) for f in pair
     ]
     plain = verified(nearest.match(*(nearest.prepare(f) for f in strongest)))
-    assert 100 < right <= 1024
+    assert 60 < right <= 1024
     assert wrong < 0.9 * right
     assert plain < 0.8 * right
