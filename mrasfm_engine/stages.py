@@ -40,6 +40,7 @@ from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.views.birds_eye import birds_eye
+from mrasfm_engine.views.road_points import road_points
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
@@ -329,7 +330,10 @@ def scene(
 
 
 def pictures(run: Run, result: Scene) -> dict[str, NDArray[np.uint8]]:
-    """The pictures (h, w, 3) of a scene by file name: the road from above before and after recalibration."""
+    """The pictures (h, w, 3) of a scene by file name.
+
+    The road from above before and after recalibration, and its points before and after those off it were dropped.
+    """
     if not run.config.output.pictures:
         return {}
 
@@ -349,7 +353,7 @@ def pictures(run: Run, result: Scene) -> dict[str, NDArray[np.uint8]]:
         }
     )
     run.progress("pictures", 1, 1)
-    return drawn.pictures
+    return {**drawn.pictures, **road_points(result)}
 
 
 def store_of(out: Path) -> StageStore:

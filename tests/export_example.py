@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,9 @@ import pycolmap
 
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
+from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.semantics import ROAD
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
 
 UNITS, POINTS, EXTRA_KEYPOINTS = 5, 50, 7
@@ -138,3 +141,33 @@ def make_scene(*, georeferenced: bool = True, folder: str = "images", moving: bo
 def assert_nothing_published(out: Path) -> None:
     assert not out.exists()
     assert not [p for p in out.parent.iterdir() if "partial" in p.name]
+
+
+def scene_with_road(*, far: bool = False) -> Scene:
+    """The example with a level road of two patches under its way; points 0 to 19 lie on it."""
+    scene, off_m = make_scene(), 0.4
+    way = scene.world_from_rig[scene.unit_registered, :3, 3]
+    rng = np.random.default_rng(0)
+    points = scene.points_m.copy()
+    points[:20] = np.column_stack([rng.uniform(0, 10, 20), rng.uniform(-3, 3, 20), rng.normal(-1.5, 0.01, 20)])
+    surface = RoadSurface(
+        axes=np.eye(3),
+        centre_m=np.array([[2.0, 0.0, -1.5], [8.0, 0.0, -1.5]]),
+        normal=np.tile([0.0, 0.0, 1.0], (2, 1)),
+        radius_m=8.0,
+    )
+    before = np.concatenate([points[:20], points[:20] + np.array([0, 0, off_m]), points[:20] - np.array([0, 0, off_m])])
+    if far:
+        before[-1] = [1e4, 0.0, 900.0]
+    distance, patch = surface.locate(before)
+    road = Road(
+        source=RoadSource.MASKS,
+        surface=surface,
+        roughness_m=0.01,
+        rig_height_m=float(way[0, 2] + 1.5),
+        before=RoadPoints(points_m=before, distance_m=distance, kept=np.arange(60) < 20),
+    )
+    classes = np.where(np.arange(len(points)) < 20, ROAD, 1).astype(np.uint8)
+    patches = np.full(len(points), -1, np.int32)
+    patches[:20] = patch[:20]
+    return replace(scene, points_m=points, point_classes=classes, point_patches=patches, road=road)

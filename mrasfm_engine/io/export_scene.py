@@ -33,7 +33,6 @@ from mrasfm_engine.io import (
     export_poses,
     export_road,
     feature_database,
-    road_pictures,
 )
 from mrasfm_engine.scene.scene import Scene
 
@@ -123,7 +122,6 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
     if scene.road is not None:
         _write_json(work / ROAD_FILE, export_road.road_document(scene))
         export_check.check_road(scene, work / ROAD_FILE)
-        road_pictures.write_pictures(scene, work / PICTURES)
     (work / "poses.tum").write_text(export_poses.poses_text(scene), encoding="utf-8")
     _write_json(work / "poses.json", export_poses.poses_document(scene))
     _write_json(work / "calibration.json", export_calibration.calibration_document(scene))

@@ -72,9 +72,7 @@ def main() -> int:
         prog="acceptance", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--only", metavar="LINE[,LINE]", help="measure these lines only")
-    parser.add_argument(
-        "--seeds", default=",".join(map(str, SEEDS)), help="of lines 3, 6 to 9 (default: %(default)s)"
-    )
+    parser.add_argument("--seeds", default=",".join(map(str, SEEDS)), help="of lines 3, 6 to 9 (default: %(default)s)")
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()

@@ -4,57 +4,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from export_example import FILES, assert_nothing_published, make_scene
+from export_example import FILES, assert_nothing_published, make_scene, scene_with_road
 
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.io import export_ply, export_road
 from mrasfm_engine.io.export_scene import write_scene
-from mrasfm_engine.io.road_pictures import ABOVE, BELOW, NAMES, ON
-from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
-from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.scene.semantics import ROAD
-
-OFF_M = 0.4
-
-
-def scene_with_road(*, far: bool = False) -> Scene:
-    """The example with a level road of two patches under its way; points 0 to 19 lie on it."""
-    scene = make_scene()
-    way = scene.world_from_rig[scene.unit_registered, :3, 3]
-    rng = np.random.default_rng(0)
-    points = scene.points_m.copy()
-    points[:20] = np.column_stack([rng.uniform(0, 10, 20), rng.uniform(-3, 3, 20), rng.normal(-1.5, 0.01, 20)])
-    surface = RoadSurface(
-        axes=np.eye(3),
-        centre_m=np.array([[2.0, 0.0, -1.5], [8.0, 0.0, -1.5]]),
-        normal=np.tile([0.0, 0.0, 1.0], (2, 1)),
-        radius_m=8.0,
-    )
-    before = np.concatenate([points[:20], [*points[:20], 0, 0, OFF_M], points[:20] - [0, 0, OFF_M]])
-    if far:
-        before[-1] = [1e4, 0.0, 900.0]
-    distance, patch = surface.locate(before)
-    road = Road(
-        source=RoadSource.MASKS,
-        surface=surface,
-        roughness_m=0.01,
-        rig_height_m=float(way[0, 2] + 1.5),
-        before=RoadPoints(points_m=before, distance_m=distance, kept=np.arange(60) < 20),
-    )
-    classes = np.where(np.arange(len(points)) < 20, ROAD, 1).astype(np.uint8)
-    patches = np.full(len(points), -1, np.int32)
-    patches[:20] = patch[:20]
-    return replace(scene, points_m=points, point_classes=classes, point_patches=patches, road=road)
-
-
-def counted(path: Path) -> dict[str, int]:
-    """Pixels of both panels by colour."""
-    image = cv2.imread(str(path))[100:950]
-    named = {"on": ON, "above": ABOVE, "below": BELOW}
-    return {name: int((image == np.array(colour)).all(-1).sum()) for name, colour in named.items()}
 
 
 def test_the_road_is_written_with_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,7 +18,7 @@ def test_the_road_is_written_with_the_scene(tmp_path: Path, monkeypatch: pytest.
     scene = scene_with_road()
     out = tmp_path / "scene"
     write_scene(scene, out, {})
-    assert {p.name for p in out.iterdir()} == FILES | {"road.json", "pictures"}
+    assert {p.name for p in out.iterdir()} == FILES | {"road.json"}
     document = json.loads((out / "road.json").read_text())
     assert document["source"] == "masks"
     assert [patch["points"] for patch in document["patches"]] == np.bincount(scene.point_patches[:20]).tolist()
@@ -75,23 +31,7 @@ def test_the_road_is_written_with_the_scene(tmp_path: Path, monkeypatch: pytest.
     assert rows[:, -4:].copy().view("<i4")[:, 0].tolist() == scene.point_patches.tolist()
     # Written again without a road: nothing of the old one stays.
     write_scene(make_scene(), out, {})
-    assert {p.name for p in out.iterdir()} - {"pictures"} == FILES
-    assert not list(out.glob("pictures/*"))
-
-
-def test_pictures_show_what_was_dropped(tmp_path: Path) -> None:
-    scene = scene_with_road()
-    write_scene(scene, tmp_path / "scene", {})
-    before, after = (counted(tmp_path / "scene" / "pictures" / name) for name in NAMES)
-    assert min(before.values()) > 100
-    assert after["above"] == after["below"] == 0
-    assert 0.5 * before["on"] < after["on"]
-
-
-def test_points_at_the_end_of_the_world_do_not_spoil_the_picture(tmp_path: Path) -> None:
-    write_scene(scene_with_road(far=True), tmp_path / "scene", {})
-    near = counted(tmp_path / "scene" / "pictures" / NAMES[0])
-    assert min(near.values()) > 100
+    assert {p.name for p in out.iterdir()} == FILES
 
 
 @pytest.mark.parametrize("name", ["point_classes", "point_patches"])

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.errors import StorageError
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.scene.road import Road, Thickness
 from mrasfm_engine.scene.scene import Scene
@@ -91,23 +89,15 @@ class _Views:
     outside: int  # points that the side view does not reach
 
 
-def write_pictures(scene: Scene, folder: Path) -> None:
-    """Draw both pictures of the scene's road into the folder.
-
-    Raises
-    ------
-    StorageError
-        Where a picture cannot be written.
-    """
-    assert scene.road is not None
+def road_points(scene: Scene) -> dict[str, Image]:
+    """Both pictures (h, w, 3) of the scene's road by file name; none where no road was found."""
+    if scene.road is None:
+        return {}
     road, way = scene.road, scene.world_from_rig[scene.unit_registered]
     views = _views(road, way)
-    folder.mkdir(exist_ok=True)
     everything = np.ones(len(road.before.kept), dtype=np.bool_)
-    for name, shown, what in zip(NAMES, (everything, road.before.kept), ("before", "after"), strict=True):
-        path = folder / name
-        if not cv2.imwrite(str(path), _draw(road, views, shown, what)):
-            raise StorageError(f"{path} cannot be written", remedy="Free space on this disk.")
+    shown = zip(NAMES, (everything, road.before.kept), ("before", "after"), strict=True)
+    return {name: np.ascontiguousarray(_draw(road, views, points, what)[..., ::-1]) for name, points, what in shown}
 
 
 def _views(road: Road, world_from_rig: Floats) -> _Views:
