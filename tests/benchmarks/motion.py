@@ -13,7 +13,7 @@ from tests.benchmarks.commands import evaluate, mrasfm
 from tests.benchmarks.table import Figure, exactly
 
 CAMERAS, UNITS = 6, 40
-WAY = ("--world", "turn", "--speed-profile", "varying", "--tight")
+WAY = ("--world", "turn", "--speed-profile", "varying")
 SKEW_MS = 50
 FLOOR_M = 0.02  # errors below this are as good as none
 NEAR, FAR = 1.3, 2.0  # of the simultaneous drive's error: compensated at most, not compensated at least twice that
