@@ -156,7 +156,8 @@ def scene_with_road(*, far: bool = False) -> Scene:
         normal=np.tile([0.0, 0.0, 1.0], (2, 1)),
         radius_m=8.0,
     )
-    before = np.concatenate([points[:20], points[:20] + np.array([0, 0, off_m]), points[:20] - np.array([0, 0, off_m])])
+    shift = np.array([0.0, 0.0, off_m])
+    before = np.concatenate([points[:20], points[:20] + shift, points[:20] - shift])
     if far:
         before[-1] = [1e4, 0.0, 900.0]
     distance, patch = surface.locate(before)
