@@ -57,7 +57,8 @@ def compared(simultaneous: Path, apart: Path, work: Path, seed: int) -> Iterator
             value=errors["ignored"][key],
             unit="m",
             above=FAR * allowed,
-            most=100,
+            # Where the scale comes out too wrong for GNSS to be believed, the calibration is held and its places stay.
+            most=100.0 if key == "units" else None,
         )
     for scene in scenes.values():
         shutil.rmtree(scene)
