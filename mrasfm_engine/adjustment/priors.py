@@ -23,7 +23,7 @@ Bools = NDArray[np.bool_]
 # How firmly a gauge is held, relative to the priors: firm enough to hold, soft enough not to hurt the conditioning.
 GAUGE_STIFFNESS = 1e6
 HELD_SHARE = 0.02  # of a prior's sigma that is left in a direction that is held
-GAUGE_USUAL = 2.0  # cameras farther off than this many usual distances hardly count in the gauge
+GAUGE_USUAL = 3.0  # cameras farther off than this many usual distances hardly count in the gauge, nearer ones alike
 
 
 class Term(Protocol):
@@ -112,14 +112,15 @@ def robust_gauge_weights(whitened: Floats) -> Floats:
     """Weights (c,) of cameras in the gauge from their corrections in sigmas (c, 6).
 
     A camera is compared with how far cameras are from their common correction as a rule, not with the prior's sigma:
-    one that is 3 deg off would pass for usual under a prior of 2 deg, and turn the whole vehicle with it. With fewer
+    one that is 3 deg off would pass for usual under a prior of 2 deg, and turn the whole vehicle with it. Usual ones weigh
+    the same: of errors that are all of one kind the plain mean is nearest to zero. With fewer
     than three cameras there is no majority, and all weigh the same.
     """
     if len(whitened) < 3:
         return np.ones(len(whitened))
     distance = np.linalg.norm(whitened - np.median(whitened, axis=0), axis=1)
     usual = max(float(np.median(distance)), 1e-3)
-    result: Floats = 1.0 / (1.0 + (distance / (GAUGE_USUAL * usual)) ** 2) ** 2
+    result: Floats = 1.0 / (1.0 + (distance / (GAUGE_USUAL * usual)) ** 8)
     return result
 
 

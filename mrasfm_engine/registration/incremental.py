@@ -140,10 +140,7 @@ def map_units(
     if moving.any:
         log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}
         near, far = (without_keypoints(p, keypoints.first, moving.keypoint) for p in (near, far))
-        model.forget(units_to_doubt(model, moving.covered))
-        model = _with_tracks_of(model, near)
-        register_all(model, log, progress=progress, cancel=cancel)
-        adjust_globally(model, log, cancel)
+        model = _registered_anew(model, near, units_to_doubt(model, moving.covered), log, progress, cancel)
     revisits, log.revisits_tried = find_revisits(model, far)
     if not revisits:
         return model, log
@@ -155,6 +152,31 @@ def map_units(
     closed = _with_tracks_of(model, [*near, *across])
     adjust_globally(closed, log, cancel)
     return closed, log
+
+
+def _registered_anew(
+    model: Model,
+    pairs: Sequence[PairMatches],
+    units: Ints,
+    log: MappingLog,
+    progress: Callable[[int, int], None] | None,
+    cancel: Callable[[], bool] | None,
+) -> Model:
+    """The scene with tracks from other matches, in which some units find their pose anew; else they keep it."""
+    before = model.state.world_from_rig
+    model.forget(units)
+    model = _with_tracks_of(model, pairs)
+    register_all(model, log, progress=progress, cancel=cancel)
+    # Where the units around have no pose either, there is nothing to register against: rather an old pose than none.
+    lost = units[~model.registered[units]]
+    for unit in lost:
+        model.set_pose(int(unit), before[unit])
+        log.failures.pop(int(unit), None)
+    if len(lost):
+        model.renew_motion()
+        model.triangulate()
+    adjust_globally(model, log, cancel)
+    return model
 
 
 def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:

@@ -25,7 +25,7 @@ DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for 
 def describe(model: Model, log: MappingLog) -> dict[str, Any]:
     """Counts of the incremental loop, and what was rejected and why."""
     frames = model.drive.manifest.frames
-    covered = _covered(model, log)
+    covered, poor = _covered(model, log), _poorly_seen(model)
     unclear = Counter(name for r in log.registrations for name in r.unclear)
     start = log.initialisation
     missing = [
@@ -46,7 +46,8 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         "cameras_voted_out": voted_out(log.registrations, {image["unit"] for image in covered}),
         "cameras_without_a_vote": dict(unclear),
         "images_occluded": covered,
-        "images_posed_by_their_unit_alone": _poorly_seen(model),
+        "images_posed_by_their_unit_alone": poor,
+        "images_dark_or_without_texture": [file for file in poor if file not in {image["file"] for image in covered}],
         "tracks": len(model.tracks),
         "points": int(model.solved.sum()),
         "observations": int(model.kept.sum()),

@@ -7,7 +7,14 @@ import pytest
 from small_problems import Case, make_case, moved, numeric_gradient, perturbed, rotation_errors_deg
 
 from mrasfm_engine.adjustment import priors
-from mrasfm_engine.adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.adjustment.priors import (
+    CalibrationPrior,
+    FocalPrior,
+    PositionPrior,
+    Term,
+    UprightPrior,
+    robust_gauge_weights,
+)
 from mrasfm_engine.adjustment.solver import Report, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
@@ -187,6 +194,17 @@ def test_calibration_priors_gauge() -> None:
     apart[18 + 7 * np.arange(CAMERAS - 1) + 3] = [1.0, -1.0, 1.0, -1.0]
     stiffness = (together @ h @ together) / (apart @ h @ apart)
     assert stiffness > 1e4
+
+
+def test_usual_cameras_weigh_alike() -> None:
+    rng = np.random.default_rng(4)
+    corrections = rng.normal(size=(6, 6))
+    weights = robust_gauge_weights(corrections)
+    assert weights.min() > 0.9
+    corrections[3] += 8.0
+    weights = robust_gauge_weights(corrections)
+    assert weights[3] < 0.01
+    assert np.delete(weights, 3).min() > 0.9
 
 
 def test_calibration_weights_single_out_the_bad_camera() -> None:

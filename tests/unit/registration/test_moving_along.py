@@ -101,7 +101,8 @@ def mapped(simulated: SimulatedDrive) -> tuple[Model, MappingLog]:
 def test_a_lorry_bends_neither_poses_nor_calibration(cameras: tuple[int, ...]) -> None:
     """Two cameras of six, and all but one, are covered for half of the drive."""
     clean = drive()
-    plain, _ = mapped(clean)
+    plain, nothing = mapped(clean)
+    assert nothing.covered_images == {}
     covered = with_lorry(clean, in_the_middle(*cameras))
     model, log = mapped(covered)
     assert model.registered.all()
@@ -113,6 +114,10 @@ def test_a_lorry_bends_neither_poses_nor_calibration(cameras: tuple[int, ...]) -
     assert model.kept[lorry].mean() < 0.02
 
 
-def test_nothing_changes_where_nothing_is_covered() -> None:
-    log = mapped(drive())[1]
-    assert log.covered_images == {}
+def test_a_camera_that_is_covered_all_the_way_costs_no_unit() -> None:
+    """No unit is left to register the others against, so they keep the poses that they have."""
+    simulated = with_lorry(drive(), lambda unit, camera: camera == 3)
+    model, log = mapped(simulated)
+    assert model.registered.all()
+    assert len(log.covered_images) == UNITS
+    assert 1e-5 < rmse(metric_errors_m(model, simulated)) < 0.03
