@@ -22,24 +22,38 @@ def ablation(data: Path, work: Path) -> Iterator[Figure]:
     """Line 6."""
     kitti = imported(data, "kitti06", work)
     yield from _rows("kitti06 without GNSS", kitti, 2, 102, "--no-gnss")
-    yield from _rows("kitti06 with GNSS", kitti, 2, 102)
-    yield from _rows(f"{CAMERAS} cameras, {UNITS} units, rendered", perturbed_surround(work), CAMERAS, CAMERAS * UNITS)
+    # With GNSS the calibration varies, and the true one is not known to a tenth of a degree.
+    yield from _rows("kitti06 with GNSS", kitti, 2, 102, rotation_known=False)
+    title = f"{CAMERAS} cameras, {UNITS} units, rendered"
+    yield from _rows(title, perturbed_surround(work), CAMERAS, CAMERAS * UNITS)
 
 
-def _rows(title: str, drive: Path, cameras: int, images: int, *options: str) -> Iterator[Figure]:
+def _rows(
+    title: str, drive: Path, cameras: int, images: int, *options: str, rotation_known: bool = True
+) -> Iterator[Figure]:
     said = mrasfm("ablate", drive, "--truth", drive / "truth.tum", "--json", *options, timeout_s=TIMEOUT_S)
     rows = {row["name"]: row for row in json.loads(said)["rows"]}
     yield exactly("6", f"{title}: images registered by the full method", rows[FULL]["registered_images"], images)
-    yield from _without_csba(title, rows[FULL], rows[CSBA], cameras)
+    yield from _without_csba(title, rows[FULL], rows[CSBA], cameras, rotation_known=rotation_known)
     for row in rows.values():
         yield from _as_measured(f"{title}, {row['title']}", row)
 
 
-def _without_csba(title: str, full: dict[str, Any], without: dict[str, Any], cameras: int) -> Iterator[Figure]:
+def _without_csba(
+    title: str, full: dict[str, Any], without: dict[str, Any], cameras: int, *, rotation_known: bool
+) -> Iterator[Figure]:
     """Camera set adjustment has fewer unknowns and smaller errors than images that are adjusted on their own."""
-    for what, key in (("metric RMSE of images", "metric_rmse_m"), ("rotation of images", "rotation_median_deg")):
-        ratio = without["errors"]["images"][key] / full["errors"]["images"][key]
-        yield Figure(line="6", what=f"{title}: {what}, without CSBA to with", value=ratio, above=WORSE, most=FAR_WORSE)
+    for what, key, known in (
+        ("metric RMSE of images", "metric_rmse_m", True),
+        ("rotation of images", "rotation_median_deg", rotation_known),
+    ):
+        yield Figure(
+            line="6",
+            what=f"{title}: {what}, without CSBA to with",
+            value=without["errors"]["images"][key] / full["errors"]["images"][key],
+            above=WORSE,
+            most=FAR_WORSE if known else None,
+        )
     yield Figure(
         line="6",
         what=f"{title}: pose parameters, without CSBA to with",
