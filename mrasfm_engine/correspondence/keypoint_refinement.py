@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-SIGMA_PX = 1.6  # of the finer one, as in SIFT
+SIGMA_PX = 1.2  # of the finer one
 SIGMA_RATIO = 1.4
-RADIUS_PX = 4  # half a cell
+RADIUS_PX = 3
 MIN_HEIGHT = 0.5  # gray levels; less is rounding
 
 

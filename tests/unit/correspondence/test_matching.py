@@ -74,3 +74,11 @@ def test_an_empty_descriptor_is_no_nan() -> None:
     prepared = NearestNeighbourMatcher(MatchConfig()).prepare(features(d))
     assert np.isfinite(prepared).all()
     np.testing.assert_allclose(np.linalg.norm(prepared, axis=1), [1, 1, 0, 1, 1], atol=1e-6)
+
+
+def test_float_descriptors_of_any_length_match_too() -> None:
+    rng = np.random.default_rng(4)
+    a, order = rng.normal(size=(80, 64)).astype(np.float32), rng.permutation(80)[:50]
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    matches = matcher.match(matcher.prepare(features(a)), matcher.prepare(features(3 * a[order])))
+    assert sorted(map(tuple, matches.tolist())) == sorted(zip(order.tolist(), range(50), strict=True))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated_drive import make_drive, random_descriptors
@@ -95,3 +97,12 @@ def test_the_same_drive_gives_the_same_pairs() -> None:
     drive, features = drive_of(1), features_of(places_of_a_loop(), 1)
     a, b = (revisit_pairs(drive, features, PairConfig()) for _ in range(2))
     np.testing.assert_array_equal(a, b)
+
+
+def test_a_networks_descriptors_find_the_place_again_too() -> None:
+    drive, unit_pairs = drive_of(1), {(a, a + 30) for a in range(10)}
+    features = [
+        replace(f, descriptors=(f.descriptors / 512.0).astype(np.float32)) for f in features_of(places_of_a_loop(), 1)
+    ]
+    pairs = revisit_pairs(drive, features, PairConfig(revisit_pairs_per_unit=2))
+    assert unit_pairs <= set(map(tuple, pairs.tolist()))

@@ -34,7 +34,9 @@ from mrasfm_engine.io import (
     feature_database,
 )
 from mrasfm_engine.io.export_calibration import calibration_document
+from mrasfm_engine.io.export_check import check_features
 from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.io.feature_database import write_features
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.scene.scene import CalibrationVerdict, ImageFeatures, Scene
@@ -151,6 +153,25 @@ def test_the_database_has_the_models_ids_and_all_features(scene: Scene, written:
     np.testing.assert_array_equal(verified.inlier_matches, pair.matches[pair.inliers])
     np.testing.assert_array_equal(database.read_camera(2).params, scene.calibration[1].params)
     database.close()
+
+
+def test_float_descriptors_are_kept_bit_for_bit(scene: Scene, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    numbers = [rng.normal(size=(len(f.xy_px), 64)).astype(np.float32) for f in scene.features]
+    numbers[3] = numbers[3][:0]
+    features = [
+        replace(f, descriptors=d, xy_px=f.xy_px[: len(d)], colors=f.colors[: len(d)])
+        for f, d in zip(scene.features, numbers, strict=True)
+    ]
+    path = tmp_path / "features.db"
+    learned = replace(scene, features=features)
+    write_features(learned, path)
+    check_features(learned, path)
+    database = pycolmap.Database.open(str(path))
+    read = [database.read_descriptors(i + 1) for i in range(len(numbers))]
+    database.close()
+    assert all(d.type == pycolmap.FeatureExtractorType.UNDEFINED for d in read)
+    np.testing.assert_array_equal(read[0].data.view(np.float32), numbers[0])
 
 
 def test_the_database_is_one_file_that_a_read_only_folder_can_hold(written: Path) -> None:
