@@ -21,7 +21,7 @@ from tests.benchmarks.real_drives import THREADS, imported, reconstructed
 from tests.benchmarks.table import Figure, exactly
 
 IMAGES = 102
-DARK_FRAMES = "0:16"  # a third of the drive shows it
+DARK_FRAMES = "0:8"  # more would show the same
 GAMMA, NOISE, BLUR_PX = 3.0, 8 / 255, 1.0
 SEED = 0
 WEIGHTS = ("xfeat_2048_640x360.onnx", "lighterglue_L3.onnx")
@@ -79,7 +79,7 @@ def changing_light(data: Path, work: Path, models: Path) -> Iterator[Figure]:
             mean = float(np.mean([inliers.get(pair, 0) for pair in of_kind]))
             what = f"changing light, {kind}, {name}: verified matches a pair"
             # What is measured decides who wins; that there is something to match is what must hold.
-            yield Figure(line="7b", what=what, value=mean, above=1.0, most=config.features.max_keypoints)
+            yield Figure(line="7b", what=what, value=mean, above=75.0, most=1000.0)
 
 
 def darkened(gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:
