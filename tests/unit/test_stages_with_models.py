@@ -1,0 +1,83 @@
+"""Models in a run: refused before any work, part of what a stage depends on, named in the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import learned_graphs
+import pytest
+
+from mrasfm_engine import stages
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.learned.model_folder import ModelFolder
+from mrasfm_engine.learned.onnx_file import sha256_of
+from mrasfm_engine.pipeline import reconstruct
+
+WriteDrive = Callable[[dict[str, Any]], Path]
+
+
+def run_of(drive: Path, models: Path, **sections: dict[str, Any]) -> stages.Run:
+    config = EngineConfig.model_validate({"models": {"folder": models}, **sections})
+    store = stages.store_of(drive.parent / "scene")
+    return stages.Run(read_drive(drive), config, store, lambda stage, done, total: None, lambda: False)
+
+
+def add(models: Path, name: str, data: bytes) -> None:
+    given = models.parent / "given.onnx"
+    given.write_bytes(data)
+    ModelFolder(models).add(given, name)
+
+
+def test_what_does_not_go_together_is_refused_before_any_work(
+    drive_document: dict[str, Any], write_drive: WriteDrive, tmp_path: Path
+) -> None:
+    drive, steps = write_drive(drive_document), []
+    config = EngineConfig.model_validate({"matching": {"matcher": "lightglue"}})
+    with pytest.raises(InputError, match="lightglue"):
+        reconstruct(drive, tmp_path / "scene", config, progress=lambda *step: steps.append(step))
+    assert steps == []
+    assert not (tmp_path / "scene").exists()
+
+
+def test_features_depend_on_the_models_and_matches_too(
+    drive_document: dict[str, Any], write_drive: WriteDrive, tmp_path: Path
+) -> None:
+    drive, models = write_drive(drive_document), tmp_path / "models"
+    sections = {"features": {"extractor": "superpoint"}, "matching": {"matcher": "superglue"}}
+    add(models, "superpoint", learned_graphs.superpoint())
+    add(models, "superglue", learned_graphs.superglue())
+    first = run_of(drive, models, **sections)
+    again = run_of(drive, models, **sections)
+    plain = run_of(drive, models)
+    assert first.feature_settings == again.feature_settings
+    assert first.feature_settings != plain.feature_settings
+    add(models, "superpoint", learned_graphs.superpoint(threshold=0.3))
+    changed = run_of(drive, models, **sections)
+    assert changed.feature_settings != first.feature_settings
+    assert changed.plugins.fingerprint_of("matcher") == first.plugins.fingerprint_of("matcher")
+
+
+def test_learned_features_come_back_from_the_store_as_they_were(
+    drive_document: dict[str, Any], write_drive: WriteDrive, tmp_path: Path
+) -> None:
+    drive, models = write_drive(drive_document), tmp_path / "models"
+    add(models, "superpoint", learned_graphs.superpoint())
+    runs = [run_of(drive, models, features={"extractor": "superpoint"}) for _ in range(2)]
+    made, kept = (stages.features(run) for run in runs)
+    assert [run.report["stages"][0]["reused"] for run in runs] == [False, True]
+    for a, b in zip(made, kept, strict=True):
+        assert len(a.xy_px) > 5
+        assert a.descriptors.dtype == b.descriptors.dtype == "float32"
+        assert (a.descriptors == b.descriptors).all()
+        assert a.scores is not None
+        assert b.scores is not None
+        assert (a.scores == b.scores).all()
+    stages.load_models(runs[0])
+    described = runs[0].report["models"]["extractor"]
+    assert described["sha256"] == sha256_of(learned_graphs.superpoint())
+    assert described["licence"] == "Magic Leap, research only"
+    assert described["provider"].endswith("ExecutionProvider")
