@@ -112,9 +112,9 @@ def robust_gauge_weights(whitened: Floats) -> Floats:
     """Weights (c,) of cameras in the gauge from their corrections in sigmas (c, 6).
 
     A camera is compared with how far cameras are from their common correction as a rule, not with the prior's sigma:
-    one that is 3 deg off would pass for usual under a prior of 2 deg, and turn the whole vehicle with it. Usual ones weigh
-    the same: of errors that are all of one kind the plain mean is nearest to zero. With fewer
-    than three cameras there is no majority, and all weigh the same.
+    one that is 3 deg off would pass for usual under a prior of 2 deg, and turn the whole vehicle with it. Usual ones
+    weigh the same: of errors that are all of one kind the plain mean is nearest to zero. With fewer than three cameras
+    there is no majority, and all weigh the same.
     """
     if len(whitened) < 3:
         return np.ones(len(whitened))
