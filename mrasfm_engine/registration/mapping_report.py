@@ -174,8 +174,8 @@ def _road(judged: RoadJudgement | str) -> dict[str, Any]:
             result[f"spread_{when}_m"] = thickness.spread_m
     if road.source is RoadSource.GEOMETRY:
         result["confidence"] = (
-            "low: no mask says what is road. Points near the road's level in the vehicle's own lane were judged, and "
-            "dropped only where nothing can stand: below the road, or above it where the vehicle drove"
+            "low: no mask says what is road. Points near the road's level in the vehicle's own lane were judged in the "
+            "finished scene, and dropped only where nothing can stand: below the road, or above it where it drove"
         )
     return result
 

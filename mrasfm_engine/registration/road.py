@@ -67,6 +67,8 @@ def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
     if not (model.track_class == ROAD).any():
         if model.keypoints.classes.any():
             return "no keypoint lies on the road of the masks"
+        if not final:
+            return "without masks, the road is judged in the finished scene only: too unsure to bear on poses"
         source = RoadSource.GEOMETRY
         tracks = np.flatnonzero(model.solved)
         below = points_below_the_way(model.state.points_m[tracks], world_from_rig, _lowest_camera_m(model))
