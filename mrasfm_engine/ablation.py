@@ -52,22 +52,13 @@ class Switch:
         section = getattr(config, self.section).model_copy(update={self.field: False})
         return config.model_copy(update={self.section: section})
 
-    @property
-    def exists(self) -> bool:
-        """Whether the engine has this setting."""
-        return self.field in type(getattr(EngineConfig(), self.section)).model_fields
 
-
-SWITCHES = tuple(
-    switch
-    for switch in (
-        Switch("adjustment", "camera_set_adjustment", "no CSBA"),
-        Switch("mapping", "camera_set_registration", "no camera set PnP"),
-        Switch("mapping", "semantic_triangulation", "no road surface"),
-        Switch("pairs", "selection", "all pairs"),
-        Switch("adjustment", "priors", "no priors"),
-    )
-    if switch.exists
+SWITCHES = (
+    Switch("adjustment", "camera_set_adjustment", "no CSBA"),
+    Switch("mapping", "camera_set_registration", "no camera set PnP"),
+    Switch("mapping", "semantic_triangulation", "no road surface"),
+    Switch("pairs", "selection", "all pairs"),
+    Switch("adjustment", "priors", "no priors"),
 )
 
 

@@ -32,6 +32,7 @@ def test_every_part_is_on_by_default_and_each_switch_turns_off_one() -> None:
         assert before == after
 
 
+@pytest.mark.slow
 def test_the_table_as_json(small: Variant, mrasfm: Run, tmp_path: Path) -> None:
     only = [word for name in (CSBA, SELECTION, PRIORS) for word in ("--only", name)]
     truth = small.root / "truth.tum"
@@ -56,6 +57,7 @@ def test_the_table_as_json(small: Variant, mrasfm: Run, tmp_path: Path) -> None:
     assert {path.parent.name for path in (tmp_path / "out").glob("*/features.npz")} == {FULL}
 
 
+@pytest.mark.slow
 def test_the_table_for_people(small: Variant, mrasfm: Run) -> None:
     small.keep(units=4).save()
     truth = small.root / "truth.tum"
