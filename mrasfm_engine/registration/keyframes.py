@@ -16,14 +16,16 @@ from mrasfm_engine.registration.model import Model
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-MIN_COMMON = 40  # keypoints in common with the last keyframe; with fewer, nothing is known and a unit is a keyframe
+MIN_COMMON = 40  # keypoints of a camera in common with the last keyframe; with fewer, nothing is known
 
 
 def select_keyframes(model: Model) -> Bools:
-    """Which units (u,) moved against the last keyframe before them, in the median over all cameras.
+    """Which units (u,) moved against the last keyframe before them, in the camera that moved most.
 
-    A median, because others drive past a standing car. Where images are not simultaneous, the first and the last unit
-    of a stop stay keyframes: they tell that the car stood. A drive without motion has keyframes only.
+    A camera's motion is its median, because others drive past a standing car. One camera is enough, because a lorry
+    that drives along stands still in all that it covers: a unit too many costs time, one too few its place in the scene.
+    Where images are not simultaneous, the first and the last unit of a stop stay keyframes: they tell that the car
+    stood. A drive without motion has keyframes only.
     """
     units = len(model.registered)
     keyframe = np.ones(units, dtype=np.bool_)
@@ -41,14 +43,18 @@ def select_keyframes(model: Model) -> Bools:
 
 
 def _displacement_px(model: Model, before: int, now: int) -> float:
-    """Median way (px) of the tracks that the same cameras see in both units; NaN with too few of them."""
+    """Way (px) of a camera's tracks that both units see: its median, in the camera where that is largest.
+
+    NaN where no camera has enough of them.
+    """
     rows = [model.rows_of_unit[unit] for unit in (before, now)]
-    keys = [model.tracks.of_keypoint[r] * len(model.camera_kind) + model.keypoints.camera[r] for r in rows]
+    cameras = len(model.camera_kind)
+    keys = [model.tracks.of_keypoint[r] * cameras + model.keypoints.camera[r] for r in rows]
     _, a, b = np.intersect1d(keys[0], keys[1], return_indices=True)
-    if len(a) < MIN_COMMON:
-        return float("nan")
-    moved = model.keypoints.xy_px[rows[1][b]] - model.keypoints.xy_px[rows[0][a]]
-    return float(np.median(np.linalg.norm(moved, axis=1)))
+    way_px = np.linalg.norm(model.keypoints.xy_px[rows[1][b]] - model.keypoints.xy_px[rows[0][a]], axis=1)
+    camera = model.keypoints.camera[rows[0][a]]
+    enough = np.flatnonzero(np.bincount(camera, minlength=cameras) >= MIN_COMMON)
+    return max((float(np.median(way_px[camera == c])) for c in enough), default=float("nan"))
 
 
 def register_between_keyframes(model: Model, *, max_error_px: float) -> list[Registration]:

@@ -56,7 +56,7 @@ def test_the_road_is_found(surround_scene: Path) -> None:
     normals = np.array([patch["normal"] for patch in document["patches"]])
     assert (normals @ document["up"] > np.cos(np.radians(6))).all()
     assert sum(patch["points"] for patch in document["patches"]) <= road["kept"]
-    assert {path.name for path in (surround_scene / "pictures").iterdir()} == {"road_before.png", "road_after.png"}
+    assert {"road_before.png", "road_after.png"} < {path.name for path in (surround_scene / "pictures").iterdir()}
 
 
 def test_features_are_a_colmap_database(surround_scene: Path, tmp_path: Path) -> None:
