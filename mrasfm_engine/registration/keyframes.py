@@ -23,9 +23,9 @@ def select_keyframes(model: Model) -> Bools:
     """Which units (u,) moved against the last keyframe before them, in the camera that moved most.
 
     A camera's motion is its median, because others drive past a standing car. One camera is enough, because a lorry
-    that drives along stands still in all that it covers: a unit too many costs time, one too few its place in the scene.
-    Where images are not simultaneous, the first and the last unit of a stop stay keyframes: they tell that the car
-    stood. A drive without motion has keyframes only.
+    that drives along stands still in all that it covers: a unit too many costs time, one too few loses points. Where
+    images are not simultaneous, the first and the last unit of a stop stay keyframes: they tell that the car stood. A
+    drive without motion has keyframes only.
     """
     units = len(model.registered)
     keyframe = np.ones(units, dtype=np.bool_)
