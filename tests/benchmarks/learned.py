@@ -1,4 +1,4 @@
-"""Line 7: learned keypoints and matches on a real drive, and where light changes from one instant to the next."""
+"""Line 12: learned keypoints and matches on a real drive, and where light changes from one instant to the next."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEARNED = {"features": {"extractor": "xfeat"}, "matching": {"matcher": "lighterg
 
 
 def learned(data: Path, work: Path) -> Iterator[Figure]:
-    """Line 7."""
+    """Line 12."""
     models = work / "models"
     for name in WEIGHTS:
         ModelFolder(models).add(data.parent / "weights" / "xfeat" / name)
@@ -38,7 +38,7 @@ def learned(data: Path, work: Path) -> Iterator[Figure]:
 
 
 def accuracy(data: Path, work: Path, models: Path) -> Iterator[Figure]:
-    """Line 7a: a reconstruction from XFeat's keypoints and LighterGlue's matches."""
+    """Line 12a: a reconstruction from XFeat's keypoints and LighterGlue's matches."""
     drive = imported(data, "kitti06", work)
     config = work / "learned.toml"
     config.write_text(_toml(LEARNED | {"models": {"folder": str(models)}}), encoding="utf-8")
@@ -47,18 +47,18 @@ def accuracy(data: Path, work: Path, models: Path) -> Iterator[Figure]:
         scene = reconstructed(drive, work / f"learned scene {title}", "--config", str(config), *options)
         errors = evaluate(scene, drive)
         what = f"kitti06, XFeat and LighterGlue, {title}"
-        yield exactly("7a", f"{what}: images registered", errors["registered_images"], IMAGES)
+        yield exactly("12a", f"{what}: images registered", errors["registered_images"], IMAGES)
         rmse_m = errors["metric"]["rmse_m"]
-        yield Figure(line="7a", what=f"{what}: metric RMSE", value=rmse_m, unit="m", most=most_m)
+        yield Figure(line="12a", what=f"{what}: metric RMSE", value=rmse_m, unit="m", most=most_m)
         similarity_m = errors["similarity"]["rmse_m"]
-        yield Figure(line="7a", what=f"{what}: RMSE after similarity", value=similarity_m, unit="m", most=0.05)
+        yield Figure(line="12a", what=f"{what}: RMSE after similarity", value=similarity_m, unit="m", most=0.05)
         stages = read_report(scene)["by_stage"]
         for stage in ("features", "matches"):
-            yield Figure(line="7a", what=f"{what}: time of {stage}", value=stages[stage]["seconds"], unit="s")
+            yield Figure(line="12a", what=f"{what}: time of {stage}", value=stages[stage]["seconds"], unit="s")
 
 
 def changing_light(data: Path, work: Path, models: Path) -> Iterator[Figure]:
-    """Line 7b: every second unit is dark and noisy. What matches, whichever is better, is reported as measured."""
+    """Line 12b: every second unit is dark and noisy. What matches, whichever is better, is reported as measured."""
     folder = work / "kitti06 in changing light"
     mrasfm("import", data / "kitti06", "--out", folder, "--frames", DARK_FRAMES, "--copy")
     drive = read_drive(folder)
@@ -80,7 +80,7 @@ def changing_light(data: Path, work: Path, models: Path) -> Iterator[Figure]:
             mean = float(np.mean([inliers.get(pair, 0) for pair in of_kind]))
             what = f"changing light, {kind}, {name}: verified matches a pair"
             # What is measured decides who wins; that there is something to match is what must hold.
-            yield Figure(line="7b", what=what, value=mean, above=75.0, most=1000.0)
+            yield Figure(line="12b", what=what, value=mean, above=75.0, most=1000.0)
 
 
 def darkened(gray: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Line 6: lorries that drive along and cover two of six cameras for half of the drive, without semantic masks."""
+"""Line 7: lorries that drive along and cover two of six cameras for half of the drive, without semantic masks."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MIN_LOST_SHARE = 0.25  # without camera set registration
 
 
 def occlusion(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
-    """Line 6."""
+    """Line 7."""
     for seed in seeds:
         cameras = PAIRS[seed % len(PAIRS)]
         rendered = work / f"occluded {seed}"
@@ -62,7 +62,7 @@ def _coverage(drive: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure
     ]
     for name, value in (("least", min(shares)), ("most", max(shares))):
         yield Figure(
-            line="6",
+            line="7",
             what=f"seed {seed}, {' and '.join(cameras)}: {name} of an image that the lorry covers",
             value=value,
             above=COVERAGE[0],
@@ -84,13 +84,13 @@ def _without_masks(drive: Path, out: Path) -> Path:
 
 
 def with_the_set(drive: Path, scene: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure]:
-    """Line 6a: covered images have the pose that the other cameras give, and are named."""
+    """Line 7a: covered images have the pose that the other cameras give, and are named."""
     mrasfm("reconstruct", drive, "--out", scene)
     title = f"seed {seed}"
     files = [f"images/{camera}/{unit:06d}.jpg" for camera in cameras for unit in COVERED]
     keypoints = min(_keypoints(scene, files))
     yield Figure(
-        line="6a",
+        line="7a",
         what=f"{title}: fewest keypoints of a covered image",
         value=keypoints,
         above=MIN_KEYPOINTS - 1,
@@ -98,18 +98,18 @@ def with_the_set(drive: Path, scene: Path, cameras: Sequence[str], seed: int) ->
     )
     position_m, rotation_deg = image_errors(scene, drive, files)
     worst = float(position_m.max())
-    yield Figure(line="6a", what=f"{title}: worst covered image, position", value=worst, unit="m", most=MAX_POSITION_M)
+    yield Figure(line="7a", what=f"{title}: worst covered image, position", value=worst, unit="m", most=MAX_POSITION_M)
     worst = float(rotation_deg.max())
     yield Figure(
-        line="6a", what=f"{title}: worst covered image, rotation", value=worst, unit="deg", most=MAX_ROTATION_DEG
+        line="7a", what=f"{title}: worst covered image, rotation", value=worst, unit="deg", most=MAX_ROTATION_DEG
     )
     named = [image["file"] for image in read_report(scene)["by_stage"]["mapping"]["images_occluded"]]
-    yield exactly("6a", f"{title}: covered images that are named", len(set(named) & set(files)), len(files))
-    yield exactly("6a", f"{title}: others that are named + 1", len(set(named) - set(files)) + 1, 1)
+    yield exactly("7a", f"{title}: covered images that are named", len(set(named) & set(files)), len(files))
+    yield exactly("7a", f"{title}: others that are named + 1", len(set(named) - set(files)) + 1, 1)
 
 
 def image_by_image(drive: Path, scene: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure]:
-    """Line 6b: without camera set registration covered images are lost."""
+    """Line 7b: without camera set registration covered images are lost."""
     config = scene.with_suffix(".toml")
     config.write_text("[mapping]\ncamera_set_registration = false\n", encoding="utf-8")
     mrasfm("reconstruct", drive, "--out", scene, "--config", config)
@@ -122,9 +122,9 @@ def image_by_image(drive: Path, scene: Path, cameras: Sequence[str], seed: int) 
     ):
         what = f"seed {seed}, images registered one by one: share of covered images {name}"
         if least is None:
-            yield Figure(line="6b", what=what, value=share)
+            yield Figure(line="7b", what=what, value=share)
         else:
-            yield Figure(line="6b", what=what, value=share, above=least - 1e-9, most=1.0)
+            yield Figure(line="7b", what=what, value=share, above=least - 1e-9, most=1.0)
 
 
 def image_errors(scene: Path, drive: Path, files: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

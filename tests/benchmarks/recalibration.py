@@ -1,4 +1,4 @@
-"""Line 7: a camera with a wrong extrinsic, and what a straight street lets a drive observe of its calibration."""
+"""Line 8: a camera with a wrong extrinsic, and what a straight street lets a drive observe of its calibration."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ HIDDEN, SEEN = 0.9, 0.5  # of the prior's sigma: more is left in what images do 
 
 
 def recalibration(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
-    """Line 7."""
+    """Line 8."""
     for seed in seeds:
         drive, scene = work / f"wrong {seed}", work / f"wrong {seed} scene"
         name = WRONG[seed % len(WRONG)]
@@ -62,37 +62,37 @@ def recalibration(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
 
 
 def wrong_camera(drive: Path, scene: Path, name: str, seed: int) -> Iterator[Figure]:
-    """Line 7a: the camera is named and recalibrated, the others stay."""
+    """Line 8a: the camera is named and recalibrated, the others stay."""
     printed = mrasfm("reconstruct", drive, "--out", scene)
     title = f"seed {seed}, {name} off by {WRONG_BY_DEG:g} deg"
     report = read_report(scene)
     named = [camera["camera"] for camera in report["by_stage"]["refinement"]["calibration"]["cameras_wrong"]]
-    yield exactly("7a", f"{title}: named", int(name in named), 1)
-    yield exactly("7a", f"{title}: other cameras named + 1", len(set(named) - {name}) + 1, 1)
-    yield exactly("7a", f"{title}: named on the command line", int(f"camera {name} is turned" in printed), 1)
+    yield exactly("8a", f"{title}: named", int(name in named), 1)
+    yield exactly("8a", f"{title}: other cameras named + 1", len(set(named) - {name}) + 1, 1)
+    yield exactly("8a", f"{title}: named on the command line", int(f"camera {name} is turned" in printed), 1)
     refined, true = read_calibration(scene / "calibration.json"), read_calibration(drive / "truth_calibration.json")
     errors = {n: se3.log_so3(refined[n][:3, :3] @ true[n][:3, :3].T) for n in true}
     others = {n: refined[n] for n in true if n != name}
     median = np.median([errors[n] for n in others], axis=0)
     own = float(np.degrees(np.linalg.norm(errors[name] - median)))
     yield Figure(
-        line="7a", what=f"{title}: error left, to the median of the others", value=own, unit="deg", most=MAX_WRONG_DEG
+        line="8a", what=f"{title}: error left, to the median of the others", value=own, unit="deg", most=MAX_WRONG_DEG
     )
     worst = max(pair.rotation_deg for pair in compare_calibrations(others, true))
     yield Figure(
-        line="7a", what=f"{title}: worst relative rotation of two others", value=worst, unit="deg", most=MAX_OTHERS_DEG
+        line="8a", what=f"{title}: worst relative rotation of two others", value=worst, unit="deg", most=MAX_OTHERS_DEG
     )
 
 
 def straight(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:
-    """Line 7b: 100 m straight on, a calibration as good as declared, a noisy receiver."""
+    """Line 8b: 100 m straight on, a calibration as good as declared, a noisy receiver."""
     mrasfm("reconstruct", drive, "--out", scene)
     title = f"straight {seed}"
     yield exactly(
-        "7b", f"{title}: images registered", evaluate(scene, drive)["registered_images"], CAMERAS * STRAIGHT_UNITS
+        "8b", f"{title}: images registered", evaluate(scene, drive)["registered_images"], CAMERAS * STRAIGHT_UNITS
     )
     rmse_m = evaluate(scene, drive)["metric"]["rmse_m"]
-    yield Figure(line="7b", what=f"{title}: metric RMSE", value=rmse_m, unit="m", most=MAX_METRIC_RMSE_M)
+    yield Figure(line="8b", what=f"{title}: metric RMSE", value=rmse_m, unit="m", most=MAX_METRIC_RMSE_M)
     yield from verdicts(drive, scene, title)
 
 
@@ -115,18 +115,18 @@ def verdicts(drive: Path, scene: Path, title: str) -> Iterator[Figure]:
     hidden = np.sort(expected.hidden)[::-1]
     # Six motions of all cameras are hidden altogether; the seventh, their scale, but for what positions say.
     yield Figure(
-        line="7b",
+        line="8b",
         what=f"{title}: prior sigma left in the 6th least visible motion",
         value=hidden[5],
         above=HIDDEN,
         most=1.0,
     )
     yield Figure(
-        line="7b", what=f"{title}: prior sigma left in the scale", value=expected.scale_ratio, above=SEEN, most=1.0
+        line="8b", what=f"{title}: prior sigma left in the scale", value=expected.scale_ratio, above=SEEN, most=1.0
     )
-    yield Figure(line="7b", what=f"{title}: prior sigma left in the next one", value=hidden[COMMON_MOTIONS], most=SEEN)
+    yield Figure(line="8b", what=f"{title}: prior sigma left in the next one", value=hidden[COMMON_MOTIONS], most=SEEN)
     yield Figure(
-        line="7b",
+        line="8b",
         what=f"{title}: prior sigma left in a camera's direction, at most",
         value=float(np.nanmax(expected.ratio)),
     )
@@ -142,10 +142,10 @@ def verdicts(drive: Path, scene: Path, title: str) -> Iterator[Figure]:
     ]
     right = [*expected.observed.ravel(), *[False] * 6, expected.scale_ratio < SEEN]
     yield exactly(
-        "7b", f"{title}: verdicts as the geometry has them", int(np.sum(np.equal(reported, right))), len(right)
+        "8b", f"{title}: verdicts as the geometry has them", int(np.sum(np.equal(reported, right))), len(right)
     )
     yield Figure(
-        line="7b",
+        line="8b",
         what=f"{title}: verdicts of directions that are not observed",
         value=len(right) - sum(map(bool, reported)),
     )
@@ -157,7 +157,7 @@ def verdicts(drive: Path, scene: Path, title: str) -> Iterator[Figure]:
         left_alone.append(abs(float(size @ corrections[:, 3:].ravel())) / float(np.linalg.norm(size)))
     left_alone += list(np.abs(corrections[~observed]))
     yield Figure(
-        line="7b",
+        line="8b",
         what=f"{title}: largest correction where nothing is observed, of the prior's sigma",
         value=float(max(left_alone)),
         above=-1.0,  # exactly as given is what to hope for
