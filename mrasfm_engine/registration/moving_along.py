@@ -81,9 +81,16 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
     return MovingAlong(keypoint=no_world, share=share, covered=covered)
 
 
-def units_to_doubt(model: Model, covered: Bools) -> Ints:
-    """Units with covered images (images,): these may have outvoted the others, so their pose has to be found anew."""
-    doubt = model.registered & (np.bincount(model.image_unit[covered], minlength=len(model.registered)) > 0)
+def units_to_doubt(model: Model, moving: MovingAlong, known: Bools) -> Ints:
+    """Units whose pose has to be found anew, as covered images may have outvoted the others.
+
+    Not those from whose covered images most of what moves along had been taken out before: `known` (keypoints,).
+    """
+    image, units = model.keypoints.image, len(model.registered)
+    missed = np.bincount(image[moving.keypoint & ~known], minlength=len(moving.covered))
+    found = np.bincount(image[moving.keypoint & known], minlength=len(moving.covered))
+    misled = moving.covered & (missed > found)
+    doubt = model.registered & (np.bincount(model.image_unit[misled], minlength=units) > 0)
     # A scene of two units is the least to register others against.
     return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
 
