@@ -32,7 +32,8 @@ MIN_FLOW_PX = 6.0  # what the world must move by before standing still means som
 STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
 STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the world
 MIN_KEYPOINTS = 30  # that move along, before an image is called covered
-COVERED_SHARE = 0.5  # of the keypoints
+TELLING_SHARE = 0.5  # of the keypoints that tell, in a covered image
+COVERED_SHARE = 0.75  # of all matched ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +77,7 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
         np.bincount(keypoints.image[which], minlength=images) for which in (with_it, along < 0, seen, still)
     )
     share = (count + quiet) / np.maximum(total, 1)
-    covered = (count >= MIN_KEYPOINTS) & (count >= COVERED_SHARE * (count + counter)) & (share >= COVERED_SHARE)
+    covered = (count >= MIN_KEYPOINTS) & (count >= TELLING_SHARE * (count + counter)) & (share >= COVERED_SHARE)
     no_world = (with_it | (covered[keypoints.image] & still)) if covered.any() else np.zeros_like(with_it)
     return MovingAlong(keypoint=no_world, share=share, covered=covered)
 
