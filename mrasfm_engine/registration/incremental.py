@@ -25,6 +25,7 @@ from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.moving_along import find_moving_along, units_to_doubt, without_keypoints
 from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.single_images import register_images_singly, retry_missing, take_over
+from mrasfm_engine.registration.still_images import find_still_keypoints
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
@@ -130,17 +131,21 @@ def map_units(
     """
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
-    model = Model(drive, keypoints, build_tracks(keypoints, near), config)
+    image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
+    still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, near)
+    sound = without_keypoints(near, keypoints.first, still) if still.any() else near
+    model = Model(drive, keypoints, build_tracks(keypoints, sound), config)
     model.keyframe = select_keyframes(model)
     if prior_world_from_rig is not None:
         model.motion.follow_prior(prior_world_from_rig)
-    log = grow(model, near, prior_world_from_rig, progress=progress, cancel=cancel)
-    # Only the poses of all cameras together tell what moves along, so the scene grows before it is cleaned.
+    log = grow(model, sound, prior_world_from_rig, progress=progress, cancel=cancel)
+    # Only the poses of all cameras together tell surely what moves along, so the scene grows before it is cleaned.
     moving = find_moving_along(model, near)
     if moving.any:
         log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}
         near, far = (without_keypoints(p, keypoints.first, moving.keypoint) for p in (near, far))
-        model = _registered_anew(model, near, units_to_doubt(model, moving.covered), log, progress, cancel)
+        doubt = units_to_doubt(model, moving, still)
+        model = _registered_anew(model, near, doubt, log, progress, cancel)
     revisits, log.revisits_tried = find_revisits(model, far)
     if not revisits:
         return model, log

@@ -32,7 +32,8 @@ MIN_FLOW_PX = 6.0  # what the world must move by before standing still means som
 STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
 STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the world
 MIN_KEYPOINTS = 30  # that move along, before an image is called covered
-COVERED_SHARE = 0.5  # of the keypoints
+TELLING_SHARE = 0.5  # of the keypoints that tell, in a covered image
+COVERED_SHARE = 0.75  # of all matched ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +77,21 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
         np.bincount(keypoints.image[which], minlength=images) for which in (with_it, along < 0, seen, still)
     )
     share = (count + quiet) / np.maximum(total, 1)
-    covered = (count >= MIN_KEYPOINTS) & (count >= COVERED_SHARE * (count + counter)) & (share >= COVERED_SHARE)
+    covered = (count >= MIN_KEYPOINTS) & (count >= TELLING_SHARE * (count + counter)) & (share >= COVERED_SHARE)
     no_world = (with_it | (covered[keypoints.image] & still)) if covered.any() else np.zeros_like(with_it)
     return MovingAlong(keypoint=no_world, share=share, covered=covered)
 
 
-def units_to_doubt(model: Model, covered: Bools) -> Ints:
-    """Units with covered images (images,): these may have outvoted the others, so their pose has to be found anew."""
-    doubt = model.registered & (np.bincount(model.image_unit[covered], minlength=len(model.registered)) > 0)
+def units_to_doubt(model: Model, moving: MovingAlong, known: Bools) -> Ints:
+    """Units whose pose has to be found anew, as covered images may have outvoted the others.
+
+    Not those from whose covered images most of what moves along had been taken out before: `known` (keypoints,).
+    """
+    image, units = model.keypoints.image, len(model.registered)
+    missed = np.bincount(image[moving.keypoint & ~known], minlength=len(moving.covered))
+    found = np.bincount(image[moving.keypoint & known], minlength=len(moving.covered))
+    misled = moving.covered & (missed > found)
+    doubt = model.registered & (np.bincount(model.image_unit[misled], minlength=units) > 0)
     # A scene of two units is the least to register others against.
     return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
 
