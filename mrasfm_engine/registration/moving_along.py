@@ -97,11 +97,16 @@ def units_to_doubt(model: Model, moving: MovingAlong, known: Bools) -> Ints:
 
 
 def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools) -> list[PairMatches]:
-    """The pairs without the matches of some keypoints; `first` (images + 1,) as in `Keypoints`."""
+    """The pairs without the matches of some keypoints, and without pairs of which nothing is left.
+
+    `first` (images + 1,) is as in `Keypoints`.
+    """
     result = []
     for pair in pairs:
         gone = removed[first[pair.image_a] + pair.matches[:, 0]] | removed[first[pair.image_b] + pair.matches[:, 1]]
-        result.append(replace(pair, inliers=pair.inliers & ~gone) if gone.any() else pair)
+        left = pair.inliers & ~gone
+        if left.any():
+            result.append(replace(pair, inliers=left) if gone.any() else pair)
     return result
 
 
