@@ -57,11 +57,11 @@ def service(data: Path, work: Path) -> Iterator[Figure]:
         most=1e6,
     )
     slow = subprocess.run(
-        [sys.executable, "-m", "pytest", "-m", "slow", "tests/worker", "tests/integration", "tests/service"],
+        [sys.executable, "-m", "pytest", "-m", "slow", "tests"],
         cwd=REPOSITORY,
         check=False,
     )
-    yield exactly("5", "long tests of crashes and leases: exit code + 1", slow.returncode + 1, 1)
+    yield exactly("5", "long tests, of crashes and leases among them: exit code + 1", slow.returncode + 1, 1)
 
 
 def _same_scene(data: Path, work: Path) -> Iterator[Figure]:

@@ -41,6 +41,7 @@ def test_kitti02_with_gnss(kitti02: Path, mrasfm: Run) -> None:
     assert (scene / "poses.tum").read_bytes() == poses
 
 
+@pytest.mark.slow
 def test_latitude_and_longitude_exchanged(kitti02: Path, variant_of: Callable[[Path], Variant], mrasfm: Run) -> None:
     variant = variant_of(kitti02)
     for sample in variant.document["gnss"]["samples"]:

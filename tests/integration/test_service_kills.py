@@ -182,6 +182,7 @@ def test_kills(service: Standalone, drive: Path) -> None:
     assert service.processes() == []
 
 
+@pytest.mark.slow
 def test_supervisor_is_killed(service: Standalone, drive: Path) -> None:
     """Nothing that it started stays behind."""
     service.start()

@@ -61,6 +61,7 @@ def test_scene_and_progress(world: World, brief_drive: Path, caplog: pytest.LogC
     assert len(world.scenes()) == 1
 
 
+@pytest.mark.slow
 def test_stages_are_found_again_on_another_machine(world: World, brief_drive: Path, tmp_path: Path) -> None:
     """The drive lies elsewhere there; database and artifacts are the same. Other settings are other stages."""
     drive_id = world.add_drive(brief_drive)

@@ -148,6 +148,7 @@ def test_images_obey_the_true_epipolar_geometry(drive: Path) -> None:
     assert np.median(np.abs(off.sum(1)) / np.hypot(line[:, 0], line[:, 1])) > 1.3 * np.median(distance)
 
 
+@pytest.mark.slow
 def test_same_seed_same_files_other_seed_others(tmp_path: Path) -> None:
     options = small_options(**TINY, cameras=1)
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -314,6 +315,7 @@ def test_loop_comes_back_and_crossing_drives_meet() -> None:
     assert nearest[6] > 200
 
 
+@pytest.mark.slow
 def test_several_drives_share_one_world(tmp_path: Path) -> None:
     folders = render_drives(small_options(**TINY, cameras=1, drives=2, world=World.REPEATED), tmp_path / "out")
     assert [folder.name for folder in folders] == ["drive_0", "drive_1"]
