@@ -22,13 +22,14 @@ from tests.benchmarks.table import Figure, exactly
 
 CAMERAS, UNITS = 6, 40
 COVERED = range(UNITS // 4, 3 * UNITS // 4)  # units of the lorries: see `synth --occlude`
+# By seed; on different sides, as two lorries on one side cover more of each image than one does.
 PAIRS = (
-    ("front_left", "back_left"),
+    ("front_left", "front_right"),
     ("back_left", "front_right"),
     ("front_left", "back_right"),
     ("front_left", "front_right"),
     ("back_left", "back_right"),
-)  # by seed
+)
 TRUCK = 14  # of the masks
 COVERAGE = (0.85, 0.95)
 MIN_KEYPOINTS = 200  # on what covers an image
