@@ -58,8 +58,6 @@ def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.
 
 def _share_that_moves(model: Model, pair: PairMatches) -> float:
     """How far the matches show motion, 0 to 1: units at which the car stands match best, but give no points."""
-    if not pair.inliers.any():
-        return 0.0  # all of them were found to show something that moves along
     a = model.keypoints.rays[model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]]
     b = model.keypoints.rays[model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]]
     return min(1.0, parallax_rad(a, b) / float(FULL_PARALLAX_RAD))
