@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 FILE_BYTES = 4_000_000
-TAIL_BYTES = 8_000
+TAIL_BYTES = 16_000  # of an abort: the Python stacks of all threads, and below them those of C++
 
 # Databases refuse NUL in text, and a terminal should not be steered by a log.
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")

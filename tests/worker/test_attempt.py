@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -197,7 +198,8 @@ def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> 
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable) == ("engine-abort", True)
     assert "SIGABRT" in outcome.what
-    assert "Fatal Python error: Aborted" in outcome.log_tail  # faulthandler says where it was
+    # faulthandler says where it was; how many threads it lists after that, and C++ frames below, varies
+    assert re.search(r'File ".*mrasfm_engine.*", line \d+ in ', outcome.log_tail)
 
 
 def test_cancel(small_drive: Path, scratch: Path, settings: Settings) -> None:
