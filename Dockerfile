@@ -18,7 +18,7 @@ RUN /opt/mrasfm/bin/pip install --no-deps --no-index --no-build-isolation . \
 FROM python:3.12-slim-bookworm
 RUN groupadd --gid 10001 mrasfm \
     && useradd --uid 10001 --gid mrasfm --no-create-home --home-dir /data --shell /usr/sbin/nologin mrasfm \
-    && install --directory --owner mrasfm --group mrasfm --mode 700 /data
+    && install --directory --owner mrasfm --group mrasfm --mode 700 /data /models
 COPY --from=build /opt/mrasfm /opt/mrasfm
 # `python -m` shall not look for packages in the current folder. Code compiled by numba is kept beside the data: the
 # rest of the file system may be read-only.

@@ -18,6 +18,11 @@ _PLACES: dict[str, tuple[str | None, str]] = {
     "max_side_px": ("features", "max_side_px"),
     "refine_calibration": ("adjustment", "refine_calibration"),
     "refine_focal": ("adjustment", "refine_focal"),
+    "extractor": ("features", "extractor"),
+    "matcher": ("matching", "matcher"),
+    "segmentation_model": ("semantics", "model"),
+    "semantic_triangulation": ("mapping", "semantic_triangulation"),
+    "motion_compensation": ("mapping", "motion_compensation"),
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, StringConstraints
 
@@ -25,6 +25,17 @@ class ReconstructionSettings(RequestBody):
     refine_calibration: bool | None = Field(None, description="rig_from_cam, where the drive makes it observable")
     refine_focal: bool | None = Field(None, description="focal lengths, where rig_from_cam varies too")
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
+    extractor: Literal["sift", "superpoint", "aliked", "xfeat"] | None = Field(
+        None, description="of keypoints; all but sift need a model on the workers"
+    )
+    matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] | None = Field(
+        None, description="all but nearest need a model on the workers, trained on the extractor's descriptors"
+    )
+    segmentation_model: Annotated[str, Field(pattern="^[a-z0-9][a-z0-9._-]{0,63}$")] | None = Field(
+        None, description="name of a model on the workers that makes masks for images that come without"
+    )
+    semantic_triangulation: bool | None = Field(None, description="drop points of the road that are off its surface")
+    motion_compensation: bool | None = Field(None, description="pose every image at its own time")
 
 
 class ReconstructionRequest(RequestBody):

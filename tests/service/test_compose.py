@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE
 from service.settings import Settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -13,9 +14,10 @@ EXAMPLE = (REPOSITORY / ".env.example").read_text(encoding="utf-8")
 
 
 def test_every_setting_that_it_passes_exists() -> None:
-    passed = set(re.findall(r"^ +MRASFM_(\w+):", COMPOSE, re.MULTILINE))
-    assert passed >= {"DATABASE_URL", "REDIS_URL", "ARTIFACTS_URL"}
-    assert {name.lower() for name in passed} <= set(Settings.model_fields)
+    passed = set(re.findall(r"^ +(MRASFM_\w+):", COMPOSE, re.MULTILINE))
+    assert passed >= {"MRASFM_DATABASE_URL", "MRASFM_REDIS_URL", "MRASFM_ARTIFACTS_URL"}
+    of_the_service = {f"MRASFM_{name.upper()}" for name in Settings.model_fields}
+    assert passed <= of_the_service | {FOLDER_VARIABLE}  # of the engine: where trained models lie
 
 
 def test_secrets_are_required_and_have_no_value_anywhere() -> None:

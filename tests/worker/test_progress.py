@@ -168,10 +168,16 @@ def test_every_setting_of_a_request_reaches_the_engine() -> None:
     assert plain.threads == 3
     assert plain == engine_config({}, threads=3)
     asked = ReconstructionSettings(
-        use_gnss=False, max_keypoints=500, max_side_px=800, refine_calibration=False, refine_focal=True, seed=7
-    )
+        use_gnss=False, max_keypoints=500, max_side_px=800, refine_calibration=False, refine_focal=True, seed=7,
+        extractor="xfeat", matcher="lighterglue", segmentation_model="streets",
+        semantic_triangulation=False, motion_compensation=False,
+    )  # fmt: skip
+    assert None not in asked.model_dump().values()
     config = engine_config(asked.model_dump(), threads=3)
     assert (config.use_gnss, config.seed) == (False, 7)
     assert (config.features.max_keypoints, config.features.max_side_px) == (500, 800)
     assert (config.adjustment.refine_calibration, config.adjustment.refine_focal) == (False, True)
+    assert (config.features.extractor, config.matching.matcher) == ("xfeat", "lighterglue")
+    assert config.semantics.model == "streets"
+    assert (config.mapping.semantic_triangulation, config.mapping.motion_compensation) == (False, False)
     assert (plain.use_gnss, plain.features.max_keypoints, plain.adjustment.refine_focal) == (True, 2048, False)
