@@ -302,6 +302,12 @@ class BlockFactor:
         _solve(self.elimination.factor.first, self.elimination.factor.row, self.blocks, x)
         return x[position].reshape(right.shape)
 
+    def pivots(self) -> Floats:
+        """What was left of each diagonal entry when its turn came (columns, 6)."""
+        on = self.elimination.factor.first[:-1][self.elimination.position]
+        result: Floats = np.diagonal(self.blocks[on], axis1=1, axis2=2) ** 2
+        return result
+
     def inverse_diagonal(self) -> Floats:
         """The inverse's diagonal blocks (columns, 6, 6)."""
         z = np.empty_like(self.blocks)

@@ -9,12 +9,14 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF
+from mrasfm_engine.adjustment.reduced import Reduced
 from mrasfm_engine.adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+LARGEST_DENSE = 4000  # unknowns
 SINGULAR = 1e-11  # pivots and eigenvalues of the scaled matrix below this are rounding
 
 
@@ -32,36 +34,84 @@ def covariances(problem: Problem, state: State) -> Covariances:
     """Marginals at a solution, from the inverse of the reduced normal equations (Gauss-Newton, robust weights).
 
     Scale is the functional sum (p_i - mean)' dp_i / sum |p_i - mean|^2 of the free units' positions: it does not change
-    when the scene is moved or turned. What nothing determines has an infinite sigma.
+    when the scene is moved or turned. What nothing determines has an infinite sigma; which unknowns share in that is
+    told up to `LARGEST_DENSE` unknowns, beyond that all have one.
     """
     layout = problem.layout
     reduced = problem.normal_equations(state, 0.0)
-    free = np.setdiff1d(np.arange(layout.size), layout.held())
-    free = free[np.diagonal(reduced.matrix)[free] > 0.0]
-    inverse, loose = _inverse(reduced.matrix[np.ix_(free, free)])
-    variance = np.full(layout.size, np.inf)
-    variance[layout.held()] = 0.0
-    variance[free] = np.where(loose, np.inf, np.maximum(np.diagonal(inverse), 0.0))
-    covariance = np.zeros((layout.size, layout.size))
-    covariance[np.ix_(free, free)] = inverse
-    units, cameras = np.flatnonzero(layout.unit_slot >= 0), np.flatnonzero(layout.camera_slot >= 0)
-    split = UNIT_DOF * layout.num_units
+    position = state.unit_position_m[layout.unit_slot >= 0]
+    found = _regular_marginals(reduced, position)
+    if found is None:
+        found = _dense_marginals(reduced, position)
     per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
-    per_unit[units] = np.sqrt(variance[:split]).reshape(-1, UNIT_DOF)
+    per_unit[layout.unit_slot >= 0] = np.sqrt(found.units)
     per_camera = np.full((len(layout.camera_slot), CAMERA_DOF), np.nan)
-    per_camera[cameras] = np.sqrt(variance[split:]).reshape(-1, CAMERA_DOF)
-    positions = np.isinf(variance[:split]).reshape(-1, UNIT_DOF)[:, 3:]
-    poses = split + (CAMERA_DOF * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
-    loose_poses = np.isinf(variance[poses])
-    covariance[poses[loose_poses], poses[loose_poses]] = np.inf
+    per_camera[layout.camera_slot >= 0] = np.sqrt(np.diagonal(found.cameras)).reshape(-1, CAMERA_DOF)
+    poses = (CAMERA_DOF * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
     return Covariances(
         sigma_unit_position_m=per_unit[:, 3:],
         sigma_camera=per_camera,
-        sigma_scale=np.inf
-        if positions.any()
-        else _sigma_scale(state.unit_position_m[units], covariance[:split, :split]),
-        calibration=covariance[np.ix_(poses, poses)],
+        sigma_scale=found.sigma_scale,
+        calibration=found.cameras[np.ix_(poses, poses)],
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Marginals:
+    units: Floats  # (free units, 6) variances
+    cameras: Floats  # (7 c, 7 c) covariance of the free cameras; zero where held
+    sigma_scale: float
+
+
+def _regular_marginals(reduced: Reduced, position: Floats) -> _Marginals | None:
+    """By eliminating units and cameras; None where something besides single unknowns is not determined."""
+    layout = reduced.layout
+    split = UNIT_DOF * layout.num_units
+    unseen = ~(reduced.matrix_diagonal() > 0.0)
+    solved = reduced.eliminate(unseen.astype(np.float64))
+    if solved is None or solved.smallest_pivot(reduced, unseen) < SINGULAR:
+        return None
+    units, cameras = solved.inverse()
+    variance = np.diagonal(units, axis1=1, axis2=2).copy()
+    variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
+    covariance = np.zeros((CAMERA_DOF * layout.num_cameras,) * 2)
+    covariance[np.ix_(solved.free, solved.free)] = cameras
+    loose = solved.free[unseen[split:][solved.free]]
+    covariance[loose, loose] = np.inf
+    scale = float("nan")
+    if np.isinf(variance[:, 3:]).any():
+        scale = np.inf
+    elif len(position) >= 2:
+        functional = _scale_functional(position)
+        scale = float(np.sqrt(max(solved.inverse_form(functional), 0.0)))
+    return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
+
+
+def _dense_marginals(reduced: Reduced, position: Floats) -> _Marginals:
+    """By the inverse without its null space."""
+    layout = reduced.layout
+    size, split = layout.size, UNIT_DOF * layout.num_units
+    if size > LARGEST_DENSE:
+        cameras = np.diag(np.full(size - split, np.inf))
+        return _Marginals(units=np.full((layout.num_units, UNIT_DOF), np.inf), cameras=cameras, sigma_scale=np.inf)
+    matrix = reduced.matrix
+    free = np.setdiff1d(np.arange(size), layout.held())
+    free = free[np.diagonal(matrix)[free] > 0.0]
+    inverse, loose = _inverse(matrix[np.ix_(free, free)])
+    variance = np.full(size, np.inf)
+    variance[layout.held()] = 0.0
+    variance[free] = np.where(loose, np.inf, np.maximum(np.diagonal(inverse), 0.0))
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(free, free)] = inverse
+    covariance[np.diag_indices(size)] = variance
+    units = variance[:split].reshape(-1, UNIT_DOF)
+    scale = float("nan")
+    if np.isinf(units[:, 3:]).any():
+        scale = np.inf
+    elif len(position) >= 2:
+        functional = _scale_functional(position)
+        scale = float(np.sqrt(max(float(functional @ covariance[:split, :split] @ functional), 0.0)))
+    return _Marginals(units=units, cameras=covariance[split:, split:], sigma_scale=scale)
 
 
 def _inverse(matrix: Floats) -> tuple[Floats, Bools]:
@@ -89,11 +139,9 @@ def _inverse(matrix: Floats) -> tuple[Floats, Bools]:
     return result, loose
 
 
-def _sigma_scale(position: Floats, covariance: Floats) -> float:
-    if len(position) < 2:
-        return float("nan")
+def _scale_functional(position: Floats) -> Floats:
+    """What a step (6 units,) of the units changes of the trajectory's size, relative to it."""
     centred = position - position.mean(0)
     functional = np.zeros((len(position), UNIT_DOF))
     functional[:, 3:] = centred / max(float((centred**2).sum()), 1e-12)
-    row = functional.ravel()
-    return float(np.sqrt(max(float(row @ covariance @ row), 0.0)))
+    return functional.ravel()

@@ -12,7 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.problem import Layout
+from mrasfm_engine.adjustment.problem import CAMERA_DOF, Layout
+from mrasfm_engine.adjustment.reduced import Extra
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
 
@@ -33,8 +34,8 @@ class Term(Protocol):
         """Half the (robust) sum of squared residuals."""
         ...
 
-    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
-        """Add J'J to h (n, n) (both triangles) and J'r to g (n,)."""
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """Add J'J (both triangles) and J'r."""
         ...
 
 
@@ -88,7 +89,7 @@ class CalibrationPrior:
         own = 0.5 * s2 * np.log1p((self._own(r, sigma)[0] ** 2).sum(1) / s2).sum()
         return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
 
-    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         r, sigma = self._whitened(state)
         cameras = np.flatnonzero(layout.camera_slot >= 0)
@@ -96,9 +97,9 @@ class CalibrationPrior:
         w = 1.0 / (1.0 + (own**2).sum(1) / self.loss_scale**2)
         gauge = self._gauge()
         mean = gauge @ r
-        offsets = layout.camera_offsets(cameras)
+        h, g = extra.cameras, extra.camera_gradient
         for axis in range(6):
-            rows = offsets + axis
+            rows = CAMERA_DOF * layout.camera_slot[cameras] + axis
             scaled = 1.0 / own_sigma[cameras, axis]
             h[rows, rows] += w[cameras] * scaled**2
             g[rows] += w[cameras] * scaled * own[cameras, axis]
@@ -139,14 +140,14 @@ class FocalPrior:
         """See `Term`."""
         return float(0.5 * (self._residuals(state) ** 2).sum())
 
-    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         if not layout.free_focal:
             return
         cameras = np.flatnonzero(layout.camera_slot >= 0)
-        rows = layout.camera_offsets(cameras) + 6
-        h[rows, rows] += 1.0 / self.sigma[cameras] ** 2
-        g[rows] += self._residuals(state)[cameras] / self.sigma[cameras]
+        rows = CAMERA_DOF * layout.camera_slot[cameras] + 6
+        extra.cameras[rows, rows] += 1.0 / self.sigma[cameras] ** 2
+        extra.camera_gradient[rows] += self._residuals(state)[cameras] / self.sigma[cameras]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,17 +173,17 @@ class PositionPrior:
         s2 = self.loss_scale**2
         return float(0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum())
 
-    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         arm, r = self._residuals(state)
         w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
         # d (R arm) / d omega = -[R arm]x in world axes
         j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
         j = j / self.sigma_m[:, :, None]
-        for i in np.flatnonzero(layout.unit_slot[self.unit] >= 0):
-            o = int(layout.unit_slot[self.unit[i]]) * 6
-            h[o : o + 6, o : o + 6] += w[i] * j[i].T @ j[i]
-            g[o : o + 6] += w[i] * j[i].T @ r[i]
+        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
+        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
+        np.add.at(extra.units, slots, j_w @ j[free])
+        np.add.at(extra.unit_gradient, slots, (j_w @ r[free, :, None])[:, :, 0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,10 +209,10 @@ class UprightPrior:
         """See `Term`."""
         return float(0.5 * (self._rows(state)[0] ** 2).sum())
 
-    def add_to(self, state: State, layout: Layout, h: Floats, g: Floats) -> None:
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         r, j = self._rows(state)
-        for i in np.flatnonzero(layout.unit_slot[self.unit] >= 0):
-            o = int(layout.unit_slot[self.unit[i]]) * 6
-            h[o : o + 3, o : o + 3] += j[i].T @ j[i]
-            g[o : o + 3] += j[i].T @ r[i]
+        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
+        slots, j_t = layout.unit_slot[self.unit[free]], np.swapaxes(j[free], 1, 2)
+        np.add.at(extra.units[:, :3, :3], slots, j_t @ j[free])
+        np.add.at(extra.unit_gradient[:, :3], slots, (j_t @ r[free, :, None])[:, :, 0])

@@ -6,15 +6,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from mrasfm_engine.adjustment.normal_equations import accumulate, squared_errors, substitute
+from mrasfm_engine.adjustment.coupling import Coupling
+from mrasfm_engine.adjustment.normal_equations import IMAGE_SUMS, accumulate, add_images, squared_errors, substitute
 from mrasfm_engine.adjustment.priors import Term
-from mrasfm_engine.adjustment.problem import Layout, Observations, ShotMotion, retract
+from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
+from mrasfm_engine.adjustment.reduced import Extra, Reduced
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
@@ -96,34 +98,43 @@ class Problem:
         images = 0.5 * s2 * np.log1p(self.errors_px2(state) / (s2 * self.options.sigma_px**2)).sum()
         return float(images + sum(term.cost(state) for term in self.terms))
 
+    @cached_property
+    def coupling(self) -> Coupling:
+        """Which blocks the points couple; the same for every state."""
+        return Coupling.of(self.observations, self.layout, self.motion)
+
     def normal_equations(self, state: State, damping: float) -> Reduced:
         """The reduced system at a state."""
-        o, layout, options = self.observations, self.layout, self.options
-        n, p = layout.size, o.num_points
-        # Every thread has a system of its own: not more of them than fit into a gigabyte.
-        parts = min(options.threads, max(1, p // 256), max(1, int(1e9 // (8 * n * n + 1))))
-        s, diagonal, g = np.zeros((parts, n, n)), np.zeros((parts, n)), np.zeros((parts, n))
+        o, layout, options, coupling = self.observations, self.layout, self.options, self.coupling
+        units, cameras, p = layout.num_units, layout.num_cameras, o.num_points
+        parts = min(options.threads, max(1, p // 256))
+        images = np.zeros((parts, len(coupling.image_unit), IMAGE_SUMS))
+        blocks = (
+            np.zeros((parts, len(coupling.pattern.row), UNIT_DOF * UNIT_DOF)),
+            np.zeros((parts, cameras, units, CAMERA_DOF * UNIT_DOF)),
+            np.zeros((parts, cameras, cameras, CAMERA_DOF * CAMERA_DOF)),
+        )
+        gradient = np.zeros((parts, layout.size))
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
-        _in_ranges(
-            parts,
-            p,
+        slots = layout.unit_slot, layout.camera_slot, units
+        _in_parts(
+            coupling.shares(parts),
             lambda lo, hi, t: accumulate(
-                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
-                layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
-                damping, lo, hi, s[t], diagonal[t], g[t], v_inverse, v_gradient,
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, coupling.image, o.xy_px,
+                o.first_of_point, *slots, *coupling.arrays, options.sigma_px, options.loss_scale**2, damping, lo, hi,
+                images[t], *(part[t] for part in blocks), gradient[t], v_inverse, v_gradient,
             ),
         )  # fmt: skip
-        matrix, extra, gradient = s.sum(0), np.zeros((n, n)), g.sum(0)
-        matrix = np.tril(matrix) + np.tril(matrix, -1).T
+        sums = tuple(part[0] if parts == 1 else part.sum(0) for part in (*blocks, np.zeros_like(gradient), gradient))
+        add_images(
+            *_arrays(state, self.camera_kind)[:4], state.camera_position_m, *self._motion(),
+            coupling.image_unit, coupling.image_camera, *slots, coupling.pattern.first, coupling.pattern.row,
+            images.sum(0), *sums,
+        )  # fmt: skip
+        extra = Extra.none(layout)
         for term in self.terms:
-            term.add_to(state, layout, extra, gradient)
-        return Reduced(
-            matrix=matrix + extra,
-            diagonal=diagonal.sum(0) + np.diagonal(extra),
-            gradient=gradient,
-            v_inverse=v_inverse,
-            v_gradient=v_gradient,
-        )
+            term.add_to(state, layout, extra)
+        return Reduced.of(layout, coupling, sums, (v_inverse, v_gradient), extra)
 
     def points_after(self, state: State, reduced: Reduced, step: Floats) -> Floats:
         """Points (p, 3) that go with a step of the reduced vector."""
@@ -139,17 +150,6 @@ class Problem:
             ),
         )  # fmt: skip
         return out
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reduced:
-    """Normal equations with the points eliminated."""
-
-    matrix: Floats  # (n, n)
-    diagonal: Floats  # (n,) of the matrix before points were eliminated: what Marquardt's damping scales
-    gradient: Floats  # (n,)
-    v_inverse: Floats  # (p, 6)
-    v_gradient: Floats  # (p, 3)
 
 
 def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic] | None, ...]:
@@ -172,6 +172,14 @@ def _in_ranges(parts: int, count: int, work: Callable[[int, int, int], None]) ->
         work(0, count, 0)
         return
     bounds = np.linspace(0, count, parts + 1).astype(int)
+    _in_parts(bounds, work)
+
+
+def _in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:
+    parts = len(bounds) - 1
+    if parts == 1:
+        work(int(bounds[0]), int(bounds[1]), 0)
+        return
     with ThreadPoolExecutor(parts) as pool:
         list(pool.map(work, bounds[:-1], bounds[1:], range(parts)))
 
@@ -218,7 +226,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
             break
         iterations += 1
         reduced = problem.normal_equations(state, damping)
-        step = _damped_step(reduced, free, damping)
+        step = reduced.step(damping)
         if step is not None:
             trial = problem.retract(state, step, problem.points_after(state, reduced, step))
             trial_cost = problem.cost(trial)
@@ -245,18 +253,3 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
         parameters=len(free) + 3 * problem.observations.num_points,
         pose_parameters=len(free),
     )
-
-
-def _damped_step(reduced: Reduced, free: Ints, damping: float) -> Floats | None:
-    """The step of the reduced vector, zero where held; None where the damped matrix is not positive definite."""
-    step = np.zeros(len(reduced.gradient))
-    if not len(free):
-        return step
-    a = reduced.matrix[np.ix_(free, free)]
-    a[np.diag_indices(len(free))] += damping * np.maximum(reduced.diagonal[free], 1e-12)
-    try:
-        factor = scipy.linalg.cho_factor(a, lower=True, overwrite_a=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        return None
-    step[free] = -scipy.linalg.cho_solve(factor, reduced.gradient[free], check_finite=False)
-    return step if np.isfinite(step).all() else None

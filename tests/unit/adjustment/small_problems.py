@@ -10,6 +10,7 @@ import numpy as np
 
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import Layout, Observations
+from mrasfm_engine.adjustment.reduced import Extra
 from mrasfm_engine.adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL, project_points
@@ -168,7 +169,10 @@ def add_terms(terms: Sequence[Term], problem: Problem, state: State, h: np.ndarr
     """Add the terms to the part of units and cameras."""
     n = problem.layout.size
     for term in terms:
-        term.add_to(state, problem.layout, h[:n, :n], g[:n])
+        extra = Extra.none(problem.layout)
+        term.add_to(state, problem.layout, extra)
+        h[:n, :n] += extra.matrix
+        g[:n] += extra.gradient
 
 
 def numeric_gradient(problem: Problem, state: State, coordinates: Sequence[int], cost: Any = None) -> np.ndarray:

@@ -9,7 +9,7 @@ from small_problems import Case, dense_normal_equations, make_case, moved, numer
 from mrasfm_engine.adjustment.normal_equations import BEHIND_PX
 from mrasfm_engine.adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, UprightPrior
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion
-from mrasfm_engine.adjustment.solver import Problem, SolverOptions, Termination, _damped_step, solve
+from mrasfm_engine.adjustment.solver import Problem, SolverOptions, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
 from mrasfm_engine.geometry.local_motion import local_motion
@@ -122,7 +122,7 @@ def test_the_step_equals_that_of_the_dense_full_system() -> None:
     h[np.diag_indices(len(h))] *= 1 + damping
     expected = -np.linalg.solve(h, g)
     reduced = problem.normal_equations(state, damping)
-    step = _damped_step(reduced, np.arange(n), damping)
+    step = reduced.step(damping)
     assert step is not None
     np.testing.assert_allclose(step, expected[:n], atol=1e-5 * np.abs(expected[:n]).max())
     points = problem.points_after(state, reduced, step)

@@ -15,6 +15,8 @@ from mrasfm_engine.adjustment.priors import (
     UprightPrior,
     robust_gauge_weights,
 )
+from mrasfm_engine.adjustment.problem import Layout
+from mrasfm_engine.adjustment.reduced import Extra
 from mrasfm_engine.adjustment.solver import Report, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
@@ -49,11 +51,17 @@ def calibration_prior(truth: State, **kwargs: float) -> CalibrationPrior:
     )
 
 
+def added(term: Term, state: State, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and gradient that a term adds."""
+    extra = Extra.none(layout)
+    term.add_to(state, layout, extra)
+    return extra.matrix, extra.gradient
+
+
 def check_gradient(term: Term, case: Case, state: State, *, rtol: float = 1e-5) -> np.ndarray:
     """The term's gradient against differences of its cost; returns its Gauss-Newton matrix."""
     n = case.problem.layout.size
-    h, g = np.zeros((n, n)), np.zeros(n)
-    term.add_to(state, case.problem.layout, h, g)
+    h, g = added(term, state, case.problem.layout)
     numeric = numeric_gradient(case.problem, state, range(n), term.cost)
     assert np.abs(g).max() > 1e-3  # there is something to compare
     np.testing.assert_allclose(g, numeric, rtol=rtol, atol=rtol * np.abs(g).max())
@@ -79,9 +87,7 @@ def test_pitfall_4_position_prior_differentiates_its_lever_arm(lever_arm_m: list
     )
     check_gradient(prior, case, state)
     # The unit without a measurement and the fixed one feel nothing.
-    n = case.problem.layout.size
-    h, g = np.zeros((n, n)), np.zeros(n)
-    prior.add_to(state, case.problem.layout, h, g)
+    h, g = added(prior, state, case.problem.layout)
     assert not g[6:12].any()
     assert not g[18:].any()
     assert h[:6, :6].any()
@@ -104,7 +110,6 @@ def test_position_prior_is_zero_where_the_antenna_was_measured() -> None:
 
 def test_pitfall_4_one_wrong_position_loses_its_pull() -> None:
     case, _ = free_case()
-    n = case.problem.layout.size
 
     def pull(off_m: float) -> float:
         prior = PositionPrior(
@@ -113,8 +118,7 @@ def test_pitfall_4_one_wrong_position_loses_its_pull() -> None:
             sigma_m=np.full((1, 3), 0.1),
             lever_arm_m=np.zeros(3),
         )
-        h, g = np.zeros((n, n)), np.zeros(n)
-        prior.add_to(case.truth, case.problem.layout, h, g)
+        _, g = added(prior, case.truth, case.problem.layout)
         return float(np.abs(g[3]))
 
     assert 5 < pull(0.1) < 10
@@ -165,8 +169,8 @@ def test_focal_prior() -> None:
 def test_focal_prior_adds_nothing_where_focal_lengths_are_held() -> None:
     case, state = free_case()
     layout = replace(case.problem.layout, free_focal=False)
-    h, g = np.zeros((layout.size,) * 2), np.zeros(layout.size)
-    FocalPrior(focal_px=case.truth.camera_params[:, 0], sigma=np.full(CAMERAS, 0.002)).add_to(state, layout, h, g)
+    prior = FocalPrior(focal_px=case.truth.camera_params[:, 0], sigma=np.full(CAMERAS, 0.002))
+    h, g = added(prior, state, layout)
     assert not h.any()
     assert not g.any()
 
