@@ -1,8 +1,8 @@
 """Which units and cameras the points of an adjustment couple: found once a problem, used in every iteration.
 
 A point that is eliminated couples all blocks (free units and cameras) that observe it. Points with the same blocks make
-a group: what they add to the reduced system is summed in a small dense matrix and brought to its places once a group.
-Groups are in the order of their first unit, so that neighbours in time are neighbours in memory.
+a group, whose places in the reduced system are looked up once. Groups are in the order of their first unit, so that
+neighbours in time are neighbours in memory.
 """
 
 from __future__ import annotations

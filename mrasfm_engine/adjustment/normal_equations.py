@@ -13,25 +13,27 @@ row by row,
     d/dtau_c = -M                       d/domega_c = M x (x_shot - t_c)
     d/dphi   =  pixel - principal point
 
-Where the motion within a unit follows from the trajectory, a shot's pose takes part in steps of up to three units
-(`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_shot). Left out is that a turned unit
-also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A shot
-that is held to its unit has no other support, and the derivatives above.
-
-Where all images are taken at their unit's time, shot_r, shot_t, support, weight and obs_shot are None: numba compiles
-the kernels without them, so that nobody pays for what is not there.
-
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
 reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
 
-For every point its 3x3 block V and gradient e are eliminated on the spot: with W_i its coupling to free block i,
+Where the motion within a unit follows from the trajectory, a shot's pose takes part in steps of up to three units
+(`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_shot). Left out is that a turned unit
+also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A shot
+that is held to its unit has no other support, and the derivatives above. Where all images are taken at their unit's
+time, shot_r, shot_t, support, weight and obs_shot are None: numba compiles the kernels without them, so that nobody
+pays for what is not there.
+
+Products of Jacobians need not be formed one observation at a time. With d = X - t_u and V = N' N all that an
+observation adds to its unit's block follows from V and V [d]x, and as d/dcamera = d/dunit T with a T that all
+observations of an image share (`add_images`), these sums by image make the unreduced matrix of units and cameras.
+
+For every point its 3x3 block V (now summed over its observations) and gradient e are eliminated on the spot: with W_i
+its coupling to free block i,
 
     S_ij -= W_i V^-1 W_j'         g_i -= W_i V^-1 e
 
-Points are damped as V + lambda diag V. Those that see the same blocks (a group of `coupling`) are summed in one small
-dense matrix, whose lower triangle is then added to the blocks of S: long inner loops over contiguous memory. S is kept
-as blocks of the units' pattern, a dense border of the cameras' rows, and the cameras' own square.
-
+Points are damped as V + lambda diag V. S is kept as blocks: of the units' pattern (`coupling`), of a dense border of the
+cameras' rows, and of the cameras' own square; each holds its entries row by row.
 """
 
 from __future__ import annotations
@@ -172,10 +174,10 @@ def accumulate(
 ) -> None:  # fmt: skip
     """Eliminate points order[lo:hi].
 
-    Sums of observations by image are added to images (images, IMAGE_SUMS). What elimination takes off the matrix is taken
-    off blocks s_units (b, 36) of the units' pattern, s_border (cameras, units, 42) and s_cameras (cameras, cameras, 49),
-    of all three the lower blocks; what it takes off the gradient, off g (n,). Every point's V^-1 (p, 6) and gradient
-    (p, 3) are kept.
+    Sums of observations by image are added to images (images, IMAGE_SUMS). What elimination takes off the matrix is
+    taken off blocks s_units (b, 36) of the units' pattern, s_border (cameras, units, 42) and s_cameras (cameras,
+    cameras, 49), of all three the lower blocks; what it takes off the gradient, off g (n,). Every point's V^-1 (p, 6)
+    and gradient (p, 3) are kept.
     """
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     jx, jc = np.empty((2, 3)), np.empty((2, 7))
@@ -393,8 +395,7 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
-    h, t, th, tht = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    r, q, f, one, alone = np.empty((3, 3)), np.empty(3), np.empty(6), np.ones(1), np.empty(1, np.int64)
+    h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
         u, c = image_unit[image], image_camera[image]
         if u < 0:
@@ -421,7 +422,6 @@ def add_images(
                 for k in range(6):
                     x += t[k, i] * s[21 + k]
                     y += t[k, i] * s[27 + k]
-                f[i] = y
                 g[o + i] += x
                 square[42 + i] += y
                 for j in range(6):

@@ -146,7 +146,7 @@ class Reduced:
             return None
         step = np.zeros(len(self.gradient))
         step[:split] = -solved.units_of(self.gradient[:split])
-        if len(solved.free):
+        if solved.cameras is not None:
             right = -self.gradient[split:][solved.free] - solved.border @ step[:split]
             cameras = scipy.linalg.cho_solve(solved.cameras, right, check_finite=False)
             step[split:][solved.free] = cameras
