@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from mrasfm_engine.registration.calibration import (
     judge_calibration,
     scale_of_baselines,
     scale_with_baselines,
+    settle_scale,
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
@@ -125,6 +126,7 @@ def refine(
                 cancel=cancel,
             )
         )
+        _settle(model, result, terms)
         if done < ROUNDS - 1:
             model.complete()
         else:
@@ -211,16 +213,24 @@ def _hold_unobserved(
     """
     assert result.directions is not None
     result.held = result.directions.to_hold
+    terms = _terms(model, positions, result)
     result.adjustments.append(
         model.adjust(
             free_units,
             free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
             free_focal=result.focal_free,
-            terms=_terms(model, positions, result),
+            terms=terms,
             options=_options(model, result.sigma_px, iterations=40),
             cancel=cancel,
         )
     )
+    _settle(model, result, terms)
+
+
+def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
+    several = not model.drive.has_single_camera
+    if result.calibration.free and several and terms and model.config.adjustment.camera_set_adjustment:
+        settle_scale(model, terms)
 
 
 def _options(model: Model, sigma_px: float, *, iterations: int) -> SolverOptions:
