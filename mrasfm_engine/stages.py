@@ -293,6 +293,8 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     model.keyframe = arrays["keyframe"]
     model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
     model.missing = arrays["missing"]
+    if known.world_from_rig is not None:
+        model.motion.follow_prior(known.world_from_rig)
     for image in np.flatnonzero(arrays["has_own_pose"]):
         model.set_image_pose(int(image), arrays["unit_from_image"][image])
     return model
@@ -317,6 +319,9 @@ def scene(
     run.report["findings"] += [
         as_json(wrong_camera.finding(run.drive.cameras[wrong.camera].name, wrong)) for wrong in refinement.wrong_cameras
     ]
+    if refinement.wrong_pair is not None:
+        names = [camera.name for camera in run.drive.cameras]
+        run.report["findings"].append(as_json(wrong_camera.pair_finding(names, refinement.wrong_pair)))
     run.report["stages"].append(
         {
             "stage": "refinement",

@@ -17,6 +17,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.correspondence.features import colors_at
 from mrasfm_engine.correspondence.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.correspondence.tiles import Tile, cut, duplicates, lay_tiles
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -109,6 +110,7 @@ class LearnedExtractor:
         wanted = self._config.max_keypoints
         while True:
             found = self._detector.detect(pixels, wanted, self._config.min_score)
+            self._check(found)
             xy = found.xy_px + np.array([tile.column, tile.row], np.float32)
             keep = tile.owns(xy) & usable(xy)
             if self._config.min_score is not None:
@@ -118,6 +120,18 @@ class LearnedExtractor:
             if keep.sum() >= self._config.max_keypoints or not cut_off or wanted >= MOST_ASKED:
                 return Detections(xy, found.descriptors, found.scores)[keep]
             wanted *= 4
+
+    def _check(self, found: Detections) -> None:
+        count = len(found.xy_px)
+        shapes = [list(array.shape) for array in (found.xy_px, found.descriptors, found.scores)]
+        fits = found.descriptors.ndim == 2 and [shapes[0], shapes[1][:1], shapes[2]] == [[count, 2], [count], [count]]
+        if not fits or not np.isfinite(found.xy_px).all():
+            raise InputError(
+                f"model {self._detector.network.name} gives keypoints {shapes[0]}, descriptors {shapes[1]} and scores "
+                f"{shapes[2]}, or places that are no numbers",
+                remedy="Export it with one descriptor and one score a keypoint.",
+                code="bad-model",
+            )
 
 
 def _up(size: int) -> int:

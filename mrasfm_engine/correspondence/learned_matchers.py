@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.correspondence.matching import Matches
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -62,7 +63,19 @@ class LearnedMatcher:
         if a.count < 2 or b.count < 2:
             return np.zeros((0, 2), np.int32)
         pairs, scores = self._run(a, b)
+        self._check(pairs, scores, (a.count, b.count))
         return np.ascontiguousarray(pairs[scores >= self._min_score], dtype=np.int32)
+
+    def _check(self, pairs: NDArray[np.int64], scores: Floats, counts: tuple[int, int]) -> None:
+        """An index that is out of range would else be some other keypoint's, or an error without a name."""
+        fits = pairs.ndim == 2 and pairs.shape[1] == 2 and scores.shape == pairs.shape[:1]
+        if not fits or (len(pairs) and (pairs.min() < 0 or (pairs.max(axis=0) >= counts).any())):
+            raise InputError(
+                f"model {self.network.name} gives matches {list(pairs.shape)} with scores {list(scores.shape)} that "
+                f"are not between its {counts[0]} and {counts[1]} keypoints",
+                remedy="Export it so that it takes any number of keypoints and gives indices of both, without padding.",
+                code="bad-model",
+            )
 
     def _units(self, xy_px: Floats, size: Floats) -> Floats:
         """Keypoints as LightGlue was trained: about the image's centre, half the longer side the unit."""

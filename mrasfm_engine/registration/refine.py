@@ -27,7 +27,13 @@ from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
 from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
-from mrasfm_engine.registration.wrong_camera import MIN_OTHERS, WrongCamera, find_wrong_cameras
+from mrasfm_engine.registration.wrong_camera import (
+    MIN_OTHERS,
+    WrongCamera,
+    WrongPair,
+    find_wrong_cameras,
+    find_wrong_pair,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -45,6 +51,7 @@ class Refinement:
 
     sigma_px: float = 1.0
     placement: Placement | None = None  # by GNSS, where it was to be used
+    placed_by_rough_poses: bool = False
     calibration: CalibrationVerdict = field(default_factory=lambda: CalibrationVerdict(False, ""))
     focal_free: bool = False
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
@@ -56,6 +63,7 @@ class Refinement:
     directions: Observability | None = None  # of the cameras' poses; None where it is not known
     held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
     wrong_cameras: list[WrongCamera] = field(default_factory=list)
+    wrong_pair: WrongPair | None = None  # of a rig of two cameras
     road: RoadJudgement | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
@@ -91,6 +99,7 @@ def refine(
     placed = positions is not None
     if not placed and rough_world_from_rig is not None and rough is not None:
         placed = place_by_rough_poses(model, rough_world_from_rig, rough.sigma_translation_m)
+        result.placed_by_rough_poses = placed
     if not placed and model.drive.has_single_camera:
         raise ReconstructionError(
             "one camera tells no scale, and neither GNSS nor rough poses could: "
@@ -147,9 +156,9 @@ def refine(
             _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
         if result.georeferenced and result.directions.scale_only_prior:
             scale_with_baselines(model, scale_of_baselines(model)[0])
-        result.wrong_cameras = find_wrong_cameras(
-            calibration_prior(model), model.state, result.certainty, result.directions
-        )
+        known = calibration_prior(model), model.state, result.certainty, result.directions
+        result.wrong_cameras = find_wrong_cameras(*known)
+        result.wrong_pair = find_wrong_pair(*known)
     return result
 
 

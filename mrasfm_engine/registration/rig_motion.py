@@ -65,6 +65,11 @@ class RigMotion:
         """
         self._own[image], self._unit_from_image[image] = True, unit_from_image
 
+    def forget_image_poses(self, images: Ints) -> None:
+        """Let images stand where their unit's motion says again."""
+        self._own[images] = False
+        self._unit_from_image[images] = np.eye(4)
+
     @property
     def own_poses(self) -> tuple[Bools, Floats]:
         """Which images (i,) have a pose of their own, and the poses (i, 4, 4) as `set_image_pose` takes them."""

@@ -183,6 +183,22 @@ def test_an_image_of_a_simultaneous_drive_can_have_a_pose_of_its_own() -> None:
     np.testing.assert_allclose(reprojection_px(model)[~moved], good[~moved], atol=1e-9)
 
 
+def test_a_unit_that_is_forgotten_leaves_no_pose_of_its_images() -> None:
+    simulated = skewed()
+    model = make_model(simulated)
+    place_truly(model, simulated)
+    before = model.motion.unit_from_image(model.state)
+    pushed = before.copy()
+    pushed[:, 0, 3] += 0.3
+    images = np.flatnonzero(np.isin(model.image_unit, [3, 4]))
+    model.set_image_poses(images, pushed[images])
+    model.forget(np.array([3]))
+    assert not model.motion.own_poses[0][model.image_unit == 3].any()
+    assert model.motion.own_poses[0][model.image_unit == 4].all()
+    model.clear()
+    assert not model.motion.own_poses[0].any()
+
+
 def test_own_poses_and_rows_go_together() -> None:
     simulated = skewed(time_offset_ms=None, readout_ms=30, cameras=2)
     model = make_model(simulated)
