@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.correspondence.coverage import covering_order
 from mrasfm_engine.correspondence.features import colors_at
 from mrasfm_engine.correspondence.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.correspondence.tiles import Tile, cut, duplicates, lay_tiles
@@ -90,6 +91,8 @@ class LearnedExtractor:
         if self._detector.is_refined and self._config.refine:
             xy, there = snap_to_extrema(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), found.xy_px)
             found = Detections(xy, found.descriptors, found.scores)[there & usable(xy)]
+        if self._config.spread:
+            found = found[covering_order(found.xy_px)]
         found = found[np.arange(len(found.xy_px)) < self._config.max_keypoints]
         xy = found.xy_px * stretch
         return ImageFeatures(

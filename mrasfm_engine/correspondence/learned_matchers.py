@@ -22,7 +22,7 @@ LIGHTERGLUE_MIN_SCORE = 0.3  # half of the wrong matches that 0.1 lets through, 
 
 @dataclass(frozen=True)
 class Prepared:
-    """One image's keypoints as a network takes them, strongest first."""
+    """One image's keypoints as a network takes them."""
 
     xy: Floats  # (1, n, 2)
     descriptors: Floats  # (1, n, D)
@@ -36,7 +36,7 @@ class Prepared:
 
 
 class LearnedMatcher:
-    """What all trained matchers share: the strongest keypoints, in the network's own units."""
+    """What all trained matchers share: the first keypoints of an image, in the network's own units."""
 
     usual_min_score = LIGHTGLUE_MIN_SCORE
 
@@ -46,7 +46,7 @@ class LearnedMatcher:
         self._min_score = self.usual_min_score if config.min_score is None else config.min_score
 
     def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Prepared:
-        """See `Matcher`; of the image only its strongest keypoints, which come first, are matched."""
+        """See `Matcher`; of the image only its first keypoints, which are worth most, are matched."""
         xy = np.ascontiguousarray(features.xy_px[: self._count], dtype=np.float32)
         size = np.array([width, height], np.float32)
         scores = np.ones(len(xy), np.float32) if features.scores is None else features.scores[: self._count]
