@@ -108,7 +108,7 @@ class GnssConfig(_Section):
 class OutputConfig(_Section):
     """What is written besides the scene itself."""
 
-    pictures: bool = True  # the road from above before and after recalibration, as PNG; takes a few seconds
+    pictures: bool = True  # the road from above before and after recalibration, as PNG; reads every image again
 
 
 class SemanticsConfig(_Section):
