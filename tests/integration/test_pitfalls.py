@@ -22,6 +22,7 @@ def reconstructed(run: Run, drive: Path, scene: Path, *options: str) -> dict:  #
     return errors
 
 
+@pytest.mark.slow
 def test_standing_car_and_missing_images(tmp_path: Path, mrasfm: Run) -> None:
     drive = synth(
         tmp_path / "drive", "--cameras", 3, "--units", 10, "--standing", 4, "--drop-images", 0.15, "--seed", 5

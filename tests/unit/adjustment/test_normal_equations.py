@@ -168,7 +168,7 @@ def following(case: Case) -> tuple[Problem, State]:
         motion=ShotMotion(support=motion.support[unit], weight=motion.weights(unit, offset_s), follow=follow),
         state=truth,
     )
-    return problem, follow(perturbed(truth, np.random.default_rng(0), units=range(1, units), unit_m=0.05, point_m=0.05))
+    return problem, follow(perturbed(truth, np.random.default_rng(0), units=range(1, units), unit_m=0.02, point_m=0.05))
 
 
 def test_pitfall_1_derivatives_follow_the_trajectory_that_moves_the_shots() -> None:
