@@ -53,8 +53,7 @@ def find_wrong_pair(
     corrections = np.where(directions.observed, prior.corrections(state), 0.0)
     if len(corrections) != 2:
         return None
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+    sigma, posterior = _sigmas(prior, directions)
     if not any(
         _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=np.inf)
         for c in range(2)
@@ -82,9 +81,7 @@ def find_wrong_cameras(
         # What all cameras share is held, not observed, and one that is wrong has its part in how it is held.
         corrections = corrections - np.median(corrections, axis=0)
     corrections = np.where(directions.observed, corrections, 0.0)
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    # The common scale may be off: it moves all cameras, and is no fault of one.
-    posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+    sigma, posterior = _sigmas(prior, directions)
     found = []
     for c in range(len(corrections)):
         verdicts = [
@@ -106,6 +103,13 @@ def find_wrong_cameras(
             )
         )
     return found
+
+
+def _sigmas(prior: CalibrationPrior, directions: Observability) -> tuple[Floats, Floats]:
+    """Standard deviations (c, 6) of corrections before and after the drive."""
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    # The common scale may be off: it moves all cameras, and is no fault of one.
+    return sigma, np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
 
 
 def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:
