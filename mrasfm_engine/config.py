@@ -27,7 +27,8 @@ class FeatureConfig(_Section):
     extractor: Literal["sift", "superpoint", "aliked", "xfeat"] = "sift"  # all but SIFT need a model
     model: str | None = None  # name of the model, see `mrasfm models list`; the extractor's usual one if not given
     min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's keypoints; the usual if not given
-    max_keypoints: Count = 2048  # a image, strongest first; 1024 costs accuracy
+    max_keypoints: Count = 2048  # a image; 1024 costs accuracy
+    spread: bool = True  # a network's keypoints are taken all over the image first; false: the strongest wherever
     refine: bool = True  # xfeat: keypoints are moved to the nearest detail, those without one are dropped
     contrast_threshold: Positive = 0.02  # half of SIFT's usual value, so that asphalt and shade yield keypoints too
     class_margin_px: Annotated[int, Field(ge=0)] = 2  # keypoints nearer to the border of a class in the mask have none
@@ -52,7 +53,7 @@ class MatchConfig(_Section):
 
     matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] = "nearest"  # all but nearest need a model
     model: str | None = None  # name of the model; the usual one for the extractor if not given
-    max_keypoints: Count = 1024  # strongest of an image that a network matches: time grows with the square
+    max_keypoints: Count = 1024  # first of an image that a network matches: time grows with the square
     min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's matches; the usual if not given
     ratio: Share = 0.8  # nearest: of the distances to the best and second best descriptor
     min_matches: Count = 15  # pairs with fewer matches or inliers are dropped
@@ -107,7 +108,7 @@ class GnssConfig(_Section):
 class OutputConfig(_Section):
     """What is written besides the scene itself."""
 
-    pictures: bool = True  # the road from above before and after recalibration, as PNG; takes a few seconds
+    pictures: bool = True  # the road from above before and after recalibration, as PNG; reads every image again
 
 
 class SemanticsConfig(_Section):

@@ -39,8 +39,7 @@ from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
-from mrasfm_engine.views.birds_eye import birds_eye
-from mrasfm_engine.views.road_points import road_points
+from mrasfm_engine.views.pictures import draw_pictures
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
@@ -293,6 +292,8 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     model.keyframe = arrays["keyframe"]
     model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
     model.missing = arrays["missing"]
+    if known.world_from_rig is not None:
+        model.motion.follow_prior(known.world_from_rig)
     for image in np.flatnonzero(arrays["has_own_pose"]):
         model.set_image_pose(int(image), arrays["unit_from_image"][image])
     return model
@@ -317,6 +318,9 @@ def scene(
     run.report["findings"] += [
         as_json(wrong_camera.finding(run.drive.cameras[wrong.camera].name, wrong)) for wrong in refinement.wrong_cameras
     ]
+    if refinement.wrong_pair is not None:
+        names = [camera.name for camera in run.drive.cameras]
+        run.report["findings"].append(as_json(wrong_camera.pair_finding(names, refinement.wrong_pair)))
     run.report["stages"].append(
         {
             "stage": "refinement",
@@ -329,11 +333,8 @@ def scene(
     return build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)
 
 
-def pictures(run: Run, result: Scene) -> dict[str, NDArray[np.uint8]]:
-    """The pictures (h, w, 3) of a scene by file name.
-
-    The road from above before and after recalibration, and its points before and after those off it were dropped.
-    """
+def pictures(run: Run, result: Scene) -> dict[str, bytes]:
+    """The pictures of a scene as PNG files by name; see `draw_pictures`."""
     if not run.config.output.pictures:
         return {}
 
@@ -343,17 +344,11 @@ def pictures(run: Run, result: Scene) -> dict[str, NDArray[np.uint8]]:
         run.progress("pictures", done, total)
 
     started = time.perf_counter()
-    drawn = birds_eye(result, seed=run.config.seed, progress=step)
-    run.report["stages"].append(
-        {
-            "stage": "pictures",
-            "seconds": round(time.perf_counter() - started, 3),
-            "reused": False,
-            "birds_eye": drawn.report,
-        }
-    )
+    files, report = draw_pictures(result, seed=run.config.seed, progress=step)
+    seconds = round(time.perf_counter() - started, 3)
+    run.report["stages"].append({"stage": "pictures", "seconds": seconds, "reused": False, **report})
     run.progress("pictures", 1, 1)
-    return {**drawn.pictures, **road_points(result)}
+    return files
 
 
 def store_of(out: Path) -> StageStore:

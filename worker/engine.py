@@ -15,6 +15,7 @@ from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.findings import as_json, error
 from mrasfm_engine.io.preflight import UnsoundDriveError, is_sound
 from mrasfm_engine.io.preflight_content import inspect_drive
+from mrasfm_engine.learned.model_folder import default_folder
 from mrasfm_engine.pipeline import reconstruct
 from worker.engine_settings import engine_config
 from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
@@ -112,4 +113,4 @@ def _without_paths(what: str, request: ChildRequest) -> str:
     """Files by their names in the drive or scene: where these lie on this machine is of no interest to who asked."""
     for folder in (request.drive, request.drive.resolve(), request.out, request.out.resolve()):
         what = what.replace(f"{folder}/", "")
-    return what
+    return what.replace(str(default_folder()), "the models' folder of the worker")

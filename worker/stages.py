@@ -25,7 +25,9 @@ TICK_S = 0.25
 
 # Of the environment a child gets what it runs with. The rest may hold the worker's secrets, and the child decodes
 # images from outside.
-_KEPT = frozenset({"PATH", "HOME", "USER", "LANG", "TZ", "LD_LIBRARY_PATH", "VIRTUAL_ENV"})
+_KEPT = frozenset(
+    {"PATH", "HOME", "USER", "LANG", "TZ", "LD_LIBRARY_PATH", "VIRTUAL_ENV", "MRASFM_MODELS", "CUDA_VISIBLE_DEVICES"}
+)
 _KEPT_PREFIXES = ("LC_", "PYTHON", "NUMBA_", "PROJ_", "XDG_")
 _THREADS = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"

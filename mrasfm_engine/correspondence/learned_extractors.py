@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.correspondence.coverage import covering_order
 from mrasfm_engine.correspondence.features import colors_at
 from mrasfm_engine.correspondence.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.correspondence.tiles import Tile, cut, duplicates, lay_tiles
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -89,6 +91,8 @@ class LearnedExtractor:
         if self._detector.is_refined and self._config.refine:
             xy, there = snap_to_extrema(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), found.xy_px)
             found = Detections(xy, found.descriptors, found.scores)[there & usable(xy)]
+        if self._config.spread:
+            found = found[covering_order(found.xy_px)]
         found = found[np.arange(len(found.xy_px)) < self._config.max_keypoints]
         xy = found.xy_px * stretch
         return ImageFeatures(
@@ -109,6 +113,7 @@ class LearnedExtractor:
         wanted = self._config.max_keypoints
         while True:
             found = self._detector.detect(pixels, wanted, self._config.min_score)
+            self._check(found)
             xy = found.xy_px + np.array([tile.column, tile.row], np.float32)
             keep = tile.owns(xy) & usable(xy)
             if self._config.min_score is not None:
@@ -118,6 +123,18 @@ class LearnedExtractor:
             if keep.sum() >= self._config.max_keypoints or not cut_off or wanted >= MOST_ASKED:
                 return Detections(xy, found.descriptors, found.scores)[keep]
             wanted *= 4
+
+    def _check(self, found: Detections) -> None:
+        count = len(found.xy_px)
+        shapes = [list(array.shape) for array in (found.xy_px, found.descriptors, found.scores)]
+        fits = found.descriptors.ndim == 2 and [shapes[0], shapes[1][:1], shapes[2]] == [[count, 2], [count], [count]]
+        if not fits or not np.isfinite(found.xy_px).all():
+            raise InputError(
+                f"model {self._detector.network.name} gives keypoints {shapes[0]}, descriptors {shapes[1]} and scores "
+                f"{shapes[2]}, or places that are no numbers",
+                remedy="Export it with one descriptor and one score a keypoint.",
+                code="bad-model",
+            )
 
 
 def _up(size: int) -> int:

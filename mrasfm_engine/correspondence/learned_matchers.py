@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.correspondence.matching import Matches
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -21,7 +22,7 @@ LIGHTERGLUE_MIN_SCORE = 0.3  # half of the wrong matches that 0.1 lets through, 
 
 @dataclass(frozen=True)
 class Prepared:
-    """One image's keypoints as a network takes them, strongest first."""
+    """One image's keypoints as a network takes them."""
 
     xy: Floats  # (1, n, 2)
     descriptors: Floats  # (1, n, D)
@@ -35,7 +36,7 @@ class Prepared:
 
 
 class LearnedMatcher:
-    """What all trained matchers share: the strongest keypoints, in the network's own units."""
+    """What all trained matchers share: the first keypoints of an image, in the network's own units."""
 
     usual_min_score = LIGHTGLUE_MIN_SCORE
 
@@ -45,7 +46,7 @@ class LearnedMatcher:
         self._min_score = self.usual_min_score if config.min_score is None else config.min_score
 
     def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Prepared:
-        """See `Matcher`; of the image only its strongest keypoints, which come first, are matched."""
+        """See `Matcher`; of the image only its first keypoints, which are worth most, are matched."""
         xy = np.ascontiguousarray(features.xy_px[: self._count], dtype=np.float32)
         size = np.array([width, height], np.float32)
         scores = np.ones(len(xy), np.float32) if features.scores is None else features.scores[: self._count]
@@ -62,7 +63,19 @@ class LearnedMatcher:
         if a.count < 2 or b.count < 2:
             return np.zeros((0, 2), np.int32)
         pairs, scores = self._run(a, b)
+        self._check(pairs, scores, (a.count, b.count))
         return np.ascontiguousarray(pairs[scores >= self._min_score], dtype=np.int32)
+
+    def _check(self, pairs: NDArray[np.int64], scores: Floats, counts: tuple[int, int]) -> None:
+        """An index that is out of range would else be some other keypoint's, or an error without a name."""
+        fits = pairs.ndim == 2 and pairs.shape[1] == 2 and scores.shape == pairs.shape[:1]
+        if not fits or (len(pairs) and (pairs.min() < 0 or (pairs.max(axis=0) >= counts).any())):
+            raise InputError(
+                f"model {self.network.name} gives matches {list(pairs.shape)} with scores {list(scores.shape)} that "
+                f"are not between its {counts[0]} and {counts[1]} keypoints",
+                remedy="Export it so that it takes any number of keypoints and gives indices of both, without padding.",
+                code="bad-model",
+            )
 
     def _units(self, xy_px: Floats, size: Floats) -> Floats:
         """Keypoints as LightGlue was trained: about the image's centre, half the longer side the unit."""

@@ -9,14 +9,43 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.io.export_check import checking, refuse
-from mrasfm_engine.io.images import read_image_rgb
 
 Picture = NDArray[np.uint8]  # (h, w, 3) red, green, blue
 
 
-def write_pictures(pictures: Mapping[str, Picture], folder: Path) -> None:
-    """Write pictures by file name into a new folder and read them back; without any there is no folder.
+def png_of(picture: Picture) -> bytes:
+    """A picture (h, w, 3) as a PNG file, which was decoded again and shows the same.
+
+    The bounds of camera images are no bounds of our own pictures.
+
+    Raises
+    ------
+    MrasfmError
+        Where no PNG can be made of it.
+    """
+    try:
+        data = cv2.imencode(".png", picture[..., ::-1])[1]
+        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise _no_png(picture, str(error).strip()) from error
+    if decoded is None or not np.array_equal(decoded, picture[..., ::-1]):
+        raise _no_png(picture, "it shows something else")
+    return bytes(data)
+
+
+def _no_png(picture: Picture, why: str) -> MrasfmError:
+    size = " x ".join(str(n) for n in picture.shape[1::-1])
+    return MrasfmError(
+        f"a picture of {size} pixels cannot be made a PNG: {why}",
+        remedy="This is a defect of mrasfm, please report it.",
+        code="bad-picture",
+    )
+
+
+def write_pictures(pictures: Mapping[str, bytes], folder: Path) -> None:
+    """Write PNG files by name into a new folder and read them back; without any there is no folder.
 
     Raises
     ------
@@ -25,15 +54,14 @@ def write_pictures(pictures: Mapping[str, Picture], folder: Path) -> None:
     MrasfmError
         Where a file does not read back.
     """
-    for name, picture in pictures.items():
+    for name, data in pictures.items():
         folder.mkdir(exist_ok=True)
-        _, data = cv2.imencode(".png", picture[..., ::-1])
-        (folder / name).write_bytes(data.tobytes())
+        (folder / name).write_bytes(data)
         with checking(folder / name):
-            if not np.array_equal(read_image_rgb(folder / name), picture):
-                refuse(folder / name, "it shows something else")
+            if (folder / name).read_bytes() != data:
+                refuse(folder / name, "it holds something else")
 
 
-def size_bytes(pictures: Mapping[str, Picture]) -> int:
-    """At most what the files take, for all that can be foreseen: photographs compress to less."""
-    return sum(picture.size for picture in pictures.values())
+def size_bytes(pictures: Mapping[str, bytes]) -> int:
+    """What the files take."""
+    return sum(len(data) for data in pictures.values())

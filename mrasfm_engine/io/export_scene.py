@@ -38,13 +38,13 @@ from mrasfm_engine.scene.scene import Scene
 
 COMPLETE_MARK = "report.json"
 PICTURES = "pictures"
-NO_PICTURES: Mapping[str, export_pictures.Picture] = MappingProxyType({})
+NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
 LEFTOVER_AGE_S = 3600.0
 ROAD_FILE = "road.json"
 
 
 def write_scene(
-    scene: Scene, out: Path, report: Mapping[str, Any], pictures: Mapping[str, export_pictures.Picture] = NO_PICTURES
+    scene: Scene, out: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes] = NO_PICTURES
 ) -> None:
     """Write all files of a scene into the folder `out`.
 

@@ -142,6 +142,12 @@ class ModelFolder:
             )
         sha256 = sha256_of(data)
         known = _recognise(data, sha256, name, what)
+        if name is None and known.is_published and known.sha256 != sha256:
+            raise InputError(
+                f"{what} has the signature of {known.name}, and is not the file that is published under that name",
+                remedy="Give it a name of its own with --name.",
+                code="bad-name",
+            )
         model = InstalledModel(
             name=name or known.name,
             known=known,

@@ -13,7 +13,8 @@ from mrasfm_engine.learned.signatures import Signature, Tensor
 
 Array = NDArray[Any]
 
-GPU_PROVIDERS = ("CUDAExecutionProvider", "ROCMExecutionProvider", "DmlExecutionProvider")
+# DirectML is left out: its sessions may run in one thread only.
+GPU_PROVIDERS = ("CUDAExecutionProvider", "ROCMExecutionProvider")
 CPU_PROVIDER = "CPUExecutionProvider"
 _ELEMENT_TYPES = {"float": "float32", "double": "float64", "float16": "float16"}
 _QUIET = 3  # errors only: they become our own

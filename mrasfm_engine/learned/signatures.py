@@ -77,7 +77,7 @@ def _fits(expected: Tensor, found: Tensor) -> bool:
     )
 
 
-F32, I64, I32, U8 = "float32", "int64", "int32", "uint8"
+F32, I64, U8 = "float32", "int64", "uint8"
 
 
 def _f32(name: str, *shape: str | int) -> Tensor:

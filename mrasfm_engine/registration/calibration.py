@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from mrasfm_engine.adjustment.observability import covariances
 from mrasfm_engine.adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.adjustment.solver import SolverOptions
 from mrasfm_engine.registration.model import Model
 
+Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 MIN_BASELINES_M2 = 1e-6
+SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
 MAX_UNKNOWNS_FOR_COVARIANCE = 12_000  # of units and cameras; above, the inverse would take gigabytes
 
 
@@ -112,9 +115,36 @@ def scale_with_baselines(model: Model, factor: float) -> None:
     state = model.state
     centre = state.unit_position_m[model.registered].mean(0)
     mean = state.camera_position_m.mean(0)
-    # Scaled about the rig's origin the cameras' mean would move by this.
-    moved = (factor - 1.0) * mean
-    state.unit_position_m[:] = centre + factor * (state.unit_position_m - centre) + state.unit_rotation @ moved
+    unit_position_m, camera_position_m = _scaled_places(model, factor)
     state.points_m[:] = centre + factor * (state.points_m - centre)
     model.motion.scale(state, factor, mean)
-    state.camera_position_m[:] = mean + factor * (state.camera_position_m - mean)
+    state.unit_position_m[:] = unit_position_m
+    state.camera_position_m[:] = camera_position_m
+
+
+def settle_scale(model: Model, terms: Sequence[Term]) -> None:
+    """Scale the scene with its baselines to where the terms cost least.
+
+    No image changes with that, so priors and positions decide alone. Adjustment comes there slowly if at all: the cost
+    is nearly flat along this direction, and where shots follow the trajectory its derivatives are not exact.
+    """
+
+    def cost(log_factor: float) -> float:
+        unit_position_m, camera_position_m = _scaled_places(model, float(np.exp(log_factor)))
+        state = replace(model.state, unit_position_m=unit_position_m, camera_position_m=camera_position_m)
+        return sum(term.cost(state) for term in terms)
+
+    found = minimize_scalar(cost, bounds=(-SCALE_RANGE, SCALE_RANGE), method="bounded", options={"xatol": 1e-6})
+    if found.fun < cost(0.0):
+        scale_with_baselines(model, float(np.exp(found.x)))
+
+
+def _scaled_places(model: Model, factor: float) -> tuple[Floats, Floats]:
+    """Positions of units (u, 3) in the world and of cameras (c, 3) in the rig, scaled about their middle."""
+    state = model.state
+    centre = state.unit_position_m[model.registered].mean(0)
+    mean = state.camera_position_m.mean(0)
+    # Scaled about the rig's origin the cameras' mean would move by this.
+    moved = (factor - 1.0) * mean
+    units = centre + factor * (state.unit_position_m - centre) + state.unit_rotation @ moved
+    return units, mean + factor * (state.camera_position_m - mean)

@@ -81,5 +81,7 @@ def register_between_keyframes(model: Model, *, max_error_px: float) -> list[Reg
 def nearest_keyframes(model: Model) -> Ints:
     """The registered keyframe (u,) nearest to each unit; itself, where it is one."""
     known = np.flatnonzero(model.keyframe & model.registered)
-    result: Ints = known[np.abs(np.arange(len(model.registered))[:, None] - known[None]).argmin(1)]
-    return result
+    units = np.arange(len(model.registered))
+    after = np.searchsorted(known, units)
+    low, high = known[np.maximum(after - 1, 0)], known[np.minimum(after, len(known) - 1)]
+    return np.where(units - low <= high - units, low, high)

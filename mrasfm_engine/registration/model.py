@@ -134,14 +134,15 @@ class Model:
     def forget(self, units: Ints) -> None:
         """Take the poses of units back, and what their images observe."""
         self.registered[units] = False
-        self.missing[np.isin(self.image_unit, units)] = False
+        images = np.flatnonzero(np.isin(self.image_unit, units))
+        self.missing[images] = False
+        self.motion.forget_image_poses(images)
         self.kept[np.isin(self.keypoints.unit, units)] = False
 
     def clear(self) -> None:
         """Forget all poses and points."""
-        self.registered[:] = False
+        self.forget(np.arange(len(self.registered)))
         self.solved[:] = False
-        self.kept[:] = False
 
     def tracks_of_units(self, units: Ints) -> Ints:
         """Tracks seen by any of the units, ascending."""

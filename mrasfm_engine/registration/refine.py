@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,12 +21,19 @@ from mrasfm_engine.registration.calibration import (
     judge_calibration,
     scale_of_baselines,
     scale_with_baselines,
+    settle_scale,
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
 from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
-from mrasfm_engine.registration.wrong_camera import MIN_OTHERS, WrongCamera, find_wrong_cameras
+from mrasfm_engine.registration.wrong_camera import (
+    MIN_OTHERS,
+    WrongCamera,
+    WrongPair,
+    find_wrong_cameras,
+    find_wrong_pair,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,6 +51,7 @@ class Refinement:
 
     sigma_px: float = 1.0
     placement: Placement | None = None  # by GNSS, where it was to be used
+    placed_by_rough_poses: bool = False
     calibration: CalibrationVerdict = field(default_factory=lambda: CalibrationVerdict(False, ""))
     focal_free: bool = False
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
@@ -55,6 +63,7 @@ class Refinement:
     directions: Observability | None = None  # of the cameras' poses; None where it is not known
     held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
     wrong_cameras: list[WrongCamera] = field(default_factory=list)
+    wrong_pair: WrongPair | None = None  # of a rig of two cameras
     road: RoadJudgement | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
@@ -90,6 +99,7 @@ def refine(
     placed = positions is not None
     if not placed and rough_world_from_rig is not None and rough is not None:
         placed = place_by_rough_poses(model, rough_world_from_rig, rough.sigma_translation_m)
+        result.placed_by_rough_poses = placed
     if not placed and model.drive.has_single_camera:
         raise ReconstructionError(
             "one camera tells no scale, and neither GNSS nor rough poses could: "
@@ -125,6 +135,7 @@ def refine(
                 cancel=cancel,
             )
         )
+        _settle(model, result, terms)
         if done < ROUNDS - 1:
             model.complete()
         else:
@@ -145,9 +156,9 @@ def refine(
             _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
         if result.georeferenced and result.directions.scale_only_prior:
             scale_with_baselines(model, scale_of_baselines(model)[0])
-        result.wrong_cameras = find_wrong_cameras(
-            calibration_prior(model), model.state, result.certainty, result.directions
-        )
+        known = calibration_prior(model), model.state, result.certainty, result.directions
+        result.wrong_cameras = find_wrong_cameras(*known)
+        result.wrong_pair = find_wrong_pair(*known)
     return result
 
 
@@ -211,16 +222,24 @@ def _hold_unobserved(
     """
     assert result.directions is not None
     result.held = result.directions.to_hold
+    terms = _terms(model, positions, result)
     result.adjustments.append(
         model.adjust(
             free_units,
             free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
             free_focal=result.focal_free,
-            terms=_terms(model, positions, result),
+            terms=terms,
             options=_options(model, result.sigma_px, iterations=40),
             cancel=cancel,
         )
     )
+    _settle(model, result, terms)
+
+
+def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
+    several = not model.drive.has_single_camera
+    if result.calibration.free and several and terms and model.config.adjustment.camera_set_adjustment:
+        settle_scale(model, terms)
 
 
 def _options(model: Model, sigma_px: float, *, iterations: int) -> SolverOptions:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.problem import ShotMotion
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.local_motion import LocalMotion, local_motion, smoothed_velocity
+from mrasfm_engine.geometry.local_motion import LocalMotion, local_motion, moved, smoothed_velocity
 from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.scene.state import State
 
@@ -64,6 +64,11 @@ class RigMotion:
         From now on it stays as it is; rows of a rolling shutter still move about it.
         """
         self._own[image], self._unit_from_image[image] = True, unit_from_image
+
+    def forget_image_poses(self, images: Ints) -> None:
+        """Let images stand where their unit's motion says again."""
+        self._own[images] = False
+        self._unit_from_image[images] = np.eye(4)
 
     @property
     def own_poses(self) -> tuple[Bools, Floats]:
@@ -121,17 +126,17 @@ class RigMotion:
         """Set `unit_from_shot` of a unit that has no pose yet: it moves as its registered neighbours do."""
         if state.simultaneous:
             return
-        twist = self._prior_velocity[unit]
+        velocity = self._prior_velocity[unit]
         known = np.flatnonzero(registered)
         nearest = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
         if len(nearest) == 2:
             pair = np.sort(nearest)
             around = local_motion(state.world_from_rig[pair], self._time_s[pair], np.ones(2, dtype=np.bool_))
             if around.known.all():
-                twist = around.velocity[0]
+                velocity = around.velocity[0]
         rows = self._shots_of(np.array([unit]))
-        moved = se3.exp_se3(self.shots.time_offset_s[rows, None] * twist)
-        self._write(state, rows, moved, se3.exp_se3(self._offset_of_image(rows)[:, None] * twist))
+        at_shot = moved(self.shots.time_offset_s[rows, None] * velocity)
+        self._write(state, rows, at_shot, moved(self._offset_of_image(rows)[:, None] * velocity))
 
     def unit_from_image(self, state: State) -> Floats:
         """The rig's poses (images, 4, 4) at the images' own timestamps, relative to their units'."""
@@ -173,16 +178,17 @@ class RigMotion:
 
     def _apply(self, state: State, motion: LocalMotion, rows: Ints) -> float:
         unit, before = self.shots.unit[rows], state.shot_position_m[rows]
-        moved = motion.at(unit, self.shots.time_offset_s[rows])
-        self._write(state, rows, moved, None if not self._own.any() else motion.at(unit, self._offset_of_image(rows)))
+        at_shot = motion.at(unit, self.shots.time_offset_s[rows])
+        self._write(state, rows, at_shot, None if not self._own.any() else motion.at(unit, self._offset_of_image(rows)))
         return float(np.linalg.norm(state.shot_position_m[rows] - before, axis=1).max(initial=0.0))
 
-    def _write(self, state: State, rows: Ints, moved: Floats, at_image: Floats | None) -> None:
+    def _write(self, state: State, rows: Ints, at_shot: Floats, at_image: Floats | None) -> None:
         own = self._own[self.shots.image[rows]]
         if at_image is not None and own.any():
-            moved = moved.copy()
-            moved[own] = self._unit_from_image[self.shots.image[rows[own]]] @ se3.inverse(at_image[own]) @ moved[own]
-        state.shot_rotation[rows], state.shot_position_m[rows] = moved[:, :3, :3], moved[:, :3, 3]
+            at_shot = at_shot.copy()
+            own_pose = self._unit_from_image[self.shots.image[rows[own]]]
+            at_shot[own] = own_pose @ se3.inverse(at_image[own]) @ at_shot[own]
+        state.shot_rotation[rows], state.shot_position_m[rows] = at_shot[:, :3, :3], at_shot[:, :3, 3]
 
 
 def _with_neighbours(units: Ints, registered: Bools) -> Ints:

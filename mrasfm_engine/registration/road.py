@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource
-from mrasfm_engine.scene.semantics import ROAD
+from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from mrasfm_engine.triangulation.road_prior import points_below_the_way, standing_is_impossible
 from mrasfm_engine.triangulation.road_surface import FittedRoad, fit_road
 from mrasfm_engine.triangulation.triangulate import cam_from_world
@@ -65,12 +65,12 @@ def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
     world_from_rig = model.state.world_from_rig[model.registered]
     source, tracks = RoadSource.MASKS, np.flatnonzero(model.solved & (model.track_class == ROAD))
     if not (model.track_class == ROAD).any():
-        if model.keypoints.classes.any():
+        if _all_images_are_masked(model):
             return "no keypoint lies on the road of the masks"
         if not final:
             return "without masks, the road is judged in the finished scene only: too unsure to bear on poses"
         source = RoadSource.GEOMETRY
-        tracks = np.flatnonzero(model.solved)
+        tracks = np.flatnonzero(model.solved & (model.track_class == UNKNOWN))
         below = points_below_the_way(model.state.points_m[tracks], world_from_rig, _lowest_camera_m(model))
         if below is None:
             return "without masks, no points lie on one level below the vehicle's way"
@@ -142,6 +142,12 @@ def height_sigmas_m(model: Model, tracks: Ints, world_from_rig: Floats) -> Float
     variance = np.maximum(covariance @ up @ up, 0.0)
     result: Floats = np.sqrt(variance)
     return result
+
+
+def _all_images_are_masked(model: Model) -> bool:
+    """Whether every image with keypoints has some of a known class: an image without a mask has none."""
+    image, classes = model.keypoints.image, model.keypoints.classes
+    return len(np.unique(image[classes != UNKNOWN])) == len(np.unique(image))
 
 
 def _lowest_camera_m(model: Model) -> float:

@@ -68,7 +68,7 @@ def build_scene(
         features=list(features),
         pairs=list(pairs),
         georeference=prior.georeference if georeferenced else None,
-        rough_world_from_local=None if georeferenced else prior.rough_world_from_local,
+        rough_world_from_local=prior.rough_world_from_local if refinement.placed_by_rough_poses else None,
         notes=list(notes),
         unit_from_image=None if model.state.simultaneous else model.motion.unit_from_image(model.state),
         point_classes=majority_class(model.keypoints.classes[rows], point.astype(np.int64), len(tracks)),

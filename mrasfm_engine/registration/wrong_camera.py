@@ -38,6 +38,35 @@ class WrongCamera:
     others_translation_m: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class WrongPair:
+    """Two cameras that stand or look otherwise to each other than given: which of them is wrong, nothing tells."""
+
+    rotation_deg: float
+    translation_m: float
+
+
+def find_wrong_pair(
+    prior: CalibrationPrior, state: State, certainty: Covariances, directions: Observability
+) -> WrongPair | None:
+    """Of a rig of two cameras, whether they are off against each other by more than their prior can be."""
+    corrections = np.where(directions.observed, prior.corrections(state), 0.0)
+    if len(corrections) != 2:
+        return None
+    sigma, posterior = _sigmas(prior, directions)
+    if not any(
+        _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=np.inf)
+        for c in range(2)
+        for part in (slice(0, 3), slice(3, 6))
+    ):
+        return None
+    between = corrections[1] - corrections[0]
+    return WrongPair(
+        rotation_deg=float(np.degrees(np.linalg.norm(between[:3]))),
+        translation_m=float(np.linalg.norm(between[3:])),
+    )
+
+
 def find_wrong_cameras(
     prior: CalibrationPrior, state: State, certainty: Covariances, directions: Observability
 ) -> list[WrongCamera]:
@@ -46,13 +75,13 @@ def find_wrong_cameras(
     Only directions count that the drive observes.
     """
     corrections = prior.corrections(state)
+    if len(corrections) == 2:
+        return []  # they share the correction of their pair: see `find_wrong_pair`
     if len(corrections) > MIN_OTHERS:
         # What all cameras share is held, not observed, and one that is wrong has its part in how it is held.
         corrections = corrections - np.median(corrections, axis=0)
     corrections = np.where(directions.observed, corrections, 0.0)
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    # The common scale may be off: it moves all cameras, and is no fault of one.
-    posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+    sigma, posterior = _sigmas(prior, directions)
     found = []
     for c in range(len(corrections)):
         verdicts = [
@@ -74,6 +103,13 @@ def find_wrong_cameras(
             )
         )
     return found
+
+
+def _sigmas(prior: CalibrationPrior, directions: Observability) -> tuple[Floats, Floats]:
+    """Standard deviations (c, 6) of corrections before and after the drive."""
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    # The common scale may be off: it moves all cameras, and is no fault of one.
+    return sigma, np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
 
 
 def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:
@@ -100,4 +136,15 @@ def finding(name: str, wrong: WrongCamera) -> Finding:
         f"rig.cameras says; the other cameras by {wrong.others_rotation_deg:.2f} deg and "
         f"{wrong.others_translation_m:.3f} m as a rule",
         "It was recalibrated: take its pose from calibration.json, and check how it is mounted.",
+    )
+
+
+def pair_finding(names: Sequence[str], wrong: WrongPair) -> Finding:
+    """What a user is told of a wrong pair."""
+    return warning(
+        "camera-miscalibrated",
+        f"cameras {names[0]} and {names[1]} are turned by {wrong.rotation_deg:.2f} deg and moved by "
+        f"{wrong.translation_m:.3f} m against each other from where rig.cameras says; which of them is wrong, two "
+        "cameras do not tell",
+        "They were recalibrated: take their poses from calibration.json, and check how both are mounted.",
     )

@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFeatures:
-    """Keypoints of one image, strongest first.
+    """Keypoints of one image, those first that are worth most: the strongest, or those that cover the image best.
 
     xy_px has COLMAP's convention: the centre of the top left pixel is at (0.5, 0.5).
     """

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SMALLEST_INFORMATION = 1e-12  # keeps points with parallel rays invertible; their sigma is then a kilometre
+SMALLEST_INFORMATION = 1e-12  # of a point that nothing observes
+REGULAR = 1e-9  # of the largest information: keeps points with parallel rays invertible
 
 
 def point_covariances(
@@ -38,6 +39,6 @@ def point_covariances(
             information[:, i, j] = information[:, j, i] = np.bincount(point, entry, minlength=len(points_m))
     # In units of each point's largest information, so that near and far points are equally well conditioned.
     scale = np.maximum(np.trace(information, axis1=1, axis2=2), SMALLEST_INFORMATION)
-    regular = information / scale[:, None, None] + 1e-9 * np.eye(3)
+    regular = information / scale[:, None, None] + REGULAR * np.eye(3)
     result: Floats = np.linalg.inv(regular) / scale[:, None, None]
     return result

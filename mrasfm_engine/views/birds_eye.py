@@ -20,11 +20,11 @@ from mrasfm_engine.geometry.camera_model import pack_camera
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import class_codes, usable_pixels
-from mrasfm_engine.views.agreement import Agreement, measure_agreement
+from mrasfm_engine.views.agreement import FINE_CELL_M, Agreement, measure_agreement, plots_along
 from mrasfm_engine.views.drawing import Framed, framed
 from mrasfm_engine.views.exposure import camera_gains, exposure_gains
 from mrasfm_engine.views.ground import GroundHeights, estimate_ground
-from mrasfm_engine.views.mosaic import GIVEN, REFINED, Grid, Mosaic, View, make_mosaic
+from mrasfm_engine.views.mosaic import GIVEN, REFINED, Grid, Mosaic, View, make_mosaics
 from schemas import LabelMap, SemanticClass
 
 Floats = NDArray[np.float64]
@@ -72,12 +72,13 @@ def birds_eye(scene: Scene, *, seed: int = 0, progress: Callable[[int, int], Non
     )
     if ground is None:
         return BirdsEye(report={"not_drawn": "too few points of the scene lie on the ground along the way"})
-    mosaic = _mosaic_of(scene, plan_from_world, ground, progress)
+    way_m = plan_from_rig[:, :2, 3]
+    mosaic, *plots = _mosaics_of(scene, plan_from_world, ground, way_m, progress)
     if not mosaic.images_used:
         return BirdsEye(report={"not_drawn": "no camera sees the road"})
-    agreement = measure_agreement(mosaic, plan_from_rig[:, :2, 3])
+    agreement = measure_agreement(plots or [mosaic], way_m)
     before, after = (_picture(scene, mosaic, which, agreement, plan_from_world) for which in (GIVEN, REFINED))
-    level_m = float(np.median(ground.height_m(plan_from_rig[:, :2, 3])))
+    level_m = float(np.median(ground.height_m(way_m)))
     report = _report(scene, mosaic, agreement)
     report["world_from_pixel"] = _world_from_pixel(mosaic, se3.inverse(plan_from_world), after.top_px, level_m).tolist()
     return BirdsEye(pictures={BEFORE: before.picture, AFTER: after.picture}, report=report)
@@ -104,9 +105,14 @@ def _plan_from_world(scene: Scene) -> Floats:
     return se3.transform(rotation, -rotation @ poses[:, :3, 3].mean(0))
 
 
-def _mosaic_of(
-    scene: Scene, plan_from_world: Floats, ground: GroundHeights, progress: Callable[[int, int], None] | None
-) -> Mosaic:
+def _mosaics_of(
+    scene: Scene,
+    plan_from_world: Floats,
+    ground: GroundHeights,
+    way_m: Floats,
+    progress: Callable[[int, int], None] | None,
+) -> list[Mosaic]:
+    """That of the picture, and where its cells are too coarse to compare cameras, those of fine plots along the way."""
     images = _nearest_first(scene)
     refined = scene.world_from_cam
     gains = exposure_gains(scene)
@@ -133,14 +139,21 @@ def _mosaic_of(
         if progress is not None:
             progress(done, len(views))
 
-    return make_mosaic(
+    return make_mosaics(
         views,
-        Grid.around(np.stack([v.plan_from_rig[:2, 3] for v in views])),
+        grids_along(way_m),
         ground,
         lambda index: _read(scene, int(images[index])),
         own_car_m=_own_car_m(scene),
         step=step,
     )
+
+
+def grids_along(way_m: Floats) -> list[Grid]:
+    """The grid of the picture around a way (n, 2), and where its cells are too coarse to compare cameras, fine plots
+    along the way."""
+    grid = Grid.around(way_m)
+    return [grid, *(plots_along(way_m) if grid.cell_m > FINE_CELL_M else [])]
 
 
 def _own_car_m(scene: Scene) -> Floats | None:
@@ -249,7 +262,7 @@ def _report(scene: Scene, mosaic: Mosaic, agreement: tuple[Agreement, Agreement]
         "calibration_changed": calibration_changed(scene),
     }
     if agreement is None:
-        return result | {"not_compared": "too little textured ground is seen by two cameras"}
+        return result | {"not_compared": "too little textured ground near the way is seen by two cameras"}
     for name, of in zip(("before", "after"), agreement, strict=True):
         result[name] = {"blocks": of.blocks, "correlation": of.correlation, "displaced_blocks": of.displaced_blocks}
         if np.isfinite(of.displacement_m):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -26,7 +27,10 @@ HYPOTHESES = 400
 STATION_M = 2.0  # between the patches
 PATCH_RADIUS_M = 8.0
 BLEND_SIGMA_M = 3.0
+BLENDED_PATCHES = 24  # at one place: all within four sigmas of a way that goes there twice
 SMALLEST_WEIGHT = 0.01
+HEIGHT_STEP_M = 0.5  # of the grid on which heights are interpolated
+TILE_STEPS = 16
 LOSS_SCALE = 1.5  # in sigmas
 POINT_SIGMA_M = 0.03  # of a ground point's height; its triangulation and the road's unevenness
 # How far a patch may be from where the rig's plane puts it: the car pitches, the road bends.
@@ -43,19 +47,55 @@ class GroundHeights(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class GroundPatches:
-    """Planes `z = p0 + p1 (x - x_centre) + p2 (y - y_centre)` along the way, blended by distance."""
+    """Planes `z = p0 + p1 (x - x_centre) + p2 (y - y_centre)` along the way, the nearest ones blended by distance."""
 
     centre_m: Floats  # (k, 2)
     plane: Floats  # (k, 3) height at the centre in metres, and two slopes
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.centre_m)
+
     def height_m(self, xy_m: Floats) -> Floats:
-        """See `GroundHeights`."""
-        offset = xy_m[:, None] - self.centre_m[None]
-        exponent = -0.5 * (offset**2).sum(-1) / BLEND_SIGMA_M**2
-        weight = np.exp(exponent - exponent.max(1, keepdims=True))
-        height = self.plane[:, 0] + offset[..., 0] * self.plane[:, 1] + offset[..., 1] * self.plane[:, 2]
+        """See `GroundHeights`; takes as long for a long way as for a short one."""
+        count = min(BLENDED_PATCHES, len(self.centre_m))
+        distance, nearest = (np.reshape(a, (len(xy_m), count)) for a in self._tree.query(xy_m, k=count))
+        offset, plane = xy_m[:, None] - self.centre_m[nearest], self.plane[nearest]
+        weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / BLEND_SIGMA_M**2)
+        height = plane[..., 0] + (offset * plane[..., 1:]).sum(-1)
         result: Floats = (weight * height).sum(1) / weight.sum(1)
         return result
+
+
+class GroundTiles:
+    """Heights at the corners of squares of `HEIGHT_STEP_M`, computed where they are first asked for.
+
+    So they cost time and memory by the length of the way, and not by the rectangle that it fits into.
+    """
+
+    def __init__(self, ground: GroundHeights) -> None:
+        self._ground = ground
+        self._tiles: dict[tuple[int, int], Floats] = {}
+
+    def around(self, centre_m: Floats, reach_m: float) -> tuple[Floats, Floats]:
+        """Heights (rows, columns), y growing with the rows, that cover the square of `reach_m` around a place (2,).
+
+        And x and y (2,) of the first one.
+        """
+        side_m = TILE_STEPS * HEIGHT_STEP_M
+        low = np.floor((centre_m - reach_m) / side_m).astype(int)
+        # One step more: interpolation asks for the corner after the place.
+        high = np.floor((centre_m + reach_m + HEIGHT_STEP_M) / side_m).astype(int)
+        tiles = [[self._tile(i, j) for i in range(low[0], high[0] + 1)] for j in range(low[1], high[1] + 1)]
+        return np.block(tiles), low * side_m
+
+    def _tile(self, i: int, j: int) -> Floats:
+        if (i, j) not in self._tiles:
+            steps = np.arange(TILE_STEPS)
+            x, y = np.meshgrid(*(HEIGHT_STEP_M * (TILE_STEPS * n + steps) for n in (i, j)))
+            height = self._ground.height_m(np.column_stack([x.ravel(), y.ravel()]))
+            self._tiles[i, j] = height.reshape(TILE_STEPS, TILE_STEPS)
+        return self._tiles[i, j]
 
 
 def estimate_ground(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project, unproject_pixels
-from mrasfm_engine.views.ground import GroundHeights
+from mrasfm_engine.views.ground import HEIGHT_STEP_M, GroundHeights, GroundTiles
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -30,9 +30,9 @@ GIVEN, REFINED = 0, 1
 RADIUS_M = 12.0  # beside the way
 VIEW_M = 15.0  # how far from a camera its image is used
 MIN_CELL_M = 0.025
-MAX_CELLS = 12_000_000  # bounds the picture, and memory to some 300 MB
+MAX_CELLS = 12_000_000  # bounds the picture, and what a mosaic holds to 22 bytes times that
+MAX_SIDE_CELLS = 16_000  # with its frame it stays below 16384 pixels: browsers and graphics cards show no more
 MIN_RESOLUTION_PX = 5.0  # of an image on the ground, pixels a metre along the line of sight
-HEIGHT_STEP_M = 0.5  # of the grid on which heights are interpolated
 OWN_CAR_LEVEL = 0.5  # of the cameras' height: up to there the car's body hides the ground
 FOOTPRINT_MARGIN_M = 1.0  # around where the corners of an image meet the ground: it is not level
 PREFETCHED = 3  # images that wait decoded
@@ -50,11 +50,30 @@ class Grid:
 
     @staticmethod
     def around(position_m: Floats, *, max_cells: int = MAX_CELLS) -> Grid:
-        """The grid that covers the ground up to `RADIUS_M` around positions (n, 2)."""
+        """The grid that covers the ground up to `RADIUS_M` around positions (n, 2).
+
+        Its cells are as small as `max_cells` in all and `MAX_SIDE_CELLS` a side permit.
+        """
         low, high = position_m.min(0) - RADIUS_M, position_m.max(0) + RADIUS_M
-        cell = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / max_cells)))
-        columns, rows = np.floor((high - low) / cell).astype(int)
+        size = high - low
+        cell = max(MIN_CELL_M, float(np.sqrt(np.prod(size) / max_cells)), float(size.max()) / MAX_SIDE_CELLS)
+        columns, rows = np.maximum(np.floor(size / cell).astype(int), 1)
         return Grid(left_m=float(low[0]), top_m=float(high[1]), cell_m=cell, rows=int(rows), columns=int(columns))
+
+    @staticmethod
+    def square(centre_m: Floats, *, side_m: float) -> Grid:
+        """The finest grid around a place (2,)."""
+        cells = round(side_m / MIN_CELL_M)
+        left, top = float(centre_m[0]) - side_m / 2, float(centre_m[1]) + side_m / 2
+        return Grid(left_m=left, top_m=top, cell_m=MIN_CELL_M, rows=cells, columns=cells)
+
+    def within(self, low_m: Floats, high_m: Floats) -> NDArray[np.int64]:
+        """Cells in a rectangle between two corners (2,): [first row, row after the last, first column, column after
+        the last]."""
+        first = (self.top_m - high_m[1]) / self.cell_m, (low_m[0] - self.left_m) / self.cell_m
+        last = (self.top_m - low_m[1]) / self.cell_m, (high_m[0] - self.left_m) / self.cell_m
+        sides = zip(first, last, (self.rows, self.columns), strict=True)
+        return np.concatenate([np.clip([lo, hi], 0, n) for lo, hi, n in sides]).astype(np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,16 +115,16 @@ class Mosaic:
         return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def make_mosaic(
+def make_mosaics(
     views: Sequence[View],
-    grid: Grid,
+    grids: Sequence[Grid],
     ground: GroundHeights,
     read: Callable[[int], tuple[Bytes, Bools | None]],
     *,
     own_car_m: Floats | None,
     step: Callable[[int], None] = lambda done: None,
-) -> Mosaic:
-    """Paint the ground with all views; every image is read once.
+) -> list[Mosaic]:
+    """Paint the ground of every grid with all views; every image is read once.
 
     Parameters
     ----------
@@ -116,20 +135,24 @@ def make_mosaic(
     step
         Called after every view with how many are done; may raise.
     """
+    mosaics = [_empty(grid) for grid in grids]
+    heights = GroundTiles(ground)
+    used = np.zeros(len(grids), dtype=np.int64)
+    for done, (index, rgb, usable) in enumerate(_read_ahead(len(views), read), 1):
+        used += _paint_view(mosaics, views[index], rgb, usable, heights, own_car_m)
+        step(done)
+    return [replace(mosaic, images_used=int(n)) for mosaic, n in zip(mosaics, used, strict=True)]
+
+
+def _empty(grid: Grid) -> Mosaic:
     shape = (2, grid.rows, grid.columns)
-    mosaic = Mosaic(
+    return Mosaic(
         grid=grid,
         owner=np.zeros(shape, np.uint8),
         score=np.zeros(shape, np.float32),
         color=np.zeros((2, *shape, 3), np.uint8),
         images_used=0,
     )
-    heights = _height_grid(grid, ground)
-    used = 0
-    for done, (index, rgb, usable) in enumerate(_read_ahead(len(views), read), 1):
-        used += _paint_view(mosaic, views[index], rgb, usable, heights, own_car_m)
-        step(done)
-    return Mosaic(**{**mosaic.__dict__, "images_used": used})
 
 
 def _read_ahead(
@@ -149,19 +172,6 @@ def _read_ahead(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _height_grid(grid: Grid, ground: GroundHeights) -> Floats:
-    """Heights at the corners of squares of `HEIGHT_STEP_M`, beginning at the grid's top left."""
-    columns = int(grid.columns * grid.cell_m / HEIGHT_STEP_M) + 2
-    rows = int(grid.rows * grid.cell_m / HEIGHT_STEP_M) + 2
-    x = grid.left_m + HEIGHT_STEP_M * np.arange(columns)
-    return np.stack(
-        [
-            ground.height_m(np.column_stack([x, np.full(columns, grid.top_m - HEIGHT_STEP_M * row)]))
-            for row in range(rows)
-        ]
-    )
-
-
 def widest_angle(kind: int, params: Floats, size_px: tuple[int, int]) -> float:
     """Tangent of the largest angle between the axis and a pixel of the image's border.
 
@@ -178,64 +188,78 @@ def widest_angle(kind: int, params: Floats, size_px: tuple[int, int]) -> float:
 
 
 def _paint_view(
-    mosaic: Mosaic, view: View, rgb: Bytes, usable: Bools | None, heights: Floats, own_car_m: Floats | None
-) -> int:
-    """Paint one view; 1 where it sees any ground, else 0."""
-    grid, centre = mosaic.grid, view.plan_from_cam[REFINED][:3, 3]
-    bounds = _footprint(view, grid, heights)
-    painted = _paint(
-        rgb,
-        np.ones((1, 1), np.bool_) if usable is None else usable,
-        usable is not None,
-        np.ascontiguousarray(se3.inverse(view.plan_from_cam)[:, :3]),
-        centre,
-        np.ascontiguousarray(se3.inverse(view.plan_from_rig)[:2]),
-        np.zeros((2, 2)) if own_car_m is None else own_car_m,
-        view.kind,
-        view.params,
-        widest_angle(view.kind, view.params[REFINED], view.size_px),
-        view.gain,
-        view.camera + 1,
-        heights,
-        np.array([grid.left_m, grid.top_m, grid.cell_m]),
-        bounds,
-        mosaic.owner,
-        mosaic.score,
-        mosaic.color,
-    )
-    return int(painted > 0)
+    mosaics: Sequence[Mosaic],
+    view: View,
+    rgb: Bytes,
+    usable: Bools | None,
+    ground: GroundTiles,
+    own_car_m: Floats | None,
+) -> NDArray[np.int64]:
+    """Paint one view; for every mosaic 1 where it sees any of its ground, else 0."""
+    centre = view.plan_from_cam[REFINED][:3, 3]
+    coarsest_m = max((mosaic.grid.cell_m for mosaic in mosaics), default=0.0)
+    heights, first = ground.around(centre[:2], VIEW_M + FOOTPRINT_MARGIN_M + coarsest_m)
+    used = np.zeros(len(mosaics), dtype=np.int64)
+    footprint = _footprint(view, float(heights.min()))
+    if footprint is None:
+        return used
+    cam_from_plan = np.ascontiguousarray(se3.inverse(view.plan_from_cam)[:, :3])
+    rig_from_plan = np.ascontiguousarray(se3.inverse(view.plan_from_rig)[:2])
+    widest = widest_angle(view.kind, view.params[REFINED], view.size_px)
+    for k, mosaic in enumerate(mosaics):
+        grid, bounds = mosaic.grid, mosaic.grid.within(*footprint)
+        if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
+            continue
+        painted = _paint(
+            rgb,
+            np.ones((1, 1), np.bool_) if usable is None else usable,
+            usable is not None,
+            cam_from_plan,
+            centre,
+            rig_from_plan,
+            np.zeros((2, 2)) if own_car_m is None else own_car_m,
+            view.kind,
+            view.params,
+            widest,
+            view.gain,
+            view.camera + 1,
+            heights,
+            np.array([grid.left_m, grid.top_m, grid.cell_m, *first]),
+            bounds,
+            mosaic.owner,
+            mosaic.score,
+            mosaic.color,
+        )
+        used[k] = painted > 0
+    return used
 
 
-def _footprint(view: View, grid: Grid, heights: Floats) -> NDArray[np.int64]:
-    """Rows and columns [first row, row after the last, first column, column after the last] that the image may show."""
+def _footprint(view: View, lowest_m: float) -> tuple[Floats, Floats] | None:
+    """Corners (2,) of the rectangle of ground, nowhere below `lowest_m`, that the image may show; None for none."""
     width, height = view.size_px
     u, v = np.meshgrid(np.linspace(0, width, 25), np.linspace(0, height, 17))
     rays = unproject_pixels(view.kind, view.params[REFINED], np.column_stack([u.ravel(), v.ravel()]))
     pose = view.plan_from_cam[REFINED]
     rays = rays @ pose[:3, :3].T
     rays = rays[rays[:, 2] < 0]
-    above = max(float(pose[2, 3] - heights.min()), 0.1)
+    if not len(rays):
+        return None
+    above = max(float(pose[2, 3]) - lowest_m, 0.1)
     flat = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
     reach = np.minimum(above * flat / -rays[:, 2], VIEW_M)
     at = pose[:2, 3] + rays[:, :2] * (reach / flat)[:, None]
-    if not len(at):
-        return np.zeros(4, dtype=np.int64)
-    low, high = at.min(0) - FOOTPRINT_MARGIN_M, at.max(0) + FOOTPRINT_MARGIN_M
-    first = (grid.top_m - high[1]) / grid.cell_m, (low[0] - grid.left_m) / grid.cell_m
-    last = (grid.top_m - low[1]) / grid.cell_m, (high[0] - grid.left_m) / grid.cell_m
-    rows, columns = (np.clip([lo, hi], 0, n) for lo, hi, n in zip(first, last, (grid.rows, grid.columns), strict=True))
-    return np.concatenate([rows, columns]).astype(np.int64)
+    return at.min(0) - FOOTPRINT_MARGIN_M, at.max(0) + FOOTPRINT_MARGIN_M
 
 
 @njit(cache=True, inline="always")
-def _height_at(heights: Any, right_m: float, down_m: float) -> float:
+def _height_at(heights: Any, right_m: float, up_m: float) -> float:
     """Bilinear between the corners of the height grid."""
-    a, b = down_m / HEIGHT_STEP_M, right_m / HEIGHT_STEP_M
+    a, b = up_m / HEIGHT_STEP_M, right_m / HEIGHT_STEP_M
     i, j = int(a), int(b)
     a, b = a - i, b - j
-    top = heights[i, j] * (1 - b) + heights[i, j + 1] * b
-    bottom = heights[i + 1, j] * (1 - b) + heights[i + 1, j + 1] * b
-    return float(top * (1 - a) + bottom * a)
+    here = heights[i, j] * (1 - b) + heights[i, j + 1] * b
+    next_up = heights[i + 1, j] * (1 - b) + heights[i + 1, j + 1] * b
+    return float(here * (1 - a) + next_up * a)
 
 
 @njit(cache=True, inline="always")
@@ -279,7 +303,7 @@ def _paint(
     owner: Any, score: Any, color: Any,
 ) -> int:  # fmt: skip
     """Colour the cells that the image sees better than what is there; how many."""
-    left, top, cell = place[0], place[1], place[2]
+    left, top, cell, first_x, first_y = place[0], place[1], place[2], place[3], place[4]
     height, width = rgb.shape[0], rgb.shape[1]
     focal = math.sqrt(params[1, 0] * params[1, 1])
     work, pixel, cam = np.empty(6), np.empty(8), np.empty(3)
@@ -288,7 +312,7 @@ def _paint(
         y = top - (row + 0.5) * cell
         for column in range(bounds[2], bounds[3]):
             x = left + (column + 0.5) * cell
-            z = _height_at(heights, x - left, top - y)
+            z = _height_at(heights, x - first_x, y - first_y)
             dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
             d2 = dx * dx + dy * dy + above * above
             if d2 > VIEW_M * VIEW_M:

@@ -13,6 +13,7 @@ from tests.benchmarks.commands import evaluate, mrasfm
 from tests.benchmarks.table import Figure, exactly
 
 CAMERAS, UNITS = 6, 40
+SIZE = ("--width", 640, "--height", 360)  # the time of the whole run is bounded
 WAY = ("--world", "turn", "--speed-profile", "varying")
 SKEW_MS = 50
 FLOOR_M = 0.02  # errors below this are as good as none
@@ -26,7 +27,7 @@ def motion(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
         drives = {}
         for name, skew_ms in (("simultaneous", 0), ("apart", SKEW_MS)):
             drives[name] = work / f"motion {seed} {name}"
-            size = ("--cameras", CAMERAS, "--units", UNITS, "--seed", seed)
+            size = ("--cameras", CAMERAS, "--units", UNITS, *SIZE, "--seed", seed)
             mrasfm("synth", *size, *WAY, "--time-skew-ms", skew_ms, "--out", drives[name])
         yield from compared(drives["simultaneous"], drives["apart"], work, seed)
         for folder in work.glob(f"motion {seed} *"):

@@ -19,12 +19,12 @@ from tests.benchmarks.table import Figure, exactly
 from tests.benchmarks.true_information import ExactScene, camera_information, expected_directions
 
 CAMERAS, UNITS = 6, 40
+SIZE = ("--width", 640, "--height", 360)  # the time of the whole run is bounded
 WRONG = ("front", "front_left", "front_right", "back_left", "back_right", "back")  # by seed
 WRONG_BY_DEG = 3.0
 MAX_WRONG_DEG, MAX_OTHERS_DEG = 0.1, 0.05
 
 STRAIGHT_UNITS = 92  # of 1.1 m: 100 m
-STRAIGHT_SIZE = ("--width", 640, "--height", 360)  # the time of the whole run is bounded
 SIGMA_DEG, SIGMA_M = 0.1, 0.005  # declared, and true, for each axis
 GNSS_NOISE_M, VERTICAL = 0.8, 1.5
 GNSS = ("--gnss-noise-m", GNSS_NOISE_M, "--gnss-drift-m", 0, "--gnss-bias-m", 0, "--gnss-outliers", 0.05)
@@ -40,7 +40,7 @@ def recalibration(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
         drive, scene = work / f"wrong {seed}", work / f"wrong {seed} scene"
         name = WRONG[seed % len(WRONG)]
         mrasfm(
-            "synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", seed, "--no-masks",
+            "synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", seed, "--no-masks", *SIZE,
             "--wrong-camera", name, "--wrong-by-deg", WRONG_BY_DEG, "--out", drive,
         )  # fmt: skip
         yield from wrong_camera(drive, scene, name, seed)
@@ -54,7 +54,7 @@ def recalibration(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
         )  # fmt: skip
         mrasfm(
             "synth", "--cameras", CAMERAS, "--units", STRAIGHT_UNITS, "--seed", seed, "--straight", "--no-masks",
-            *STRAIGHT_SIZE, *GNSS, *perturbation, "--declare-sigmas", "--out", drive,
+            *SIZE, *GNSS, *perturbation, "--declare-sigmas", "--out", drive,
         )  # fmt: skip
         yield from straight(drive, scene, seed)
         for folder in (drive, scene):

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from mrasfm_engine.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from tests.integration.conftest import Ran, Variant, leftovers, mrasfm_process, read_report
 
@@ -56,6 +58,7 @@ def test_full_disk(variant: Variant) -> None:
     assert list(variant.scene.rglob("*.npz")) == []
 
 
+@pytest.mark.slow
 def test_disk_fills_while_the_scene_is_written(surround_drive: Path, variant: Variant, mrasfm: Run) -> None:
     """The stages are kept, and of the scene there is nothing."""
     variant.keep(cameras=["front", "left"], units=3).save()

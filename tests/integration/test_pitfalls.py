@@ -6,6 +6,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from tests.integration.conftest import Ran, Variant, read_report, synth
 
 Run = Callable[..., Ran]
@@ -20,6 +22,7 @@ def reconstructed(run: Run, drive: Path, scene: Path, *options: str) -> dict:  #
     return errors
 
 
+@pytest.mark.slow
 def test_standing_car_and_missing_images(tmp_path: Path, mrasfm: Run) -> None:
     drive = synth(
         tmp_path / "drive", "--cameras", 3, "--units", 10, "--standing", 4, "--drop-images", 0.15, "--seed", 5
@@ -43,6 +46,7 @@ def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None
     assert 0 < abs(errors["similarity"]["scale"] - 1) < 3 * sigma < 1
 
 
+@pytest.mark.slow
 def test_cameras_that_are_not_simultaneous(tmp_path: Path, mrasfm: Run) -> None:
     drive = synth(tmp_path / "drive", "--cameras", 3, "--units", 6, "--time-skew-ms", 40, "--seed", 7)
     errors = reconstructed(mrasfm, drive, tmp_path / "scene")
@@ -50,6 +54,7 @@ def test_cameras_that_are_not_simultaneous(tmp_path: Path, mrasfm: Run) -> None:
     assert 0 < errors["metric"]["rmse_m"] < 1.0  # not compensated: up to 0.2 m of way between cameras
 
 
+@pytest.mark.slow
 def test_opposite_gnss_outliers(variant: Variant, mrasfm: Run) -> None:
     """Two samples that are 55 m off in opposite directions, whose mean looks right."""
     samples = variant.document["gnss"]["samples"]
@@ -65,6 +70,7 @@ def test_opposite_gnss_outliers(variant: Variant, mrasfm: Run) -> None:
     assert 0 < refinement["gnss"]["residual_rms_m"] < 2.0
 
 
+@pytest.mark.slow
 def test_gnss_that_jumps_for_good(variant: Variant, mrasfm: Run) -> None:
     """From one sample on, all are 75 m off: no place on the earth is better than the wrong one."""
     for sample in variant.document["gnss"]["samples"][4:]:

@@ -137,6 +137,7 @@ def service(tmp_path: Path) -> Iterator[Standalone]:
         made.process.wait()
 
 
+@pytest.mark.slow
 def test_kills(service: Standalone, drive: Path) -> None:
     """Of the stage, the worker, the API, the broker and of everything: each job ends in exactly one scene."""
     service.start()

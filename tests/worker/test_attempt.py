@@ -15,10 +15,12 @@ from mrasfm_engine.cli import main
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.preflight import check_manifest
+from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE, ModelFolder
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import BodyAxes, Pose
 from schemas.parsing import parse_manifest
 from service.settings import Settings
+from tests import learned_graphs
 from tests.worker.conftest import go_on, meter_of, settings_with
 from worker.messages import Work
 from worker.outcomes import Cancelled, Failed, Outcome, Succeeded
@@ -136,6 +138,21 @@ def test_unknown_setting(small_drive: Path, scratch: Path, settings: Settings) -
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable) == ("bad-settings", False)
     assert "gravity" in outcome.what
+
+
+def test_models_are_looked_for_where_the_worker_says(
+    small_drive: Path, scratch: Path, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a client is not told where that is."""
+    models = tmp_path / "models"
+    monkeypatch.setenv(FOLDER_VARIABLE, str(models))
+    outcome = attempt(small_drive, scratch, settings, segmentation_model="streets")
+    assert isinstance(outcome, Failed)
+    assert (outcome.code, outcome.retryable) == ("missing-model", False)
+    assert str(tmp_path) not in outcome.what + outcome.remedy
+    assert "the models' folder of the worker" in outcome.what
+    ModelFolder(models).add_data(learned_graphs.segmenter(), "streets", what="made here")
+    assert isinstance(attempt(small_drive, scratch, settings, segmentation_model="streets"), Succeeded)
 
 
 def test_drive_that_cannot_be_reconstructed(own_drive: Path, scratch: Path, settings: Settings) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import psutil
+import pytest
 
 from service.persistence.wakeups import Wakeups
 from tests.worker.service_world import World, wait_until
@@ -30,6 +31,7 @@ app.Worker(
 """
 
 
+@pytest.mark.slow
 def test_long_job_runs_once(make_world: Callable[..., World], brief_drive: Path) -> None:
     """Both installations hold a job for more than three timeouts; only where leases are renewed it is sent once."""
     renewed, other = (make_world(visibility_timeout_seconds=VISIBILITY_TIMEOUT_S) for _ in range(2))

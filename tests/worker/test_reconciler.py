@@ -68,6 +68,7 @@ def test_jobs_that_need_no_message(world: World, brief_drive: Path) -> None:
     assert queued(world) == 0
 
 
+@pytest.mark.slow
 def test_many_jobs_wait(world: World) -> None:
     """All of them get a message, whatever waits in front."""
     count = 2300

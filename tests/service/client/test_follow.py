@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import pytest
@@ -43,16 +43,21 @@ def note(percent: float, stage: str) -> jobs.ProgressNote:
     )
 
 
-def work_of(client: Client, job_id: str, told: list[JobNews]) -> Callable[[], None]:
+STEPS = ((10.0, "features"), (60.0, "mapping"))
+
+
+def work_of(
+    client: Client, job_id: str, told: list[JobNews], steps: Sequence[tuple[float, str]] = STEPS
+) -> Callable[[], None]:
     """A worker's part: progress, each step once the one before was told, then a scene."""
 
     def work() -> None:
         held = client.claim(job_id)
-        for percent, stage in ((10.0, "features"), (60.0, "mapping")):
+        for percent, stage in steps:
             with client.api.database.write() as session:
                 jobs.heartbeat(session, held, lease_us=60_000_000, note=note(percent, stage))
             end_s = time.monotonic() + 30
-            while not any(news.stage == stage for news in told) and time.monotonic() < end_s:
+            while not any(news.percent >= percent for news in told) and time.monotonic() < end_s:
                 time.sleep(0.02)
         client.publish(held, {"report.json": b"{}"})
 
@@ -74,9 +79,10 @@ def test_events_tell_every_step(client: Client, connect: Connect, job_id: str) -
 
 
 def test_breaking_streams_go_on_after_the_last_event(client: Client, connect: Connect, job_id: str) -> None:
-    cut = Cut(b"/events", answer_bytes=700, times=3)  # the head, and some events
+    cut = Cut(b"/events", answer_bytes=1000, times=3)  # the head, and some of the events
     told: list[JobNews] = []
-    with bad_network(client.api.url, cut) as network, meanwhile(work_of(client, job_id, told)):
+    steps = [(10.0 * i, "features") for i in range(1, 9)]
+    with bad_network(client.api.url, cut) as network, meanwhile(work_of(client, job_id, told, steps)):
         assert follow(connect(client, url=network.url), job_id, tell=told.append).state == "SUCCEEDED"
     assert b"last-event-id" not in cut.seen[0].lower()
     assert any(b"last-event-id" in head.lower() for head in cut.seen[1:])

@@ -169,6 +169,7 @@ def test_interrupted_while_waiting_the_job_goes_on(client: Client, drive: Path) 
     assert upload(client, drive, "--wait")[1]["job_id"] == job["id"]
 
 
+@pytest.mark.slow
 def test_the_service_killed_while_sending_and_while_waiting(killable: ApiProcess, large_drive: Path) -> None:
     client = killable.client()
     running = Upload(large_drive, "--wait", "--parallel", "1", url=killable.url, key=client.key)

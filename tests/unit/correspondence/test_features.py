@@ -18,13 +18,14 @@ WIDTH, HEIGHT = 800, 600
 
 def blobs(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """An image of round blobs and their centres, where the centre of the top left pixel is at (0.5, 0.5)."""
-    yy, xx = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image, centres = np.full((HEIGHT, WIDTH), 60.0), []
     for gy in range(40, HEIGHT - 40, 40):
         for gx in range(40, WIDTH - 40, 40):
             x, y = gx + rng.uniform(-5, 5), gy + rng.uniform(-5, 5)
             s = rng.uniform(1.2, 4.0)
-            image += 120 * np.exp(-((xx - x) ** 2 + (yy - y) ** 2) / (2 * s * s))
+            row, column = int(y) - 25, int(x) - 25  # what is farther off is less than a grey level
+            yy, xx = np.mgrid[row : row + 50, column : column + 50] + 0.5
+            image[row : row + 50, column : column + 50] += 120 * np.exp(-((xx - x) ** 2 + (yy - y) ** 2) / (2 * s * s))
             centres.append((x, y))
     return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, axis=2), np.array(centres)
 

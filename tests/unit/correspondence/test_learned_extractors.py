@@ -59,8 +59,8 @@ def aliked_whole() -> Detector:
 ALL = [xfeat_tiles, superpoint_tiles, superpoint_whole, aliked_whole]
 
 
-def extractor(make: MakeDetector, **settings: float) -> LearnedExtractor:
-    return LearnedExtractor(make(), FeatureConfig(refine=False, **settings))
+def extractor(make: MakeDetector, *, spread: bool = False, **settings: float) -> LearnedExtractor:
+    return LearnedExtractor(make(), FeatureConfig(refine=False, spread=spread, **settings))
 
 
 @pytest.mark.parametrize("make", ALL)
@@ -108,6 +108,21 @@ def test_the_strongest_are_kept(make: MakeDetector) -> None:
     assert everything.scores is not None
     assert few.scores is not None
     np.testing.assert_array_equal(few.scores, everything.scores[:30])
+
+
+def test_what_is_kept_covers_the_image() -> None:
+    image, centres = dots(np.random.default_rng(5))
+    # The brighter ones are all on the right: by strength alone they would be all that is taken.
+    image[:, :250][image[:, :250] > 100] = 140
+    strongest, spread = (extractor(xfeat_tiles, max_keypoints=40, spread=s).extract(image, None) for s in (False, True))
+    assert strongest.xy_px[:, 0].min() > 250
+    # Three quarters of the dots are on the left.
+    assert 0.5 < (spread.xy_px[:, 0] < 250).mean() < 0.8
+    everything = extractor(xfeat_tiles, spread=True).extract(image, None)
+    np.testing.assert_allclose(sorted_rows(everything.xy_px), sorted_rows(centres), atol=2e-4)
+    assert everything.scores is not None
+    column, row = (everything.xy_px - 0.5).round().astype(int).T
+    np.testing.assert_allclose(everything.scores, image[row, column].mean(1) / 255, atol=1e-6)
 
 
 @pytest.mark.parametrize("make", ALL)

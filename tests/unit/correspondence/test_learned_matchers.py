@@ -14,6 +14,7 @@ from mrasfm_engine.correspondence.learned_matchers import (
     LightGlueMatcher,
     SuperGlueMatcher,
 )
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
@@ -111,3 +112,23 @@ def test_colmaps_network_gets_the_sizes_of_both_images() -> None:
     found = matcher.match(a, b)
     assert len(found) == 40
     np.testing.assert_array_equal(order[found[:, 1]], found[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("pairs", "scores"),
+    [
+        ([[0, 5]], [0.9]),  # there are five
+        ([[0, 1], [-1, -1]], [0.9, 0.9]),  # padding
+        ([[0, 1]], [0.9, 0.9]),
+        ([0, 1], [0.9]),
+    ],
+)
+def test_matches_that_are_none_are_refused(
+    pairs: list[list[int]], scores: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = Network("padded", learned_graphs.lightglue(), gpu=False)
+    given = {"matches0": np.array(pairs), "mscores0": np.array(scores, np.float32)}
+    monkeypatch.setattr(network, "run", lambda feed: given)
+    five = features(unit(np.random.default_rng(0), 5, 256))
+    with pytest.raises(InputError, match="model padded gives matches"):
+        matched(LightGlueMatcher(network, MatchConfig()), five, five)

@@ -70,6 +70,15 @@ def test_many_keypoints_all_over_the_image_none_twice(found: ImageFeatures, imag
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-3)
 
 
+def test_what_is_matched_covers_the_image(models: Path, image: np.ndarray, found: ImageFeatures) -> None:
+    strongest = plugins(models, spread=False).extractor.extract(image, None)
+    cells = [len(np.unique(f.xy_px[:1024] // 32, axis=0)) for f in (strongest, found)]
+    assert cells[1] > 1.25 * cells[0]
+    # The road before the vehicle, where an image has its nearest points.
+    near = [(f.xy_px[:1024, 1] > 0.75 * image.shape[0]).sum() for f in (strongest, found)]
+    assert near[1] > 1.25 * near[0]
+
+
 @pytest.mark.parametrize("refine", [True, False])
 def test_a_shifted_image_has_shifted_keypoints_without_bias(models: Path, image: np.ndarray, refine: bool) -> None:
     extractor = plugins(models, refine=refine).extractor

@@ -25,12 +25,24 @@ def all_known(time_s: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("offset_s", [-0.05, -0.01, 0.0, 0.03, 0.05])
 @pytest.mark.parametrize("unit", [0, 3, 7])
-def test_a_constant_twist_is_exact_inside_and_at_both_ends(unit: int, offset_s: float) -> None:
+def test_a_steady_turn_is_followed_inside_and_at_both_ends(unit: int, offset_s: float) -> None:
     time_s = np.array([0.0, 0.1, 0.2, 0.35, 0.4, 0.5, 0.62, 0.7])
     motion = local_motion(driven(time_s), time_s, all_known(time_s))
     found = motion.at(np.array([unit]), np.array([offset_s]))[0]
-    np.testing.assert_allclose(found, se3.exp_se3(offset_s * TWIST), atol=1e-12)
+    expected = se3.exp_se3(offset_s * TWIST)
+    np.testing.assert_allclose(found[:3, :3], expected[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(found[:3, 3], expected[:3, 3], atol=1e-3)  # a line would be 6 mm off
     assert motion.known.all()
+
+
+def test_places_follow_a_scaling_of_the_whole_way_exactly() -> None:
+    """Else a turn would seem to tell the scale."""
+    time_s = np.arange(8) * 0.1
+    poses, unit, offset_s = driven(time_s), np.array([0, 3, 7]), np.array([0.05, -0.04, 0.03])
+    places = (poses[unit] @ local_motion(poses, time_s, all_known(time_s)).at(unit, offset_s))[:, :3, 3]
+    poses[:, :3, 3] *= 1.1
+    scaled = (poses[unit] @ local_motion(poses, time_s, all_known(time_s)).at(unit, offset_s))[:, :3, 3]
+    np.testing.assert_allclose(scaled, 1.1 * places, atol=1e-12)
 
 
 def test_constant_acceleration_on_a_line_is_exact_between_neighbours() -> None:
@@ -50,7 +62,7 @@ def test_a_gap_is_bridged_and_a_far_one_is_not() -> None:
     poses[~known] = np.eye(4)
     motion = local_motion(poses, time_s, known)
     at = motion.at(np.array([2]), np.array([0.04]))[0]
-    np.testing.assert_allclose(at, se3.exp_se3(0.04 * TWIST), atol=1e-12)
+    np.testing.assert_allclose(at, se3.exp_se3(0.04 * TWIST), atol=1e-3)
     assert time_s[5] - time_s[4] > MAX_GAP_S
     assert motion.known.tolist() == [True, False, True, False, True, False]
     np.testing.assert_array_equal(motion.at(np.array([1, 5]), np.array([0.05, 0.05])), np.tile(np.eye(4), (2, 1, 1)))
@@ -60,7 +72,7 @@ def test_nothing_is_said_of_times_beyond_the_neighbours() -> None:
     time_s = np.array([0.0, 0.1, 0.2])
     motion = local_motion(driven(time_s), time_s, all_known(time_s))
     far = motion.at(np.array([1, 1]), np.array([5.0, -5.0]))
-    np.testing.assert_allclose(far, se3.exp_se3(np.array([[0.1], [-0.1]]) * TWIST), atol=1e-12)
+    np.testing.assert_allclose(far, se3.exp_se3(np.array([[0.1], [-0.1]]) * TWIST), atol=1e-9)
 
 
 def test_poses_at_almost_the_same_time_do_not_turn_noise_into_speed() -> None:
@@ -68,7 +80,7 @@ def test_poses_at_almost_the_same_time_do_not_turn_noise_into_speed() -> None:
     poses = driven(time_s)
     poses[2, :3, 3] += 0.02
     velocity = local_motion(poses, time_s, all_known(time_s)).velocity[1]
-    np.testing.assert_allclose(velocity, TWIST, atol=1e-9)
+    np.testing.assert_allclose(velocity, TWIST, atol=0.01)
 
 
 def test_a_neighbour_that_is_far_off_asks_for_an_acceleration_that_is_not_believed() -> None:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -40,6 +41,7 @@ from mrasfm_engine.io.feature_database import write_features
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.scene.scene import CalibrationVerdict, ImageFeatures, Scene
+from schemas.drive import MAX_IMAGE_SIDE_PX
 
 
 @pytest.fixture(scope="module")
@@ -417,10 +419,10 @@ def test_a_scene_that_contradicts_itself_is_refused(
 def test_pictures_are_part_of_the_scene(scene: Scene, tmp_path: Path) -> None:
     out = tmp_path / "scene"
     picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    write_scene(scene, out, {}, {"a.png": picture})
+    write_scene(scene, out, {}, {"a.png": export_pictures.png_of(picture)})
     assert {p.name for p in out.iterdir()} == {*FILES, "pictures"}
     np.testing.assert_array_equal(read_image_rgb(out / "pictures" / "a.png"), picture)
-    write_scene(scene, out, {}, {"b.png": picture[:20]})
+    write_scene(scene, out, {}, {"b.png": export_pictures.png_of(picture[:20])})
     assert [p.name for p in (out / "pictures").iterdir()] == ["b.png"]
     write_scene(scene, out, {})
     assert {p.name for p in out.iterdir()} == FILES  # old pictures would show another scene
@@ -429,7 +431,16 @@ def test_pictures_are_part_of_the_scene(scene: Scene, tmp_path: Path) -> None:
 def test_a_picture_that_does_not_read_back_is_withheld(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(export_pictures, "read_image_rgb", lambda path: np.zeros((2, 2, 3), np.uint8))
+    write_bytes = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda path, data: write_bytes(path, data[:-1]))
     with pytest.raises(MrasfmError, match="was written but does not read back"):
-        write_scene(scene, tmp_path / "scene", {}, {"a.png": np.ones((2, 2, 3), np.uint8)})
+        write_scene(scene, tmp_path / "scene", {}, {"a.png": export_pictures.png_of(np.ones((2, 2, 3), np.uint8))})
     assert_nothing_published(tmp_path / "scene")
+
+
+def test_our_own_pictures_may_be_longer_than_camera_images() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (3, MAX_IMAGE_SIDE_PX + 1, 3), dtype=np.uint8)
+    data = np.frombuffer(export_pictures.png_of(picture), np.uint8)
+    np.testing.assert_array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], picture)
+    with pytest.raises(MrasfmError, match="cannot be made a PNG"):
+        export_pictures.png_of(picture[:0])

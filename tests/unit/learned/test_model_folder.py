@@ -60,6 +60,14 @@ def test_an_own_export_is_known_by_its_signature_and_keeps_no_foreign_licence(
     assert (model.is_published, model.licence, model.commercial_use) == (False, "that of the file", None)
 
 
+def test_an_own_export_takes_no_published_name_by_itself(folder: ModelFolder, tmp_path: Path, published: bytes) -> None:
+    model = folder.add(write(tmp_path, published))
+    with pytest.raises(InputError, match="not the file that is published") as error:
+        folder.add(write(tmp_path, learned_graphs.xfeat(threshold=0.3)))
+    assert "--name" in error.value.remedy
+    assert folder.load("xfeat") == (model, published)
+
+
 def test_superpoint_is_registered_with_its_hash_and_its_licence(folder: ModelFolder, tmp_path: Path) -> None:
     data = learned_graphs.superpoint()
     model = folder.add(write(tmp_path, data))

@@ -9,7 +9,13 @@ from mrasfm_engine.adjustment.solver import SolverOptions
 from mrasfm_engine.correspondence.verification import parallax_rad
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.registration.calibration import judge_calibration, scale_of_baselines, scale_with_baselines
+from mrasfm_engine.registration.calibration import (
+    calibration_prior,
+    judge_calibration,
+    scale_of_baselines,
+    scale_with_baselines,
+    settle_scale,
+)
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.placement import place_by_rough_poses
 
@@ -138,3 +144,14 @@ def test_points_without_an_angle_are_told_from_those_with_one() -> None:
     model.kept[model.keypoints.unit > 1] = False
     fewer = model.triangulator.has_angle(model.state, model.tracks, model.kept, solved)
     assert 0 < fewer.sum() < len(fewer)
+
+
+def test_the_scale_settles_where_the_terms_cost_least() -> None:
+    model = true_model(units=6)
+    terms = [calibration_prior(model)]
+    scale_with_baselines(model, 1.15)
+    assert terms[0].cost(model.state) > 0.1
+    before = model.state.points_m.copy()
+    settle_scale(model, terms)
+    assert scale_of_baselines(model)[0] == pytest.approx(1.0, abs=1e-4)
+    assert np.abs(model.state.points_m - before).max() > 0.1

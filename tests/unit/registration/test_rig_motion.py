@@ -101,7 +101,7 @@ def test_a_unit_is_registered_with_the_motion_of_its_neighbours() -> None:
 
 
 @pytest.mark.parametrize("with_prior", [True, False])
-def test_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_prior: bool) -> None:
+def test_pitfall_1_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_prior: bool) -> None:
     def mapped(simulated: SimulatedDrive, config: EngineConfig) -> tuple[Model, MappingLog]:
         pairs = true_matches(simulated)
         model = make_model(simulated, pairs, config)
@@ -181,6 +181,22 @@ def test_an_image_of_a_simultaneous_drive_can_have_a_pose_of_its_own() -> None:
     moved = model.keypoints.image[rows] == 3
     assert np.median(reprojection_px(model)[moved]) > 5 * np.median(good[moved])
     np.testing.assert_allclose(reprojection_px(model)[~moved], good[~moved], atol=1e-9)
+
+
+def test_a_unit_that_is_forgotten_leaves_no_pose_of_its_images() -> None:
+    simulated = skewed()
+    model = make_model(simulated)
+    place_truly(model, simulated)
+    before = model.motion.unit_from_image(model.state)
+    pushed = before.copy()
+    pushed[:, 0, 3] += 0.3
+    images = np.flatnonzero(np.isin(model.image_unit, [3, 4]))
+    model.set_image_poses(images, pushed[images])
+    model.forget(np.array([3]))
+    assert not model.motion.own_poses[0][model.image_unit == 3].any()
+    assert model.motion.own_poses[0][model.image_unit == 4].all()
+    model.clear()
+    assert not model.motion.own_poses[0].any()
 
 
 def test_own_poses_and_rows_go_together() -> None:

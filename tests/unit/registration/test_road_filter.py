@@ -142,7 +142,6 @@ def test_without_masks_only_what_cannot_stand_is_dropped() -> None:
 
 def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
     simulated = make_simulated_drive(units=6, cameras=4, points=1500, clutter=0)
-    above = [point >= 0 for point in simulated.point_of_keypoint]
     above = [simulated.truth.points_m[p, 2] > 0.5 for p in simulated.point_of_keypoint]
     features, points = [], []
     for found, of, seen in zip(simulated.features, simulated.point_of_keypoint, above, strict=True):
@@ -199,3 +198,16 @@ def test_classes_of_tracks_are_those_of_most_of_their_keypoints(shadows: tuple[S
     point = np.concatenate(simulated.point_of_keypoint)[model.tracks.keypoints[model.tracks.first[:-1]]]
     expected = np.where(simulated.truth.points_m[point, 2] == 0.0, ROAD, 1)
     assert (model.track_class == expected).mean() > 0.999
+
+
+def test_one_mask_does_not_switch_off_what_geometry_says_of_the_other_images() -> None:
+    simulated, _ = drive_over_shadows(masks=False)
+    alone = judge_road(mapped(simulated), final=True)
+    first = replace(simulated.features[0], classes=np.full(len(simulated.features[0].xy_px), 1, np.uint8))
+    one = judge_road(mapped(replace(simulated, features=[first, *simulated.features[1:]])), final=True)
+    assert isinstance(alone, RoadJudgement)
+    assert isinstance(one, RoadJudgement)
+    assert one.source is RoadSource.GEOMETRY
+    # What the mask says is not road is none; of the rest geometry judges as before.
+    assert 50 < len(one.tracks) < len(alone.tracks)
+    assert set(one.tracks.tolist()) <= set(alone.tracks.tolist())

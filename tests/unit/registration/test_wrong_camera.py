@@ -1,14 +1,26 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
 
+from mrasfm_engine.adjustment.calibration_verdict import Observability
+from mrasfm_engine.adjustment.observability import Covariances
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.registration.calibration import calibration_prior
 from mrasfm_engine.registration.camera_set import Registration
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.registration.refine import Refinement, refine
-from mrasfm_engine.registration.wrong_camera import WrongCamera, finding, voted_out
+from mrasfm_engine.registration.wrong_camera import (
+    WrongCamera,
+    find_wrong_cameras,
+    find_wrong_pair,
+    finding,
+    pair_finding,
+    voted_out,
+)
 
 TURNING, STRAIGHT = 24, 8  # units
 
@@ -93,3 +105,37 @@ def test_votes_in_units_with_covered_images_blame_no_camera() -> None:
     ]
     assert voted_out(registrations, set()) == {"left": 2, "back": 2}
     assert voted_out(registrations, {1, 2}) == {"left": 1}
+
+
+def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
+    model = make_model(make_simulated_drive(units=4, cameras=2, points=200))
+    prior = replace(calibration_prior(model), sigma_rotation_rad=np.radians([0.2, 0.2]))
+    off = se3.exp_so3([0.0, 0.0, np.radians(1.5)])
+    state = replace(
+        model.state,
+        camera_rotation=np.stack([off @ prior.rotation[0], off.T @ prior.rotation[1]]),
+        camera_position_m=prior.position_m,
+    )
+    sees_rotations = np.tile([True, True, True, False, False, False], (2, 1))
+    directions = Observability(
+        observed=sees_rotations,
+        ratio=np.where(sees_rotations, 0.01, np.nan),
+        scale_observed=False,
+        scale_only_prior=False,
+        sigma_scale=0.01,
+        prior_sigma_scale=0.01,
+    )
+    nothing = Covariances(
+        sigma_unit_position_m=np.zeros((0, 3)),
+        sigma_camera=np.zeros((2, 7)),
+        sigma_scale=0.01,
+        calibration=np.zeros((12, 12)),
+    )
+    assert find_wrong_cameras(prior, state, nothing, directions) == []
+    pair = find_wrong_pair(prior, state, nothing, directions)
+    assert pair is not None
+    assert pair.rotation_deg == pytest.approx(3.0)
+    said = pair_finding(["left", "right"], pair)
+    assert "cameras left and right are turned by 3.00 deg" in said.what
+    at_rest = replace(state, camera_rotation=prior.rotation)
+    assert find_wrong_pair(prior, at_rest, nothing, directions) is None

@@ -102,6 +102,7 @@ def test_a_turn_is_a_quarter_of_a_circle_and_smooth() -> None:
     assert 9 < speed.max() < 15  # the outer lane is longer than the street
 
 
+@pytest.mark.slow
 def test_rows_of_a_rolling_shutter_are_rendered_at_their_own_times(tmp_path: Path) -> None:
     same = {"cameras": 1, "moving_cars": 0, "noise": 0.0, "blur_px": 0.0, "spacing_m": 1.5}
     rolling, still = (

@@ -28,10 +28,24 @@ def pattern(xy: np.ndarray) -> np.ndarray:
 
 
 class Level:
-    """A ground at height 0."""
+    """A ground at height 0 that counts how often it is asked."""
+
+    asked = 0
 
     def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+        self.asked += len(xy_m)
         return np.zeros(len(xy_m))
+
+
+class Slope:
+    """A plane through the origin."""
+
+    def __init__(self, slope: tuple[float, float]) -> None:
+        self.slope = np.array(slope)
+
+    def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+        result: np.ndarray = xy_m @ self.slope
+        return result
 
 
 def looking(yaw_deg: float, x_m: float) -> np.ndarray:

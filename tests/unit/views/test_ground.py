@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.views.ground import estimate_ground
+from mrasfm_engine.views.ground import BLEND_SIGMA_M, HEIGHT_STEP_M, GroundPatches, GroundTiles, estimate_ground
 
 CAMERAS = np.array([[1.5, 0.5, 1.5], [1.5, -0.5, 1.6]])
 
@@ -60,3 +60,41 @@ def test_without_a_ground_there_is_none() -> None:
     high = street(rng)
     high[:, 2] += 5.0
     assert estimate_ground(high, poses, CAMERAS, rng=rng) is None
+
+
+def test_the_nearest_patches_say_what_all_of_them_say() -> None:
+    rng = np.random.default_rng(3)
+    once = np.column_stack([np.arange(0.0, 300.0, 2.0), 5 * np.sin(np.arange(150) / 15)])
+    way = np.concatenate([once, once + np.array([0.9, 0.3])])  # there and again
+    height = hill(way) + 0.01 * np.sin(way[:, 0] / 7)
+    patches = GroundPatches(
+        centre_m=way, plane=np.column_stack([height, rng.normal(0.06, 0.003, 300), rng.normal(0, 0.003, 300)])
+    )
+    xy = way[rng.integers(0, len(way), 500)] + rng.uniform(-12, 12, (500, 2))
+    offset = xy[:, None] - way
+    squared = (offset**2).sum(-1)
+    weight = np.exp(-0.5 * (squared - squared.min(1, keepdims=True)) / BLEND_SIGMA_M**2)
+    planes = patches.plane[:, 0] + (offset * patches.plane[:, 1:]).sum(-1)
+    error = np.abs(patches.height_m(xy) - (weight * planes).sum(1) / weight.sum(1))
+    assert 0 < error.max() < 0.002
+
+
+def test_heights_far_from_all_patches_are_finite_and_one_patch_is_enough() -> None:
+    patch = GroundPatches(centre_m=np.array([[1.0, 2.0]]), plane=np.array([[3.0, 0.1, 0.0]]))
+    np.testing.assert_allclose(patch.height_m(np.array([[11.0, 2.0], [1e4, 0.0]])), [4.0, 3.0 + 0.1 * 9999])
+
+
+def test_tiles_cover_what_is_asked_for() -> None:
+    class Bowl:
+        def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+            result: np.ndarray = 0.01 * xy_m[:, 0] ** 2 - 0.3 * xy_m[:, 1]
+            return result
+
+    tiles = GroundTiles(Bowl())
+    for centre in ([0.0, 0.0], [-37.3, 12.9], [103.9, -55.55]):
+        heights, first = tiles.around(np.array(centre), 17.0)
+        last = first + HEIGHT_STEP_M * (np.array(heights.shape[::-1]) - 1)
+        assert (first <= np.array(centre) - 17).all()
+        assert (last >= np.array(centre) + 17).all()
+        x, y = (first[k] + HEIGHT_STEP_M * np.arange(heights.shape[1 - k]) for k in (0, 1))
+        np.testing.assert_allclose(heights, 0.01 * x[None] ** 2 - 0.3 * y[:, None], atol=1e-9)
