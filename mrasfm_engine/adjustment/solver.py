@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.adjustment.coupling import Coupling
-from mrasfm_engine.adjustment.normal_equations import IMAGE_SUMS, accumulate, add_images, squared_errors, substitute
+from mrasfm_engine.adjustment.normal_equations import IMAGE_SUMS, accumulate, add_images, point_costs, settle, squared_errors, substitute
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
 from mrasfm_engine.adjustment.reduced import Extra, Reduced
@@ -94,9 +94,37 @@ class Problem:
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares."""
-        s2 = self.options.loss_scale**2
-        images = 0.5 * s2 * np.log1p(self.errors_px2(state) / (s2 * self.options.sigma_px**2)).sum()
+        return self._sum(state, self.point_costs(state))
+
+    def _sum(self, state: State, costs: Floats) -> float:
+        images = 0.5 * self.options.loss_scale**2 * costs.sum()
         return float(images + sum(term.cost(state) for term in self.terms))
+
+    def point_costs(self, state: State) -> Floats:
+        """Sums (p,) of log(1 + r^2 / s^2) over the observations of every point."""
+        o, out = self.observations, np.empty(self.observations.num_points)
+        _in_ranges(
+            self.options.threads,
+            len(out),
+            lambda lo, hi, _: point_costs(
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                (self.options.loss_scale * self.options.sigma_px) ** 2, lo, hi, out,
+            ),
+        )  # fmt: skip
+        return out
+
+    def settle(self, state: State, before: State, costs_before: Floats) -> tuple[Floats, float]:
+        """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
+        o, options, costs = self.observations, self.options, np.empty(self.observations.num_points)
+        _in_ranges(
+            options.threads,
+            len(costs),
+            lambda lo, hi, _: settle(
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                options.sigma_px, options.loss_scale**2, before.points_m, costs_before, lo, hi, costs,
+            ),
+        )  # fmt: skip
+        return costs, self._sum(state, costs)
 
     @cached_property
     def coupling(self) -> Coupling:
@@ -215,7 +243,8 @@ def solve(problem: Problem, *, cancel: Callable[[], bool] | None = None) -> tupl
 
 def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[State, Report]:
     options, layout, state = problem.options, problem.layout, problem.state
-    cost = initial = problem.cost(state)
+    costs = problem.point_costs(state)
+    cost = initial = problem._sum(state, costs)
     damping, raise_by, iterations = 1e-4, 2.0, 0
     termination = Termination.ITERATIONS
     free = np.setdiff1d(np.arange(layout.size), layout.held())
@@ -229,7 +258,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
         step = reduced.step(damping)
         if step is not None:
             trial = problem.retract(state, step, problem.points_after(state, reduced, step))
-            trial_cost = problem.cost(trial)
+            trial_costs, trial_cost = problem.settle(trial, state, costs)
         if step is None or not trial_cost < cost:
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
@@ -242,7 +271,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
             len(free) and decrement <= options.decrement_tolerance * len(free)
         ):
             termination = Termination.CONVERGED
-        state, cost = trial, trial_cost
+        state, cost, costs = trial, trial_cost, trial_costs
         damping, raise_by = max(damping / 5.0, 1e-10), 2.0
     return state, Report(
         initial_cost=initial,
