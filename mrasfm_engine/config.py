@@ -75,6 +75,7 @@ class MappingConfig(_Section):
     min_pnp_inlier_ratio: Share = 0.2
     local_units: Count = 6  # units that vary in local adjustment
     local_every: Count = 2  # registered units between local adjustments
+    pose_observations: int = Field(default=400, ge=0)  # of an image, for its pose while the scene grows; 0: all
     semantic_triangulation: bool = True  # points of the road that are off its surface are dropped
     road_patch_m: Positive = 8.0  # radius of a plane patch of the road's surface
     road_sigmas: Positive = 3.0  # how far from the surface a point of the road may be, in its own uncertainty

@@ -98,7 +98,7 @@ def squared_errors(
         out[n] = (proj[0] - obs_xy[n, 0]) ** 2 + (proj[1] - obs_xy[n, 1]) ** 2
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _linearise(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any,
     kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
@@ -558,7 +558,7 @@ def substitute(
         out[p, 2] = points[p, 2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_cost(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
     obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, scale2: float, x: Any,
@@ -581,11 +581,11 @@ def _point_cost(
     return result + math.log(product)
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_system(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, sigma: float, loss2: float, x: Any,
-    d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, sigma: float, loss2: float,
+    x: Any, d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
 ) -> None:  # fmt: skip
     """V (6,) and gradient e (3,) of a point at x over its observations begin..end."""
     v[:] = 0.0

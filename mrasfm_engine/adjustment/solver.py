@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.adjustment.coupling import Coupling
-from mrasfm_engine.adjustment.normal_equations import IMAGE_SUMS, accumulate, add_images, point_costs, settle, squared_errors, substitute
+from mrasfm_engine.adjustment.normal_equations import (
+    IMAGE_SUMS,
+    accumulate,
+    add_images,
+    point_costs,
+    settle,
+    squared_errors,
+    substitute,
+)
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
 from mrasfm_engine.adjustment.reduced import Extra, Reduced
@@ -21,6 +30,9 @@ from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SETTLING = 2  # steps of points whose poses have moved
 
 
 class Termination(StrEnum):
@@ -112,6 +124,31 @@ class Problem:
             ),
         )  # fmt: skip
         return out
+
+    def of_points(self, chosen: Bools) -> Problem:
+        """The problem of some of the points (p,) and what observes them."""
+        o = self.observations
+        rows = chosen[o.point]
+        number = np.cumsum(chosen) - 1
+        return replace(
+            self,
+            state=replace(self.state, points_m=self.state.points_m[chosen]),
+            observations=Observations(
+                unit=o.unit[rows],
+                camera=o.camera[rows],
+                point=number[o.point[rows]],
+                xy_px=o.xy_px[rows],
+                num_points=int(chosen.sum()),
+                shot=None if o.shot is None else o.shot[rows],
+            ),
+        )
+
+    def with_points_settled(self, state: State) -> State:
+        """The state with every point moved to where poses and calibration want it; only those that gain move."""
+        result = replace(state, points_m=state.points_m.copy())
+        for _ in range(SETTLING):
+            self.settle(result, state, np.full(len(state.points_m), np.inf))
+        return result
 
     def settle(self, state: State, before: State, costs_before: Floats) -> tuple[Floats, float]:
         """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
@@ -208,8 +245,16 @@ def _in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:
     if parts == 1:
         work(int(bounds[0]), int(bounds[1]), 0)
         return
-    with ThreadPoolExecutor(parts) as pool:
-        list(pool.map(work, bounds[:-1], bounds[1:], range(parts)))
+    list(_pool(parts).map(work, bounds[:-1], bounds[1:], range(parts)))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that wait for the next of a solver's many short passes: starting them anew would take as long as one."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="adjustment")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
 _THREADS = ThreadpoolController()

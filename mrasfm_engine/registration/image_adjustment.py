@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.adjustment.point_choice import solve_with_chosen_points
 from mrasfm_engine.adjustment.priors import PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.problem import Layout, Observations
-from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solve
+from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
@@ -39,6 +40,7 @@ def adjust_images(
     *,
     terms: Sequence[Term],
     options: SolverOptions,
+    an_image: int,
     cancel: Callable[[], bool] | None,
 ) -> Report:
     """Adjust the images of some units one by one, and take over their poses; a unit's pose is their robust mean.
@@ -66,7 +68,7 @@ def adjust_images(
         terms=terms_of_images(terms, model.image_unit, adjusted),
         options=options,
     )
-    solution, report = solve(problem, cancel=cancel)
+    solution, report = solve_with_chosen_points(problem, model.image_size_px, an_image=an_image, cancel=cancel)
     if cancel is not None and cancel():
         raise CancelledError
     model.state.points_m[tracks] = solution.points_m

@@ -239,6 +239,7 @@ def _adjust_locally(model: Model, unit: int) -> None:
             loss_scale=model.config.adjustment.loss_scale,
             threads=model.config.threads,
         ),
+        an_image=model.config.mapping.pose_observations,
     )
 
 
@@ -264,6 +265,7 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
             free_cameras=np.full(len(model.camera_kind), free),
             terms=[calibration_prior(model)] if free and priors else (),
             options=options,
+            an_image=model.config.mapping.pose_observations,
             cancel=cancel,
         )
         log.global_adjustments.append(report)

@@ -9,9 +9,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.adjustment.point_choice import solve_with_chosen_points
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import Layout, Observations
-from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solve
+from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
@@ -57,6 +58,7 @@ class Model:
     def __init__(self, drive: Drive, keypoints: Keypoints, tracks: Tracks, config: EngineConfig) -> None:
         self.drive, self.keypoints, self.tracks, self.config = drive, keypoints, tracks, config
         self.camera_kind, params = pack_cameras(drive.cameras)
+        self.image_size_px = np.array([[camera.width, camera.height] for camera in drive.cameras], dtype=np.float64)
         units = len(drive.manifest.frames)
         self.state = State(
             unit_rotation=np.tile(np.eye(3), (units, 1, 1)),
@@ -297,16 +299,20 @@ class Model:
         free_focal: bool = False,
         terms: Sequence[Term] = (),
         options: SolverOptions,
+        an_image: int = 0,
         cancel: Callable[[], bool] | None = None,
     ) -> Report:
-        """Solve the adjustment and take over its result."""
+        """Solve the adjustment and take over its result.
+
+        With `an_image` poses are estimated from about so many observations of an image; points follow all of theirs.
+        """
         if not self.config.adjustment.camera_set_adjustment:
-            return adjust_images(self, free_units, terms=terms, options=options, cancel=cancel)
+            return adjust_images(self, free_units, terms=terms, options=options, an_image=an_image, cancel=cancel)
         self.renew_motion(np.flatnonzero(free_units & self.registered))
         problem, tracks = self.problem(
             free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
         )
-        solution, report = solve(problem, cancel=cancel)
+        solution, report = solve_with_chosen_points(problem, self.image_size_px, an_image=an_image, cancel=cancel)
         if cancel is not None and cancel():
             raise CancelledError  # else a half-solved model would pass for a finished one
         points = self.state.points_m
