@@ -16,7 +16,7 @@ from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.registration.calibration import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
-    CalibrationVerdict,
+    CalibrationDecision,
     calibration_prior,
     judge_calibration,
     scale_of_baselines,
@@ -52,7 +52,7 @@ class Refinement:
     sigma_px: float = 1.0
     placement: Placement | None = None  # by GNSS, where it was to be used
     placed_by_rough_poses: bool = False
-    calibration: CalibrationVerdict = field(default_factory=lambda: CalibrationVerdict(False, ""))
+    calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     focal_free: bool = False
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
     adjustments: list[Report] = field(default_factory=list)
