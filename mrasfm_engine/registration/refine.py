@@ -151,12 +151,12 @@ def refine(
     result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _certainty(model, positions, result)
     result.directions = _directions(model, result.certainty)
-    if result.recalibrated.any() and result.directions is not None and result.certainty is not None:
+    if result.recalibrated.any() and result.directions is not None:
         if result.calibration.free and result.directions.to_hold.any():
             _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
         if result.georeferenced and result.directions.scale_only_prior:
             scale_with_baselines(model, scale_of_baselines(model)[0])
-        known = calibration_prior(model), model.state, result.certainty, result.directions
+        known = calibration_prior(model), model.state, result.directions
         result.wrong_cameras = find_wrong_cameras(*known)
         result.wrong_pair = find_wrong_pair(*known)
     return result
@@ -187,10 +187,9 @@ def _wrong_although_held(
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return wrong
     solution, _ = solve(problem, cancel=cancel)
-    certainty = covariances(problem, solution)
-    directions = _directions(model, certainty)
+    directions = _directions(model, covariances(problem, solution))
     if directions is not None:
-        for found in find_wrong_cameras(calibration_prior(model), solution, certainty, directions):
+        for found in find_wrong_cameras(calibration_prior(model), solution, directions):
             wrong[found.camera] = True
     return wrong if (~wrong).sum() >= MIN_OTHERS else np.zeros_like(wrong)
 
