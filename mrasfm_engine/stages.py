@@ -321,6 +321,7 @@ def scene(
     if refinement.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
         run.report["findings"].append(as_json(wrong_camera.pair_finding(names, refinement.wrong_pair)))
+    run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(model)]
     run.report["stages"].append(
         {
             "stage": "refinement",
