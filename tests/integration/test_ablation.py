@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine import ablation
-from mrasfm_engine.ablation import FULL, SWITCHES, Row
-from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.ablation import FULL, SWITCHES, Row, _remark, switches_named
+from mrasfm_engine.config import EngineConfig, SemanticsConfig
+from mrasfm_engine.io.drive_bundle import read_drive
 from tests.integration.conftest import Ran, Variant
 
 Run = Callable[..., Ran]
@@ -32,6 +33,17 @@ def test_every_part_is_on_by_default_and_each_switch_turns_off_one() -> None:
         assert before[switch.section].pop(switch.field) is True
         assert after[switch.section].pop(switch.field) is False
         assert before == after
+
+
+def test_what_the_road_is_known_by_without_masks_depends_on_a_model_for_them(small: Variant) -> None:
+    for frame in small.document["frames"]:
+        for image in frame["images"].values():
+            image.pop("mask")
+    drive, config = read_drive(small.save().root), EngineConfig()
+    [switch] = switches_named(["mapping.semantic_triangulation"])
+    assert "no masks" in _remark(switch, drive, config)
+    by_model = config.model_copy(update={"semantics": SemanticsConfig(model="mine")})
+    assert _remark(switch, drive, by_model) == ""
 
 
 @pytest.mark.slow
