@@ -25,7 +25,7 @@ from mrasfm_engine.registration.calibration import (
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
+from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses
 from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.wrong_camera import (
     MIN_OTHERS,
@@ -120,8 +120,7 @@ def refine(
     if not result.calibration.free:
         result.recalibrated = _wrong_although_held(model, free_units, positions, result, cancel)
     result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
-    if result.calibration.free and result.placement is not None and model.config.adjustment.priors:
-        share_scale(model, result.placement)
+    _settle(model, result, _terms(model, positions, result))
     for done in range(ROUNDS):
         result.sigma_px = _observation_sigma(model)
         terms = _terms(model, positions, result)
@@ -236,6 +235,7 @@ def _hold_unobserved(
 
 
 def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
+    """Let the priors and the positions say the scale, where the calibration and with it the scale may vary."""
     several = not model.drive.has_single_camera
     if result.calibration.free and several and terms and model.config.adjustment.camera_set_adjustment:
         settle_scale(model, terms)
