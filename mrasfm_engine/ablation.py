@@ -190,7 +190,8 @@ def _require_truth(drive: Drive, truth: Trajectory) -> None:
 def _remark(switch: Switch, drive: Drive, config: EngineConfig) -> str:
     if drive.has_single_camera and switch.field.startswith("camera_set"):
         return "one camera: there is no camera set"
-    if switch.field == "semantic_triangulation" and not any(image.mask for image in drive.images):
+    has_masks = config.semantics.model is not None or any(image.mask for image in drive.images)
+    if switch.field == "semantic_triangulation" and not has_masks:
         return "the drive has no masks: the road is known by geometry alone"
     if switch.field == "priors" and (drive.manifest.gnss is None or not config.use_gnss):
         return "no GNSS: only the calibration has a prior, where it varies"

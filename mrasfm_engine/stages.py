@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
@@ -159,21 +158,19 @@ def features(run: Run) -> list[ImageFeatures]:
             progress=run.step("features"),
             cancel=run.cancel,
         )
-        counts = np.array([len(f.xy_px) for f in found], dtype=np.int64)
-        poor = [run.drive.images[i].file for i in np.flatnonzero(counts < 100)]
-        arrays = {"counts": counts, **{name: _joined(found, name) for name in FEATURE_ARRAYS}}
-        if all(f.scores is not None for f in found):
-            arrays["scores"] = _joined(found, "scores")
-        return (
-            arrays,
-            {
-                "images": len(found),
-                "keypoints": int(counts.sum()),
-                "keypoints_by_class": count_classes([f.classes for f in found]),
-                "images_with_mask": sum(image.mask is not None for image in run.drive.images),
-                "images_with_under_100_keypoints": poor,
+        arrays = _pack_features(found)
+        return arrays, {
+            "images": len(found),
+            "keypoints": int(arrays["counts"].sum()),
+            "keypoints_by_class": count_classes([f.classes for f in found]),
+            "images_with_mask": {
+                "given": sum(image.mask is not None for image in run.drive.images),
+                "made_by_model": sum(f.made_mask is not None for f in found),
             },
-        )
+            "images_with_under_100_keypoints": [
+                run.drive.images[i].file for i in np.flatnonzero(arrays["counts"] < 100)
+            ],
+        }
 
     arrays, _ = run.stage("features", run.feature_settings, work)
     if not arrays["counts"].sum():
@@ -182,16 +179,31 @@ def features(run: Run) -> list[ImageFeatures]:
             remedy="Check that the images are not empty, and that masks do not cover everything.",
             code="no-features",
         )
-    ends = np.cumsum(arrays["counts"])
-    names = [name for name in (*FEATURE_ARRAYS, "scores") if name in arrays]
+    return _unpack_features(arrays)
+
+
+def _pack_features(found: Sequence[ImageFeatures]) -> Arrays:
+    masks = [np.zeros(0, np.uint8) if f.made_mask is None else f.made_mask for f in found]
+    names = [*FEATURE_ARRAYS, *(["scores"] if all(f.scores is not None for f in found) else [])]
+    return {
+        "counts": np.array([len(f.xy_px) for f in found], dtype=np.int64),
+        **{name: np.concatenate([getattr(f, name) for f in found]) for name in names},
+        "mask_bytes": np.array([len(mask) for mask in masks], dtype=np.int64),
+        "masks": np.concatenate(masks),
+    }
+
+
+def _unpack_features(arrays: Arrays) -> list[ImageFeatures]:
+    parts = {
+        name: np.split(arrays[name], np.cumsum(arrays["counts"])[:-1])
+        for name in (*FEATURE_ARRAYS, "scores")
+        if name in arrays
+    }
+    masks = np.split(arrays["masks"], np.cumsum(arrays["mask_bytes"])[:-1])
     return [
-        ImageFeatures(**{name: arrays[name][hi - n : hi] for name in names})
-        for n, hi in zip(arrays["counts"], ends, strict=True)
+        ImageFeatures(**{name: part[i] for name, part in parts.items()}, made_mask=mask if len(mask) else None)
+        for i, mask in enumerate(masks)
     ]
-
-
-def _joined(found: Sequence[ImageFeatures], name: str) -> NDArray[Any]:
-    return np.concatenate([getattr(f, name) for f in found])
 
 
 def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> list[PairMatches]:
@@ -321,6 +333,7 @@ def scene(
     if refinement.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
         run.report["findings"].append(as_json(wrong_camera.pair_finding(names, refinement.wrong_pair)))
+    run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(model)]
     run.report["stages"].append(
         {
             "stage": "refinement",

@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mrasfm_engine.config import read_config
-from mrasfm_engine.errors import InputError, StorageError
-from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.drive_bundle import read_drive, storage_error
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
 
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
         document = _document(rows, source)
         if arguments.out is not None:
-            (work / RESULT).write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            _write(document, work / RESULT)
     if arguments.json:
         print(json.dumps(document, allow_nan=False))
     else:
@@ -104,11 +104,16 @@ def _folder(out: Path | None) -> Iterator[Path]:
         return
     try:
         out.mkdir(parents=True, exist_ok=True)
-        yield out
     except OSError as error:
-        raise StorageError(
-            f"{out} cannot be written: {error.strerror or error}", remedy="Give a folder that can be written."
-        ) from error
+        raise storage_error(out, error) from error
+    yield out
+
+
+def _write(document: dict[str, Any], path: Path) -> None:
+    try:
+        path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise storage_error(path, error) from error
 
 
 def _document(rows: Sequence[Row], source: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.correspondence.segmentation import Segmenter
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.io.images import read_image_rgb, read_mask
+from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
@@ -112,7 +112,7 @@ def extract_features(
 
     Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
     have the class of what they show; within `class_margin_px` of another class they are unknown. Images without a mask
-    get theirs from `segmenter`, if there is one.
+    get theirs from `segmenter`, if there is one; it comes with their features.
 
     Raises
     ------
@@ -134,6 +134,7 @@ def extract_features(
                 f"{camera.width}x{camera.height}",
                 remedy="Give the calibration of images of this size, or images of the calibration's size.",
             )
+        made_mask = None
         if image.mask is not None:
             mask = read_mask(drive.root / image.mask, drive.manifest.label_map)
             if mask.shape != rgb.shape[:2]:
@@ -145,11 +146,13 @@ def extract_features(
                 )
         elif segmenter is not None:
             mask = segmenter.segment(rgb)
+            made_mask = mask_png(mask)
         else:
             return extractor.extract(rgb, None)
         codes = class_codes(mask, label_map)
         found = extractor.extract(rgb, usable_pixels(codes))
-        return replace(found, classes=classes_at(confident_classes(codes, class_margin_px), found.xy_px))
+        classes = classes_at(confident_classes(codes, class_margin_px), found.xy_px)
+        return replace(found, classes=classes, made_mask=made_mask)
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()
     result: list[ImageFeatures] = []

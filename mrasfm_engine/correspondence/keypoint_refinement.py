@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.geometry.parabola import vertex
+
 Floats = NDArray[np.float32]
 
 SIGMA_PX = 1.2  # of the finer one
@@ -38,7 +40,7 @@ def snap_to_extrema(gray: NDArray[np.uint8], xy_px: Floats) -> tuple[Floats, NDA
     """
     heights = _difference_of_gaussians(gray)
     at, is_extremum = _strongest_near(heights, np.floor(xy_px).astype(np.int64))
-    refined = (at + np.float32(0.5) + _vertex(heights, at)).astype(np.float32)
+    refined = (at + np.float32(0.5) + _within_pixel(heights, at)).astype(np.float32)
     places = at[:, 1] * gray.shape[1] + at[:, 0]
     candidates = np.flatnonzero(is_extremum)
     _, first = np.unique(places[candidates], return_index=True)
@@ -71,17 +73,10 @@ def _strongest_near(heights: Floats, at: NDArray[np.int64]) -> tuple[NDArray[np.
     return found, inside & (heights[y, x] >= largest[y, x]) & (heights[y, x] > MIN_HEIGHT)
 
 
-def _vertex(heights: Floats, at: NDArray[np.int64]) -> Floats:
-    """Offset (n, 2) of the vertex of a parabola through each pixel and its neighbours, along each axis."""
+def _within_pixel(heights: Floats, at: NDArray[np.int64]) -> Floats:
+    """Offset (n, 2) of the largest height from the middle of each pixel, along each axis."""
     x = np.clip(at[:, 0], 1, heights.shape[1] - 2)
     y = np.clip(at[:, 1], 1, heights.shape[0] - 2)
-    middle = heights[y, x]
-
-    def along(before: Floats, after: Floats) -> Floats:
-        bend = before - 2 * middle + after
-        flat = np.abs(bend) < 1e-6
-        return np.where(flat, 0.0, np.clip(0.5 * (before - after) / np.where(flat, 1.0, bend), -0.5, 0.5))
-
-    return np.stack(
-        [along(heights[y, x - 1], heights[y, x + 1]), along(heights[y - 1, x], heights[y + 1, x])], axis=1
-    ).astype(np.float32)
+    right = vertex(heights[y, x - 1], heights[y, x], heights[y, x + 1])
+    down = vertex(heights[y - 1, x], heights[y, x], heights[y + 1, x])
+    return np.stack([right, down], axis=1).astype(np.float32)

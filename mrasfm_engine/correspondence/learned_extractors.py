@@ -19,14 +19,13 @@ from mrasfm_engine.correspondence.features import colors_at
 from mrasfm_engine.correspondence.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.correspondence.tiles import Tile, cut, duplicates, lay_tiles
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.learned.network import Network
+from mrasfm_engine.learned.network import STRIDE_PX, Network
 from mrasfm_engine.scene.scene import ImageFeatures
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
-STRIDE_PX = 32  # networks with free size want multiples of it
 MOST_ASKED = 65536  # keypoints of one tile
 
 

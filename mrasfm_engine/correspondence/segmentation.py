@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.learned.network import Network
+from mrasfm_engine.learned.network import STRIDE_PX, Network
 from schemas import LabelMap
 
 Bytes = NDArray[np.uint8]
-
-STRIDE_PX = 32  # networks with free size want multiples of it
 
 
 class Segmenter(Protocol):

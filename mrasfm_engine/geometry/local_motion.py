@@ -133,13 +133,13 @@ def _neighbours(time_s: Floats, known: Bools) -> tuple[Ints, Ints]:
 
 
 def smoothed_velocity(world_from_rig: Floats, time_s: Floats, *, window_s: float) -> Floats:
-    """Velocities (u, 6) as in `LocalMotion` from noisy poses (u, 4, 4), NaN where unknown; zero where nothing is known.
+    """Velocities (u, 6) as in `LocalMotion` from noisy poses (u, 4, 4), both NaN where unknown.
 
     Positions are fitted by a line over the poses within `window_s` before and after, and the turn rate is that
     between the first and the last of them: noise of 0.3 m at 10 Hz leaves 0.1 m/s of a window of 1 s.
     """
     known = np.flatnonzero(np.isfinite(world_from_rig[:, 0, 3]))
-    result = np.zeros((len(time_s), 6))
+    result = np.full((len(time_s), 6), np.nan)
     for u in known:
         near = known[np.abs(time_s[known] - time_s[u]) <= window_s]
         t = time_s[near] - time_s[near].mean()

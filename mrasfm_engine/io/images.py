@@ -81,6 +81,17 @@ def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:
     return mask
 
 
+def mask_png(mask: Bytes) -> Bytes:
+    """A mask (h, w) of ids as the bytes (b,) of a PNG, much smaller than its pixels."""
+    # Masks are large areas: more effort would take longer and save little.
+    return np.asarray(cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1], dtype=np.uint8).ravel()
+
+
+def mask_of_png(png: Bytes) -> Bytes:
+    """The mask (h, w) of ids that `mask_png` made bytes (b,) of."""
+    return np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+
+
 def check_mask_header(header: ImageHeader, path: Path) -> None:
     """Refuse masks whose pixels are not ids.
 

@@ -16,6 +16,7 @@ Array = NDArray[Any]
 # DirectML is left out: its sessions may run in one thread only.
 GPU_PROVIDERS = ("CUDAExecutionProvider", "ROCMExecutionProvider")
 CPU_PROVIDER = "CPUExecutionProvider"
+STRIDE_PX = 32  # sides of an image for a network of free size are multiples of it
 _ELEMENT_TYPES = {"float": "float32", "double": "float64", "float16": "float16"}
 _QUIET = 3  # errors only: they become our own
 

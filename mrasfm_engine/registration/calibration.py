@@ -48,7 +48,7 @@ def heading_change_deg(model: Model) -> float:
 
 
 @dataclass(frozen=True)
-class CalibrationVerdict:
+class CalibrationDecision:
     """Whether `rig_from_cam` may vary, and why."""
 
     free: bool
@@ -57,7 +57,7 @@ class CalibrationVerdict:
 
 def judge_calibration(
     model: Model, *, free_units: Bools, terms: Sequence[Term], georeferenced: bool, options: SolverOptions
-) -> CalibrationVerdict:
+) -> CalibrationDecision:
     """Whether the drive observes the calibration: freeing what it does not observe makes everything worse.
 
     A straight way without GNSS never does. Else it is asked what freeing would cost: the images, the priors and the
@@ -70,15 +70,15 @@ def judge_calibration(
     """
     settings = model.config.adjustment
     if not settings.refine_calibration:
-        return CalibrationVerdict(False, "held by the settings")
+        return CalibrationDecision(False, "held by the settings")
     if not settings.camera_set_adjustment:
-        return CalibrationVerdict(
+        return CalibrationDecision(
             False, "held as given: images that are adjusted on their own have no common calibration"
         )
     if model.drive.has_single_camera:
-        return CalibrationVerdict(False, "a single camera has no calibration to others")
+        return CalibrationDecision(False, "a single camera has no calibration to others")
     if not georeferenced and heading_change_deg(model) < settings.min_heading_change_deg:
-        return CalibrationVerdict(False, "held as given: without GNSS a drive this straight does not observe it")
+        return CalibrationDecision(False, "held as given: without GNSS a drive this straight does not observe it")
     problem, _ = model.problem(
         free_units,
         free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
@@ -88,10 +88,10 @@ def judge_calibration(
     if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
         sigma = covariances(problem, problem.state).sigma_scale
         if np.isnan(sigma):
-            return CalibrationVerdict(False, "held as given: too few units to tell what freeing it would do")
+            return CalibrationDecision(False, "held as given: too few units to tell what freeing it would do")
         if sigma > settings.max_scale_sigma:
-            return CalibrationVerdict(False, f"held as given: freed, it would leave scale uncertain by {sigma:.0%}")
-    return CalibrationVerdict(
+            return CalibrationDecision(False, f"held as given: freed, it would leave scale uncertain by {sigma:.0%}")
+    return CalibrationDecision(
         True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"
     )
 

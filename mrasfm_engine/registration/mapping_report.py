@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.solver import Report
+from mrasfm_engine.io.findings import Finding
+from mrasfm_engine.registration import rig_motion
 from mrasfm_engine.registration.calibration import heading_change_deg
 from mrasfm_engine.registration.camera_set import MIN_CAMERA_MATCHES, Registration
 from mrasfm_engine.registration.incremental import MappingLog
@@ -18,6 +21,8 @@ from mrasfm_engine.registration.road import RoadJudgement
 from mrasfm_engine.registration.wrong_camera import voted_out
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.shots import Shots
+
+Ints = NDArray[np.int64]
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
@@ -208,8 +213,23 @@ def _motion(model: Model) -> dict[str, Any]:
         "compensated": not model.motion.shots.simultaneous,
     }
     if result["compensated"]:
-        result |= {"largest_translation_m": largest.translation_m, "largest_rotation_deg": largest.rotation_deg}
+        result |= {
+            "largest_translation_m": largest.translation_m,
+            "largest_rotation_deg": largest.rotation_deg,
+            "units_not_compensated": len(_not_compensated(model)),
+        }
     return result
+
+
+def _not_compensated(model: Model) -> Ints:
+    # The others did not move: that is why they are no keyframes.
+    return model.motion.not_compensated(model.state, model.registered & model.keyframe)
+
+
+def motion_findings(model: Model) -> list[Finding]:
+    """What a user is told of the motion within units."""
+    units = _not_compensated(model)
+    return [rig_motion.finding(len(units), int(model.registered.sum()))] if len(units) else []
 
 
 def _poorly_seen(model: Model) -> list[str]:

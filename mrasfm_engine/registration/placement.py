@@ -36,7 +36,6 @@ class Placement:
     reason: str = ""
     alignment: GnssAlignment | None = None
     units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that took part in aligning
-    sigma_scale: float = float("nan")  # of the alignment's scale, with errors that change slowly taken into account
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
 
@@ -61,7 +60,6 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     _move(model, alignment.world_from_model)
     good = units[alignment.inlier]
     correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
-    sigma_scale = alignment.sigma_scale * float(np.sqrt(correlated))
     findings = []
     if not single:
         findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
@@ -71,7 +69,7 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
         sigma_m=sigma[good] * alignment.noise_factor * np.sqrt(correlated),
         lever_arm_m=np.asarray(antenna_in_rig_m),
     )
-    return Placement(prior=prior, alignment=alignment, units=units, sigma_scale=sigma_scale, findings=findings)
+    return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
 
 
 def _align(model: Model, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats) -> GnssAlignment | str:
@@ -123,21 +121,6 @@ def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> 
     if len(times_us) < 2:
         return 1.0
     return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
-
-
-def share_scale(model: Model, placement: Placement) -> None:
-    """Scale the scene and the rig's baselines to where their prior and the receiver meet.
-
-    Adjustment would get there as well, but along a direction in which the cost hardly changes, and only after many
-    steps.
-    """
-    alignment = placement.alignment
-    if alignment is None or model.drive.has_single_camera:
-        return
-    rig, sigma_rig = scale_of_baselines(model)
-    information_rig, information_gnss = 1.0 / sigma_rig**2, 1.0 / max(placement.sigma_scale, 1e-9) ** 2
-    factor = (information_rig * rig + information_gnss * alignment.scale) / (information_rig + information_gnss)
-    scale_with_baselines(model, factor)
 
 
 def _findings(

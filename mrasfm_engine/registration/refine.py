@@ -16,7 +16,7 @@ from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.registration.calibration import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
-    CalibrationVerdict,
+    CalibrationDecision,
     calibration_prior,
     judge_calibration,
     scale_of_baselines,
@@ -25,7 +25,7 @@ from mrasfm_engine.registration.calibration import (
 )
 from mrasfm_engine.registration.georeference import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses, share_scale
+from mrasfm_engine.registration.placement import Placement, place_by_gnss, place_by_rough_poses
 from mrasfm_engine.registration.road import RoadJudgement, drop_off_road
 from mrasfm_engine.registration.wrong_camera import (
     MIN_OTHERS,
@@ -52,7 +52,7 @@ class Refinement:
     sigma_px: float = 1.0
     placement: Placement | None = None  # by GNSS, where it was to be used
     placed_by_rough_poses: bool = False
-    calibration: CalibrationVerdict = field(default_factory=lambda: CalibrationVerdict(False, ""))
+    calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     focal_free: bool = False
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
     adjustments: list[Report] = field(default_factory=list)
@@ -120,8 +120,7 @@ def refine(
     if not result.calibration.free:
         result.recalibrated = _wrong_although_held(model, free_units, positions, result, cancel)
     result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
-    if result.calibration.free and result.placement is not None and model.config.adjustment.priors:
-        share_scale(model, result.placement)
+    _settle(model, result, _terms(model, positions, result))
     for done in range(ROUNDS):
         result.sigma_px = _observation_sigma(model)
         terms = _terms(model, positions, result)
@@ -151,12 +150,12 @@ def refine(
     result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _certainty(model, positions, result)
     result.directions = _directions(model, result.certainty)
-    if result.recalibrated.any() and result.directions is not None and result.certainty is not None:
+    if result.recalibrated.any() and result.directions is not None:
         if result.calibration.free and result.directions.to_hold.any():
             _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
         if result.georeferenced and result.directions.scale_only_prior:
             scale_with_baselines(model, scale_of_baselines(model)[0])
-        known = calibration_prior(model), model.state, result.certainty, result.directions
+        known = calibration_prior(model), model.state, result.directions
         result.wrong_cameras = find_wrong_cameras(*known)
         result.wrong_pair = find_wrong_pair(*known)
     return result
@@ -187,10 +186,9 @@ def _wrong_although_held(
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return wrong
     solution, _ = solve(problem, cancel=cancel)
-    certainty = covariances(problem, solution)
-    directions = _directions(model, certainty)
+    directions = _directions(model, covariances(problem, solution))
     if directions is not None:
-        for found in find_wrong_cameras(calibration_prior(model), solution, certainty, directions):
+        for found in find_wrong_cameras(calibration_prior(model), solution, directions):
             wrong[found.camera] = True
     return wrong if (~wrong).sum() >= MIN_OTHERS else np.zeros_like(wrong)
 
@@ -237,6 +235,7 @@ def _hold_unobserved(
 
 
 def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
+    """Let the priors and the positions say the scale, where the calibration and with it the scale may vary."""
     several = not model.drive.has_single_camera
     if result.calibration.free and several and terms and model.config.adjustment.camera_set_adjustment:
         settle_scale(model, terms)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.problem import ShotMotion
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.local_motion import LocalMotion, local_motion, moved, smoothed_velocity
-from mrasfm_engine.scene.shots import Shots
+from mrasfm_engine.geometry.local_motion import MAX_GAP_S, LocalMotion, local_motion, moved, smoothed_velocity
+from mrasfm_engine.io.findings import Finding, warning
+from mrasfm_engine.scene.shots import MAX_BAND_S, Shots
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
@@ -51,12 +52,16 @@ class RigMotion:
         self._own = np.zeros(len(shots.middle_of_image), dtype=np.bool_)
         self._unit_from_image = np.tile(np.eye(4), (len(self._own), 1, 1))
         self._shot_range = np.searchsorted(shots.unit, np.arange(len(timestamps_us) + 1))
-        self._prior_velocity = np.zeros((len(timestamps_us), 6))  # of units without registered neighbours
+        # Of units without registered neighbours; zero where it is not known.
+        self._prior_velocity = np.zeros((len(timestamps_us), 6))
+        self._prior_known = np.zeros(len(timestamps_us), dtype=np.bool_)
 
     def follow_prior(self, world_from_rig: Floats) -> None:
         """Where no registered unit says how the vehicle moves, prior poses (u, 4, 4) do; NaN where unknown."""
         if not self.shots.simultaneous:
-            self._prior_velocity = smoothed_velocity(world_from_rig, self._time_s, window_s=PRIOR_WINDOW_S)
+            velocity = smoothed_velocity(world_from_rig, self._time_s, window_s=PRIOR_WINDOW_S)
+            self._prior_known[:] = np.isfinite(velocity).all(axis=1)
+            self._prior_velocity = np.nan_to_num(velocity)
 
     def set_image_pose(self, image: int, unit_from_image: Floats) -> None:
         """Give an image a pose (4, 4) of its own: the rig's, relative to its unit's, at the image's timestamp.
@@ -167,6 +172,17 @@ class RigMotion:
             rotation_deg=float(se3.rotation_angle_deg(state.shot_rotation[rows]).max()),
         )
 
+    def not_compensated(self, state: State, registered: Bools) -> Ints:
+        """Registered units whose shots are apart in time although nothing says how the vehicle moved meanwhile.
+
+        Their shots stand where the unit does, as if all had been taken at once.
+        """
+        # Where an image has a pose of its own, only its rows are apart from it.
+        own = self._own[self.shots.image]
+        apart_s = self.shots.time_offset_s - np.where(own, self._offset_of_image(np.arange(len(self.shots))), 0.0)
+        unknown = ~local_motion(state.world_from_rig, self._time_s, registered).known & ~self._prior_known
+        return np.intersect1d(self.shots.unit[np.abs(apart_s) > MAX_BAND_S], np.flatnonzero(registered & unknown))
+
     def _shots_of(self, units: Ints) -> Ints:
         first, last = self._shot_range[units], self._shot_range[units + 1]
         rows = [np.arange(lo, hi) for lo, hi in zip(first, last, strict=True)]
@@ -189,6 +205,16 @@ class RigMotion:
             own_pose = self._unit_from_image[self.shots.image[rows[own]]]
             at_shot[own] = own_pose @ se3.inverse(at_image[own]) @ at_shot[own]
         state.shot_rotation[rows], state.shot_position_m[rows] = at_shot[:, :3, :3], at_shot[:, :3, 3]
+
+
+def finding(not_compensated: int, units: int) -> Finding:
+    """What a user is told of units whose motion nothing tells, by their number and that of all registered ones."""
+    return warning(
+        "motion-not-compensated",
+        f"{not_compensated} of {units} registered units have no other one within {MAX_GAP_S:g} s: how the vehicle "
+        "moved between the times of their images is not known, and these count as taken at once",
+        "Give frames that are closer in time, or frames whose images were taken at once.",
+    )
 
 
 def _with_neighbours(units: Ints, registered: Bools) -> Ints:

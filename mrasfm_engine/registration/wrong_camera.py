@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.adjustment.calibration_verdict import Observability
-from mrasfm_engine.adjustment.observability import Covariances
 from mrasfm_engine.adjustment.priors import CalibrationPrior
 from mrasfm_engine.io.findings import Finding, warning
 from mrasfm_engine.registration.camera_set import Registration
@@ -46,9 +45,7 @@ class WrongPair:
     translation_m: float
 
 
-def find_wrong_pair(
-    prior: CalibrationPrior, state: State, certainty: Covariances, directions: Observability
-) -> WrongPair | None:
+def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observability) -> WrongPair | None:
     """Of a rig of two cameras, whether they are off against each other by more than their prior can be."""
     corrections = np.where(directions.observed, prior.corrections(state), 0.0)
     if len(corrections) != 2:
@@ -67,9 +64,7 @@ def find_wrong_pair(
     )
 
 
-def find_wrong_cameras(
-    prior: CalibrationPrior, state: State, certainty: Covariances, directions: Observability
-) -> list[WrongCamera]:
+def find_wrong_cameras(prior: CalibrationPrior, state: State, directions: Observability) -> list[WrongCamera]:
     """Cameras whose correction is certain, and far outside its prior or far from what the other cameras need.
 
     Only directions count that the drive observes.

@@ -28,6 +28,8 @@ class ImageFeatures:
     scores: NDArray[np.float32] | None = None  # (n,) a trained network's confidence
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
     classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where it was not asked
+    made_mask: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         if not len(self.classes):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mrasfm_engine.geometry.parabola import vertex
 from mrasfm_engine.views.mosaic import GIVEN, REFINED, Grid, Mosaic
 
 Floats = NDArray[np.float64]
@@ -148,8 +149,8 @@ def _compare(blocks: Sequence[_Block], which: int, margin: int, cell_m: float) -
         correlations.append(float(score[margin, margin]))
         i, j = np.unravel_index(int(score.argmax()), score.shape)
         if score[i, j] >= MIN_PEAK and 0 < i < 2 * margin and 0 < j < 2 * margin:
-            di = _vertex(score[i - 1, j], score[i, j], score[i + 1, j])
-            dj = _vertex(score[i, j - 1], score[i, j], score[i, j + 1])
+            di = vertex(score[i - 1, j], score[i, j], score[i + 1, j])
+            dj = vertex(score[i, j - 1], score[i, j], score[i, j + 1])
             displacements.append(cell_m * float(np.hypot(i + di - margin, j + dj - margin)))
     return Agreement(
         blocks=len(blocks),
@@ -157,9 +158,3 @@ def _compare(blocks: Sequence[_Block], which: int, margin: int, cell_m: float) -
         displaced_blocks=len(displacements),
         displacement_m=float(np.median(displacements)) if displacements else float("nan"),
     )
-
-
-def _vertex(before: float, at: float, after: float) -> float:
-    """Where a parabola through three samples has its top, in samples from the middle one."""
-    curvature = before - 2 * at + after
-    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera
-from mrasfm_engine.io.images import read_image_rgb, read_mask
+from mrasfm_engine.io.images import mask_of_png, read_image_rgb, read_mask
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import class_codes, usable_pixels
 from mrasfm_engine.views.agreement import FINE_CELL_M, Agreement, measure_agreement, plots_along
@@ -143,7 +143,7 @@ def _mosaics_of(
         views,
         grids_along(way_m),
         ground,
-        lambda index: _read(scene, int(images[index])),
+        lambda index: read_view(scene, int(images[index])),
         own_car_m=_own_car_m(scene),
         step=step,
     )
@@ -159,6 +159,7 @@ def grids_along(way_m: Floats) -> list[Grid]:
 def _own_car_m(scene: Scene) -> Floats | None:
     """About where the car itself is: around its cameras, and no smaller than cars are."""
     label_map = scene.drive.manifest.label_map or LabelMap.cityscapes()
+    # Masks that a network made do not count: few know the car that carries the cameras from others.
     masked = all(image.mask is not None for image in scene.drive.images)
     if masked and SemanticClass.OWN_CAR in label_map.ids.values():
         return None
@@ -177,14 +178,21 @@ def _nearest_first(scene: Scene) -> NDArray[np.int64]:
     return images[np.argsort(np.where(forward, -unit, unit), kind="stable")]
 
 
-def _read(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
-    """An image and where it shows what stands still; a margin belongs to what moves, as masks are not exact."""
-    image, root = scene.drive.images[index], scene.drive.root
+def read_view(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
+    """An image (h, w, 3), and where it shows what stands still (h, w), None where no mask says so.
+
+    A margin belongs to what moves, as masks are not exact.
+    """
+    image, root, made = scene.drive.images[index], scene.drive.root, scene.features[index].made_mask
     rgb = read_image_rgb(root / image.file)
-    if image.mask is None:
-        return rgb, None
     label_map = scene.drive.manifest.label_map
-    usable = usable_pixels(class_codes(read_mask(root / image.mask, label_map), label_map or LabelMap.cityscapes()))
+    if image.mask is not None:
+        mask = read_mask(root / image.mask, label_map)
+    elif made is not None:
+        mask = mask_of_png(made)
+    else:
+        return rgb, None
+    usable = usable_pixels(class_codes(mask, label_map or LabelMap.cityscapes()))
     side = 2 * max(1, round(MASK_MARGIN_SHARE * rgb.shape[1])) + 1
     return rgb, cv2.erode(usable.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -43,7 +44,7 @@ def framed(
     out = np.full((height + top + bottom, max(width, 640), 3), PAPER, np.uint8)
     out[top : top + height, :width] = picture
     for k, text in enumerate(lines):
-        _text(out, text, (10, line * (k + 1)), size)
+        write_text(out, text, (10, line * (k + 1)), size=size)
     _scale_bar(out, (20, top + height + line), width, cell_m, size)
     x = out.shape[1] - round(90 * size) - 10
     for label, direction in reversed(arrows):
@@ -52,8 +53,27 @@ def framed(
     return Framed(out, top)
 
 
-def _text(out: Bytes, text: str, at: tuple[int, int], size: float) -> None:
-    cv2.putText(out, text, at, FONT, size, INK, max(1, round(1.6 * size)), cv2.LINE_AA)
+def write_text(
+    picture: Bytes,
+    text: str,
+    at: tuple[int, int],
+    *,
+    size: float = 0.5,
+    align: Literal["left", "centre", "right"] = "left",
+) -> None:
+    """Write a line into a picture (h, w, 3): its left end, middle or right end at a column, its foot on a row.
+
+    Parameters
+    ----------
+    at
+        Column and row, pixels.
+    size
+        Of OpenCV's fonts: capitals are about 21 pixels high times that.
+    """
+    thick = max(1, round(1.6 * size))
+    width = cv2.getTextSize(text, FONT, size, thick)[0][0]
+    shift = {"left": 0, "centre": width // 2, "right": width}[align]
+    cv2.putText(picture, text, (at[0] - shift, at[1]), FONT, size, INK, thick, cv2.LINE_AA)
 
 
 def _scale_bar(out: Bytes, at: tuple[int, int], width: int, cell_m: float, size: float) -> None:
@@ -64,12 +84,13 @@ def _scale_bar(out: Bytes, at: tuple[int, int], width: int, cell_m: float, size:
     cv2.rectangle(out, (x, y), (x + pixels, y + thick), INK, 1)
     cv2.rectangle(out, (x, y), (x + pixels // 2, y + thick), INK, -1)
     for share in (0.0, 0.5, 1.0):
-        _text(out, f"{share * length_m:g}", (x + round(share * pixels) - 4, y + thick + round(26 * size)), 0.8 * size)
-    _text(out, "m", (x + pixels + round(46 * size), y + thick + round(26 * size)), 0.8 * size)
+        foot = x + round(share * pixels) - 4, y + thick + round(26 * size)
+        write_text(out, f"{share * length_m:g}", foot, size=0.8 * size)
+    write_text(out, "m", (x + pixels + round(46 * size), y + thick + round(26 * size)), size=0.8 * size)
 
 
 def _arrow(out: Bytes, centre: tuple[int, int], direction: tuple[float, float], label: str, size: float) -> None:
     v = np.array([direction[0], -direction[1]]) * round(26 * size)
     tail, tip = (tuple((np.array(centre) + s * v).round().astype(int).tolist()) for s in (-1, 1))
     cv2.arrowedLine(out, tail, tip, INK, max(2, round(3 * size)), cv2.LINE_AA, tipLength=0.35)
-    _text(out, label, (centre[0] - round(110 * size), centre[1] + round(8 * size)), 0.8 * size)
+    write_text(out, label, (centre[0] - round(110 * size), centre[1] + round(8 * size)), size=0.8 * size)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.scene.road import Road, Thickness
 from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.views.drawing import write_text
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -27,9 +28,8 @@ SIDE_VIEW = (90, 110, 1570, 520)  # left, top, right, bottom
 TOP_VIEW = (90, 610, 1570, 900)
 ON_SURFACE_M = 0.05  # farther points are coloured as above or below the surface
 MARGIN_M = 1.0  # of height above and below the surface in the side view
-BLACK, GREY, PALE = (40, 40, 40), (110, 110, 110), (228, 228, 228)
+GREY, PALE = (110, 110, 110), (228, 228, 228)
 ON, ABOVE, BELOW, SURFACE, WAY = (120, 120, 120), (30, 60, 220), (200, 90, 20), (60, 150, 40), (0, 140, 230)  # BGR
-FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,15 +54,15 @@ class _Panel:
         for value in _ticks(self.low[0], self.high[0], 12):
             column = int(self.pixels(np.array([[value, self.low[1]]]))[0, 0])
             cv2.line(image, (column, top), (column, bottom), PALE, 1)
-            _text(image, f"{value:g}", (column, bottom + 18), align="centre")
+            write_text(image, f"{value:g}", (column, bottom + 18), align="centre")
         for value in _ticks(self.low[1], self.high[1], 6):
             row = int(self.pixels(np.array([[self.low[0], value]]))[0, 1])
             cv2.line(image, (left, row), (right, row), PALE, 1)
-            _text(image, f"{value:g}", (left - 8, row + 5), align="right")
+            write_text(image, f"{value:g}", (left - 8, row + 5), align="right")
         cv2.rectangle(image, (left, top), (right, bottom), GREY, 1)
-        _text(image, title, (left, top - 10))
-        _text(image, x_label, ((left + right) // 2, bottom + 40), align="centre")
-        _text(image, y_label, (12, top - 10))
+        write_text(image, title, (left, top - 10))
+        write_text(image, x_label, ((left + right) // 2, bottom + 40), align="centre")
+        write_text(image, y_label, (12, top - 10))
 
     def scatter(self, image: Image, xy: Floats, colour: tuple[int, int, int]) -> None:
         """Points (n, 2) as small squares."""
@@ -171,8 +171,8 @@ def _draw(road: Road, views: _Views, shown: Bools, what: str) -> Image:
     image: Image = np.full((SIZE_PX[1], SIZE_PX[0], 3), 255, np.uint8)
     distance = road.before.distance_m
     thickness = Thickness.of(distance[shown])
-    _text(image, f"Road points {what} those off the surface were dropped", (90, 34), scale=0.8)
-    _text(
+    write_text(image, f"Road points {what} those off the surface were dropped", (90, 34), size=0.8)
+    write_text(
         image,
         f"{int(shown.sum())} points, told by {road.source}; thickness {100 * thickness.range90_m:.1f} cm "
         f"(5th to 95th percentile of signed distances), spread {100 * thickness.spread_m:.1f} cm (1.4826 MAD); "
@@ -216,7 +216,7 @@ def _legend(image: Image) -> None:
         (WAY, "the vehicle's way"),
     ):
         cv2.rectangle(image, (column, 972), (column + 14, 986), colour, -1)
-        _text(image, text, (column + 22, 985))
+        write_text(image, text, (column + 22, 985))
         column += 60 + 10 * len(text)
 
 
@@ -227,9 +227,3 @@ def _ticks(low: float, high: float, most: int) -> Floats:
     step = next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= raw)
     result: Floats = np.round(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step, 9)
     return result
-
-
-def _text(image: Image, text: str, at: tuple[int, int], *, scale: float = 0.5, align: str = "left") -> None:
-    width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
-    shift = {"left": 0, "centre": width // 2, "right": width}[align]
-    cv2.putText(image, text, (at[0] - shift, at[1]), FONT, scale, BLACK, 1, cv2.LINE_AA)

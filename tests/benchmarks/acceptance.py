@@ -14,18 +14,25 @@
 | 10 | ablation: the method without each of its parts |
 | 11 | the road from above, before and after recalibration |
 | 12 | learned keypoints and matches: accuracy on a real drive, and light that changes |
+
+What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 
 from rich.console import Console
 
@@ -38,32 +45,101 @@ from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
 from tests.benchmarks.occlusion import occlusion
 from tests.benchmarks.real_drives import accuracy, speed
-from tests.benchmarks.recalibration import recalibration
-from tests.benchmarks.rendered_drives import SEEDS, rendered
-from tests.benchmarks.semantics import semantics
+from tests.benchmarks.recalibration import recalibration, straight_street
+from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
+from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import service
 from tests.benchmarks.table import Figure, failed, save, show
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-Line = Callable[[Path, Path], Iterator[Figure]]  # of the folders of real drives and of work
 
 
-def lines_for(seeds: Sequence[int]) -> dict[str, Line]:
-    """What can be measured, by number."""
-    return {
-        "1": accuracy,
-        "2": speed,
-        "3": lambda data, work: rendered(work, seeds),
-        "4": fresh_clone,
-        "5": service,
-        "6": lambda data, work: semantics(data, work, seeds),
-        "7": lambda data, work: occlusion(work, seeds),
-        "8": lambda data, work: recalibration(work, seeds),
-        "9": lambda data, work: motion(work, seeds),
-        "10": ablation,
-        "11": birds_eye,
-        "12": learned,
-    }
+@dataclass(frozen=True)
+class Line:
+    """What is measured under one number. All of it works on folders that the measurement is given and may fill."""
+
+    timed: tuple[Callable[[Path, Path], Iterator[Figure]], ...] = ()  # of the real drives' folder and of work
+    untimed: tuple[Callable[[Path, Path], Iterator[Figure]], ...] = ()
+    by_seed: tuple[Callable[[Path, int], Iterator[Figure]], ...] = ()  # of a folder of work and a seed
+
+
+LINES = {
+    "1": Line(timed=(accuracy,)),
+    "2": Line(timed=(speed,)),
+    "3": Line(by_seed=(rendered, rendered_loop)),
+    "4": Line(timed=(fresh_clone,)),
+    "5": Line(timed=(service,)),
+    "6": Line(by_seed=(shadowed_road,), untimed=(real_road,)),
+    "7": Line(by_seed=(occlusion,)),
+    "8": Line(by_seed=(recalibration, straight_street)),
+    "9": Line(by_seed=(motion,)),
+    "10": Line(timed=(ablation,)),
+    "11": Line(untimed=(birds_eye,)),
+    "12": Line(untimed=(learned,)),
+}
+
+
+@dataclass
+class Run:
+    """The measurement's figures so far, by line and task."""
+
+    data: Path
+    work: Path
+    started_s: float = field(default_factory=time.perf_counter)
+    figures: dict[tuple[str, int], list[Figure]] = field(default_factory=dict)
+
+    def measure(self, line: str, part: int, measure: Callable[[Path], Iterator[Figure]], work: Path) -> None:
+        """Run one task; what keeps it from its end is a figure that fails."""
+        figures = self.figures[line, part]
+        try:
+            for figure in measure(work):
+                figures.append(figure)
+                print(_progress(figure, time.perf_counter() - self.started_s), file=sys.stderr, flush=True)
+        except (CommandFailed, AssertionError) as problem:
+            figures.append(failed(line, "the line was not measured to its end", str(problem)))
+            print(f"line {line}: {problem}", file=sys.stderr, flush=True)
+
+    def alone(self, lines: Sequence[str]) -> None:
+        """What is timed, one after the other in one folder: scenes are used again."""
+        for line in lines:
+            for measure in LINES[line].timed:
+                part = len(self.figures)
+                self.figures[line, part] = []
+                self.measure(line, part, partial(measure, self.data), self.work)
+
+    def side_by_side(self, lines: Sequence[str], seeds: Sequence[int]) -> None:
+        """What is not timed, each task on a core and in a folder of its own."""
+        tasks: list[tuple[str, Callable[[Path], Iterator[Figure]]]] = []
+        for line in lines:
+            tasks += [(line, partial(measure, self.data)) for measure in LINES[line].untimed]
+            tasks += [(line, partial(_seeded, measure, seed)) for measure in LINES[line].by_seed for seed in seeds]
+        cores: SimpleQueue[int] = SimpleQueue()
+        for core in sorted(os.sched_getaffinity(0)):
+            cores.put(core)
+
+        def run(line: str, part: int, measure: Callable[[Path], Iterator[Figure]]) -> None:
+            core = cores.get()
+            os.sched_setaffinity(0, {core})  # of this thread, and of the commands that it starts
+            work = self.work / f"line {line}, {part}"
+            work.mkdir()
+            try:
+                self.measure(line, part, measure, work)
+            finally:
+                shutil.rmtree(work)
+                cores.put(core)
+
+        with ThreadPoolExecutor(cores.qsize()) as pool:
+            futures = []
+            for line, measure in tasks:
+                part = len(self.figures)
+                self.figures[line, part] = []
+                futures.append(pool.submit(run, line, part, measure))
+            for future in futures:
+                future.result()
+
+
+def _seeded(measure: Callable[[Path, int], Iterator[Figure]], seed: int, work: Path) -> Iterator[Figure]:
+    return measure(work, seed)
 
 
 def main() -> int:
@@ -76,15 +152,19 @@ def main() -> int:
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
     arguments = parser.parse_args()
-    known = lines_for([int(seed) for seed in arguments.seeds.split(",")])
-    lines = arguments.only.split(",") if arguments.only else [line for line in known if line != "4"]
+    lines = arguments.only.split(",") if arguments.only else [line for line in LINES if line != "4"]
     lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
-    if unknown := set(lines) - set(known):
+    if unknown := set(lines) - set(LINES):
         parser.error(f"there is no line {', '.join(sorted(unknown))}")
     data = Path(os.environ.get("MRASFM_TEST_DATA", REPOSITORY.parent / "shared")) / "data"
     if not data.is_dir():
         parser.error(f"real drives are missing: {data} (set MRASFM_TEST_DATA)")
-    figures, seconds = _measure({line: known[line] for line in lines}, data.resolve())
+    with tempfile.TemporaryDirectory(prefix="mrasfm-acceptance-") as work:
+        run = Run(data.resolve(), Path(work))
+        run.alone(lines)
+        run.side_by_side(lines, [int(seed) for seed in arguments.seeds.split(",")])
+        seconds = time.perf_counter() - run.started_s
+    figures = [figure for line in lines for key, part in run.figures.items() if key[0] == line for figure in part]
     console = Console(width=140)
     show(figures, console)
     bad = [figure for figure in figures if not figure.passed]
@@ -92,21 +172,6 @@ def main() -> int:
     console.print(f"{len(bad)} of {sum(f.bounded for f in figures)} figures out of bounds, {seconds / 60:.0f} min")
     console.print(f"Written to {arguments.out}", soft_wrap=True)
     return 1 if bad or not figures else 0
-
-
-def _measure(lines: dict[str, Line], data: Path) -> tuple[list[Figure], float]:
-    started = time.perf_counter()
-    figures: list[Figure] = []
-    with tempfile.TemporaryDirectory(prefix="mrasfm-acceptance-") as work:
-        for line, measure in lines.items():
-            try:
-                for figure in measure(data, Path(work)):
-                    figures.append(figure)
-                    print(_progress(figure, time.perf_counter() - started), file=sys.stderr, flush=True)
-            except (CommandFailed, AssertionError) as problem:
-                figures.append(failed(line, "the line was not measured to its end", str(problem)))
-                print(f"line {line}: {problem}", file=sys.stderr, flush=True)
-    return figures, time.perf_counter() - started
 
 
 def _progress(figure: Figure, elapsed_s: float) -> str:

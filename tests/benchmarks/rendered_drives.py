@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,24 +28,20 @@ PERTURBATION = ("--perturb-rotation-deg", 0.3, "--perturb-translation-m", 0.02)
 TIGHT = {"sigma_rotation_deg": 0.01, "sigma_translation_m": 0.001}
 
 
-def rendered(work: Path, seeds: Sequence[int]) -> Iterator[Figure]:
-    """Line 3."""
-    for seed in seeds:
-        drive = work / f"seed {seed}"
-        mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", seed, *PERTURBATION, "--out", drive)
-        yield from perturbed(drive, work / f"seed {seed} perturbed scene", seed)
-        yield from tight(_with_true_calibration(drive, work / f"seed {seed} tight"), work / f"seed {seed} tight scene")
-        for folder in work.glob(f"seed {seed}*"):
-            shutil.rmtree(folder)
-    for seed in seeds:
-        drive = work / f"loop {seed}"
-        route = ("--world", "loop", "--units", LOOP_UNITS, "--spacing-m", LOOP_SPACING_M)
-        mrasfm(
-            "synth", "--cameras", CAMERAS, "--seed", seed, *route, *LOOP_SIZE, "--no-masks", "--tight", "--out", drive
-        )
-        yield from loop(drive, work / f"loop {seed} scene", seed)
-        for folder in work.glob(f"loop {seed}*"):
-            shutil.rmtree(folder)
+def rendered(work: Path, seed: int) -> Iterator[Figure]:
+    """Lines 3a and 3b."""
+    drive = work / f"seed {seed}"
+    mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", seed, *PERTURBATION, "--out", drive)
+    yield from perturbed(drive, work / f"seed {seed} perturbed scene", seed)
+    yield from tight(_with_true_calibration(drive, work / f"seed {seed} tight"), work / f"seed {seed} tight scene")
+
+
+def rendered_loop(work: Path, seed: int) -> Iterator[Figure]:
+    """Line 3c."""
+    drive = work / f"loop {seed}"
+    route = ("--world", "loop", "--units", LOOP_UNITS, "--spacing-m", LOOP_SPACING_M)
+    mrasfm("synth", "--cameras", CAMERAS, "--seed", seed, *route, *LOOP_SIZE, "--no-masks", "--tight", "--out", drive)
+    yield from loop(drive, work / f"loop {seed} scene", seed)
 
 
 def perturbed(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from mrasfm_engine.ablation import FULL, SWITCHES
-from mrasfm_engine.config import EngineConfig
+from mrasfm_engine import ablation
+from mrasfm_engine.ablation import FULL, SWITCHES, Row, _remark, switches_named
+from mrasfm_engine.config import EngineConfig, SemanticsConfig
+from mrasfm_engine.io.drive_bundle import read_drive
 from tests.integration.conftest import Ran, Variant
 
 Run = Callable[..., Ran]
@@ -30,6 +33,17 @@ def test_every_part_is_on_by_default_and_each_switch_turns_off_one() -> None:
         assert before[switch.section].pop(switch.field) is True
         assert after[switch.section].pop(switch.field) is False
         assert before == after
+
+
+def test_what_the_road_is_known_by_without_masks_depends_on_a_model_for_them(small: Variant) -> None:
+    for frame in small.document["frames"]:
+        for image in frame["images"].values():
+            image.pop("mask")
+    drive, config = read_drive(small.save().root), EngineConfig()
+    [switch] = switches_named(["mapping.semantic_triangulation"])
+    assert "no masks" in _remark(switch, drive, config)
+    by_model = config.model_copy(update={"semantics": SemanticsConfig(model="mine")})
+    assert _remark(switch, drive, by_model) == ""
 
 
 @pytest.mark.slow
@@ -77,7 +91,7 @@ def test_the_table_for_people(small: Variant, mrasfm: Run) -> None:
         (("--truth", "{drive}/truth.tum", "--only", "pairs.window_units"), "--only pairs.window_units"),
         (("--truth", "{drive}/truth.tum", "--truth-calibration", "{drive}/drive.json"), "is not a calibration"),
         (("--truth", "{drive}/truth.tum", "--truth-calibration", "{drive}/one.json"), "has no pose of left"),
-        (("--truth", "{drive}/truth.tum", "--out", "{drive}/drive.json"), "cannot be written"),
+        (("--truth", "{drive}/truth.tum", "--out", "{drive}/drive.json"), "cannot write {drive}/drive.json"),
     ],
 )
 def test_bad_input_is_named_before_any_work(
@@ -90,7 +104,7 @@ def test_bad_input_is_named_before_any_work(
     small.write("one.json", json.dumps({"front": calibration["front"]}).encode())
     result = mrasfm("ablate", small.root, *(option.format(drive=small.root) for option in options))
     assert result.code == 2
-    assert message in result.err
+    assert message.format(drive=small.root) in result.err
     assert "features" not in result.err
 
 
@@ -98,3 +112,21 @@ def test_a_drive_that_is_none_is_refused(mrasfm: Run, small: Variant, tmp_path: 
     result = mrasfm("ablate", tmp_path / "none", "--truth", small.root / "truth.tum")
     assert result.code == 2
     assert "does not exist" in result.err
+
+
+def test_only_what_cannot_be_written_is_blamed_on_the_folder_for_the_result(
+    mrasfm: Run, small: Variant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, command = tmp_path / "out", ("ablate", small.root, "--truth", small.root / "truth.tum", "--out")
+
+    def damaged(*_: object, **__: object) -> list[Row]:
+        raise OSError(errno.EIO, "Input/output error", str(small.root / "drive.json"))
+
+    monkeypatch.setattr(ablation, "ablate", damaged)
+    with pytest.raises(OSError, match=r"Input/output error.*drive\.json"):
+        mrasfm(*command, out)
+    monkeypatch.setattr(ablation, "ablate", lambda *_, **__: [])
+    (out / "ablation.json").mkdir()
+    result = mrasfm(*command, out)
+    assert result.code == 2
+    assert f"cannot write {out / 'ablation.json'}" in result.err

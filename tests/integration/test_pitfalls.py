@@ -47,11 +47,25 @@ def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None
 
 
 @pytest.mark.slow
-def test_cameras_that_are_not_simultaneous(tmp_path: Path, mrasfm: Run) -> None:
+def test_cameras_that_are_not_simultaneous(tmp_path: Path, mrasfm: Run, variant_of: Callable[[Path], Variant]) -> None:
     drive = synth(tmp_path / "drive", "--cameras", 3, "--units", 6, "--time-skew-ms", 40, "--seed", 7)
     errors = reconstructed(mrasfm, drive, tmp_path / "scene")
     assert errors["registered_units"] == 6
     assert 0 < errors["metric"]["rmse_m"] < 1.0  # not compensated: up to 0.2 m of way between cameras
+    motion = read_report(tmp_path / "scene")["by_stage"]["refinement"]["motion_within_units"]
+    assert motion["compensated"]
+    assert motion["units_not_compensated"] == 0
+    # The same instants seconds apart: nothing tells how the car moved between the images of one.
+    slow = variant_of(drive)
+    slow.document.pop("gnss")
+    for u, frame in enumerate(slow.document["frames"]):
+        for of in (frame, *frame["images"].values()):
+            of["timestamp_us"] += 3_000_000 * u
+    result = mrasfm("reconstruct", slow.save().root, "--out", slow.scene)
+    assert result.code == 0, result.err
+    assert "warning: 6 of 6 registered units have no other one within 2.5 s" in result.out
+    motion = read_report(slow.scene)["by_stage"]["refinement"]["motion_within_units"]
+    assert motion["units_not_compensated"] == 6
 
 
 @pytest.mark.slow

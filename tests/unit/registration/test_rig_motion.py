@@ -1,15 +1,28 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from simulated_drive import SimulatedDrive, make_model, make_simulated_drive, metric_errors_m, rmse, true_matches
+from simulated_drive import (
+    FIRST_US,
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    metric_errors_m,
+    rmse,
+    true_matches,
+)
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.registration.calibration import scale_with_baselines
 from mrasfm_engine.registration.camera_set import register_unit
 from mrasfm_engine.registration.incremental import MappingLog, grow
+from mrasfm_engine.registration.mapping_report import describe_refinement, motion_findings
 from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.refine import Refinement
+from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.synthetic.simulate import poses_along
 
 SKEW_MS = [0, 40, -35, 25, -20, 50]
@@ -134,6 +147,60 @@ def test_rows_of_a_rolling_shutter_have_their_own_times() -> None:
     error_m = np.median(point_errors_m(model, simulated))
     assert 1e-3 < error_m < 0.04
     assert np.median(point_errors_m(without, simulated)) > 5 * error_m
+
+
+def in_time(simulated: SimulatedDrive, time_s: list[float]) -> SimulatedDrive:
+    """The drive at other times of its units; images are as far from them as before."""
+    manifest = simulated.drive.manifest
+    frames = []
+    for frame, t in zip(manifest.frames, time_s, strict=True):
+        later_us = FIRST_US + round(1e6 * t) - frame.timestamp_us
+        images = {
+            name: image.model_copy(update={"timestamp_us": (image.timestamp_us or frame.timestamp_us) + later_us})
+            for name, image in frame.images.items()
+        }
+        frames.append(frame.model_copy(update={"timestamp_us": frame.timestamp_us + later_us, "images": images}))
+    return replace(simulated, drive=Drive(simulated.drive.root, manifest.model_copy(update={"frames": frames})))
+
+
+def test_units_far_from_all_others_are_counted_and_named_in_a_warning() -> None:
+    simulated = in_time(skewed(units=7), [0.0, 0.1, 0.2, 5.0, 10.0, 10.1, 20.0])
+    model = make_model(simulated)
+    place_truly(model, simulated)
+    assert model.motion.not_compensated(model.state, model.registered).tolist() == [3, 6]
+    alone = model.motion.unit_from_image(model.state)[model.image_unit == 3]
+    np.testing.assert_array_equal(alone, np.tile(np.eye(4), (6, 1, 1)))
+    report = describe_refinement(model, Refinement(recalibrated=np.zeros(6, dtype=np.bool_)))
+    assert report["motion_within_units"]["units_not_compensated"] == 2
+    (said,) = motion_findings(model)
+    assert said.code == "motion-not-compensated"
+    assert "2 of 7 registered units" in said.what
+    # Images with poses of their own are where they are, whatever their times.
+    images = np.flatnonzero(model.image_unit == 3)
+    model.set_image_poses(images, np.tile(np.eye(4), (len(images), 1, 1)))
+    assert model.motion.not_compensated(model.state, model.registered).tolist() == [6]
+    # A unit without a pose is not missed, but its neighbour is alone now.
+    model.registered[5] = False
+    assert model.motion.not_compensated(model.state, model.registered).tolist() == [4, 6]
+
+
+def test_a_prior_tells_the_motion_where_no_registered_unit_does() -> None:
+    simulated = skewed(units=5)
+    model = make_model(simulated)
+    model.set_pose(2, simulated.world_from_rig[2])
+    assert len(motion_findings(model)) == 1
+    model.motion.follow_prior(simulated.world_from_rig)
+    assert motion_findings(model) == []
+
+
+def test_nothing_is_to_be_compensated_where_images_are_simultaneous_or_it_is_switched_off() -> None:
+    alone = [4.0 * u for u in range(3)]
+    off, at_once = settings(motion_compensation=False), skewed(units=3, time_offset_ms=None)
+    for simulated, config in ((skewed(units=3), off), (at_once, settings())):
+        drive = in_time(simulated, alone)
+        model = make_model(drive, config=config)
+        place_truly(model, drive)
+        assert motion_findings(model) == []
 
 
 def test_simultaneous_images_need_no_shots() -> None:

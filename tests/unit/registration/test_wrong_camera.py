@@ -7,7 +7,6 @@ import pytest
 from simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
 
 from mrasfm_engine.adjustment.calibration_verdict import Observability
-from mrasfm_engine.adjustment.observability import Covariances
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.registration.calibration import calibration_prior
 from mrasfm_engine.registration.camera_set import Registration
@@ -125,17 +124,11 @@ def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
         sigma_scale=0.01,
         prior_sigma_scale=0.01,
     )
-    nothing = Covariances(
-        sigma_unit_position_m=np.zeros((0, 3)),
-        sigma_camera=np.zeros((2, 7)),
-        sigma_scale=0.01,
-        calibration=np.zeros((12, 12)),
-    )
-    assert find_wrong_cameras(prior, state, nothing, directions) == []
-    pair = find_wrong_pair(prior, state, nothing, directions)
+    assert find_wrong_cameras(prior, state, directions) == []
+    pair = find_wrong_pair(prior, state, directions)
     assert pair is not None
     assert pair.rotation_deg == pytest.approx(3.0)
     said = pair_finding(["left", "right"], pair)
     assert "cameras left and right are turned by 3.00 deg" in said.what
     at_rest = replace(state, camera_rotation=prior.rotation)
-    assert find_wrong_pair(prior, at_rest, nothing, directions) is None
+    assert find_wrong_pair(prior, at_rest, directions) is None

@@ -1,0 +1,19 @@
+"""Maxima between samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_BEND = 1e-6  # of samples that bend less, rounding would tell the place
+
+
+def vertex(before: NDArray[np.floating], at: NDArray[np.floating], after: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Where parabolas through the samples (...) at -1, 0 and 1 are largest, within -0.5 and 0.5.
+
+    It is 0 where they hardly bend, or bend upwards.
+    """
+    bend = before - 2 * at + after
+    flat = bend > -MIN_BEND
+    offset: NDArray[np.floating] = np.clip(0.5 * (before - after) / np.where(flat, -1.0, bend), -0.5, 0.5)
+    return np.where(flat, 0.0, offset)
