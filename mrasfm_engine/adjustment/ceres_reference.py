@@ -1,7 +1,9 @@
 """Camera set bundle adjustment by Ceres, through pycolmap: slower, by other people, and therefore the reference.
 
 It takes a `Problem` and returns what `solver.solve` returns. What COLMAP has no words for is refused: terms besides the
-observations, and shots apart from their unit's timestamp.
+observations, and shots apart from their unit's timestamp. A rig of COLMAP's stands where one of its cameras does, which
+is held: the first that is fixed. (A rig whose reference sees nothing keeps all of its cameras where they are, whatever
+the options say.)
 """
 
 from __future__ import annotations
@@ -34,6 +36,11 @@ class CeresProblem:
     reconstruction: pycolmap.Reconstruction
     point_ids: Ints  # (p,)
 
+    @property
+    def reference(self) -> int:
+        """The camera where the rig stands."""
+        return int(np.flatnonzero(self.problem.layout.camera_slot < 0)[0])
+
     @staticmethod
     def of(problem: Problem) -> CeresProblem:
         """Hand a problem over.
@@ -45,8 +52,13 @@ class CeresProblem:
         """
         if problem.terms or problem.motion is not None:
             raise ValueError("COLMAP knows neither other terms nor images apart from their unit's timestamp")
+        if not (problem.layout.camera_slot < 0).any():
+            raise ValueError("COLMAP holds one camera of a rig, and all are free")
         reconstruction = pycolmap.Reconstruction()
-        _add_rig(reconstruction, problem)
+        point_ids = np.zeros(problem.observations.num_points, dtype=np.int64)
+        handed = CeresProblem(problem=problem, reconstruction=reconstruction, point_ids=point_ids)
+        rig_from_reference = problem.state.rig_from_cam[handed.reference]
+        _add_rig(reconstruction, problem, handed.reference)
         o, cameras = problem.observations, len(problem.camera_kind)
         image = o.unit * cameras + o.camera + 1
         order = np.argsort(image, kind="stable")
@@ -56,17 +68,16 @@ class CeresProblem:
         for u in range(len(problem.layout.unit_slot)):
             _add_frame(
                 reconstruction,
-                problem,
+                se3.inverse(problem.state.world_from_rig[u] @ rig_from_reference),
                 u,
                 [o.xy_px[order[bounds[i] : bounds[i + 1]]] for i in range(u * cameras + 1, (u + 1) * cameras + 1)],
             )
-        ids = np.zeros(o.num_points, dtype=np.int64)
         for p, (lo, hi) in enumerate(zip(o.first_of_point[:-1], o.first_of_point[1:], strict=True)):
             track = pycolmap.Track()
             for i, k in zip(image[lo:hi].tolist(), place[lo:hi].tolist(), strict=True):
                 track.add_element(i, k)
-            ids[p] = reconstruction.add_point3D(problem.state.points_m[p], track)
-        return CeresProblem(problem=problem, reconstruction=reconstruction, point_ids=ids)
+            point_ids[p] = reconstruction.add_point3D(problem.state.points_m[p], track)
+        return handed
 
     def adjuster(self) -> pycolmap.BundleAdjuster:
         """COLMAP's adjuster with the options of the problem; `solve` does the work."""
@@ -88,20 +99,25 @@ class CeresProblem:
         for u in np.flatnonzero(layout.unit_slot < 0):
             config.set_constant_rig_from_world_pose(int(u) + 1)
         for c in np.flatnonzero(layout.camera_slot < 0):
-            config.set_constant_sensor_from_rig_pose(_sensor(int(c)))
+            if c != self.reference:
+                config.set_constant_sensor_from_rig_pose(_sensor(int(c)))
             config.set_constant_cam_intrinsics(int(c) + 1)
         return pycolmap.create_default_bundle_adjuster(options, config, self.reconstruction)
 
     def state(self) -> State:
         """What the reconstruction holds now."""
         before, rig = self.problem.state, self.reconstruction.rigs[1]
+        rig_from_reference = before.rig_from_cam[self.reference]
         units = np.stack(
             [
                 _inverse(self.reconstruction.frames[u + 1].rig_from_world)
                 for u in range(len(self.problem.layout.unit_slot))
             ]
-        )
-        cameras = np.stack([_inverse(rig.sensor_from_rig(_sensor(c))) for c in range(len(before.camera_params))])
+        ) @ se3.inverse(rig_from_reference)
+        cameras = before.rig_from_cam.copy()
+        for c in range(len(cameras)):
+            if c != self.reference:
+                cameras[c] = rig_from_reference @ _inverse(rig.sensor_from_rig(_sensor(c)))
         params = before.camera_params.copy()
         for c, kind in enumerate(self.problem.camera_kind):
             params[c, : PARAMS[int(kind)]] = self.reconstruction.cameras[c + 1].params
@@ -148,21 +164,24 @@ def _sensor(camera: int) -> pycolmap.sensor_t:
     return pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=camera + 1)
 
 
-def _add_rig(reconstruction: pycolmap.Reconstruction, problem: Problem) -> None:
-    """Cameras, in a rig whose reference is the vehicle: a sensor that sees nothing."""
+def _add_rig(reconstruction: pycolmap.Reconstruction, problem: Problem, reference: int) -> None:
     rig = pycolmap.Rig(rig_id=1)
-    rig.add_ref_sensor(pycolmap.sensor_t(type=pycolmap.SensorType.IMU, id=1))
+    rig.add_ref_sensor(_sensor(reference))
+    rig_from_reference = problem.state.rig_from_cam[reference]
     for c, kind in enumerate(problem.camera_kind.tolist()):
         params = problem.state.camera_params[c, : PARAMS[kind]]
         size = {"width": IMAGE_SIZE_PX, "height": IMAGE_SIZE_PX}
         reconstruction.add_camera(pycolmap.Camera(camera_id=c + 1, model=MODEL[kind], params=params, **size))
-        rig.add_sensor(_sensor(c), _rigid(se3.inverse(problem.state.rig_from_cam[c])))
+        if c != reference:
+            rig.add_sensor(_sensor(c), _rigid(se3.inverse(problem.state.rig_from_cam[c]) @ rig_from_reference))
     reconstruction.add_rig(rig)
 
 
-def _add_frame(reconstruction: pycolmap.Reconstruction, problem: Problem, unit: int, xy_px: list[Floats]) -> None:
+def _add_frame(
+    reconstruction: pycolmap.Reconstruction, reference_from_world: Floats, unit: int, xy_px: list[Floats]
+) -> None:
     frame = pycolmap.Frame(frame_id=unit + 1, rig_id=1)
-    frame.rig_from_world = _rigid(se3.inverse(problem.state.world_from_rig[unit]))
+    frame.rig_from_world = _rigid(reference_from_world)
     first = unit * len(xy_px) + 1
     for c in range(len(xy_px)):
         frame.add_data_id(pycolmap.data_t(sensor_id=_sensor(c), id=first + c))
