@@ -102,6 +102,9 @@ class CeresProblem:
             if c != self.reference:
                 config.set_constant_sensor_from_rig_pose(_sensor(int(c)))
             config.set_constant_cam_intrinsics(int(c) + 1)
+        if problem.observations.fixed is not None:
+            for point_id in self.point_ids[problem.observations.fixed].tolist():
+                config.add_constant_point(point_id)
         return pycolmap.create_default_bundle_adjuster(options, config, self.reconstruction)
 
     def state(self) -> State:
@@ -155,7 +158,7 @@ def solve_with_ceres(problem: Problem) -> tuple[State, Report]:
         iterations=problem.options.max_iterations,
         termination=Termination.CONVERGED if converged else Termination.ITERATIONS,
         observations=len(problem.observations.unit),
-        parameters=free + 3 * problem.observations.num_points,
+        parameters=free + 3 * problem.observations.num_free_points,
         pose_parameters=free,
     )
 

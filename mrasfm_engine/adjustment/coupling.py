@@ -45,7 +45,7 @@ class Coupling:
         o = observations
         support, weight = (None, None) if motion is None else (motion.support, motion.weight)
         blocks, first_block, signature = _blocks_of_points(
-            o.unit, o.shot, o.camera, o.first_of_point, support, weight,
+            o.unit, o.shot, o.camera, o.first_of_point, o.fixed, support, weight,
             layout.unit_slot, layout.camera_slot, layout.num_units,
         )  # fmt: skip
         leading = np.full(o.num_points, layout.num_units + layout.num_cameras)
@@ -112,10 +112,10 @@ def _insert(out: Any, begin: int, end: int, block: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _blocks_of_points(
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, first: Any, support: Any, weight: Any, unit_slot: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, first: Any, fixed: Any, support: Any, weight: Any, unit_slot: Any,
     camera_slot: Any, num_units: int,
 ) -> Any:  # fmt: skip
-    """Blocks of every point, ascending, where each point's begin, and a hash (p,) of them."""
+    """Blocks of every point, ascending, where each point's begin, and a hash (p,) of them; a fixed point has none."""
     count = len(first) - 1
     out = np.empty((2 if weight is None else 4) * len(obs_unit), np.int64)
     starts = np.zeros(count + 1, np.int64)
@@ -123,11 +123,12 @@ def _blocks_of_points(
     end = 0
     for p in range(count):
         begin = end
-        for n in range(first[p], first[p + 1]):
+        last = first[p] if fixed[p] else first[p + 1]
+        for n in range(first[p], last):
             # Cameras of the last slots come last: a full list keeps its cameras if these are put in first.
             if camera_slot[obs_camera[n]] >= 0:
                 end = _insert(out, begin, end, num_units + camera_slot[obs_camera[n]])
-        for n in range(first[p], first[p + 1]):
+        for n in range(first[p], last):
             if weight is None:
                 if unit_slot[obs_unit[n]] >= 0:
                     end = _insert(out, begin, end, unit_slot[obs_unit[n]])

@@ -167,7 +167,7 @@ def _invert3(v: Any, out: Any) -> bool:
 def accumulate(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
     support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_image: Any, obs_xy: Any, first: Any,
-    unit_slot: Any, camera_slot: Any, num_units: int,
+    fixed: Any, unit_slot: Any, camera_slot: Any, num_units: int,
     order: Any, first_point: Any, blocks: Any, first_block: Any, places: Any, first_place: Any,
     sigma: float, loss2: float, damping: float, lo: int, hi: int,
     images: Any, s_units: Any, s_border: Any, s_cameras: Any, g: Any, v_inverse: Any, v_gradient: Any,
@@ -290,8 +290,8 @@ def accumulate(
         v[0] += damping * v[0]
         v[3] += damping * v[3]
         v[5] += damping * v[5]
-        if not _invert3(v, inv):
-            # A point without depth: it stays where it is, and takes no part in the reduction.
+        if fixed[p] or not _invert3(v, inv):
+            # A point that is fixed or without depth stays where it is, and takes no part in the reduction.
             v_inverse[p, :] = 0.0
             continue
         for i in range(6):
@@ -614,8 +614,8 @@ def _point_system(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def settle(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, sigma: float, loss2: float,
-    before: Any, costs_before: Any, lo: int, hi: int, costs: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, fixed: Any,
+    sigma: float, loss2: float, before: Any, costs_before: Any, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
     """Move points lo..hi, in place, to where the poses and the calibration of now want them; what they cost to costs.
 
@@ -634,6 +634,9 @@ def settle(
             unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
             begin, end, scale2, x, d, rig, cam, work, proj,
         )  # fmt: skip
+        if fixed[p]:
+            costs[p] = cost
+            continue
         if cost > costs_before[p]:
             for i in range(3):
                 trial[i] = before[p, i]

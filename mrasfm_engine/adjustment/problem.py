@@ -42,10 +42,18 @@ class Observations:
     first_of_point: Ints = field(init=False)  # (p + 1,) observations of point i: first[i]:first[i + 1]
     num_points: int
     shot: Ints | None = None  # (n,) indices into the state's shots; without, all are at their unit's timestamp
+    fixed: Bools | None = None  # (p,) points that stay where they are; without, none does
 
     def __post_init__(self) -> None:
         first = np.searchsorted(self.point, np.arange(self.num_points + 1))
+        if self.fixed is None:
+            object.__setattr__(self, "fixed", np.zeros(self.num_points, dtype=np.bool_))
         object.__setattr__(self, "first_of_point", first.astype(np.int64))
+
+    @property
+    def num_free_points(self) -> int:
+        """How many points may move."""
+        return self.num_points if self.fixed is None else self.num_points - int(self.fixed.sum())
 
 
 @dataclass(frozen=True, kw_only=True)

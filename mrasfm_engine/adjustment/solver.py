@@ -140,6 +140,7 @@ class Problem:
                 xy_px=o.xy_px[rows],
                 num_points=int(chosen.sum()),
                 shot=None if o.shot is None else o.shot[rows],
+                fixed=None if o.fixed is None else o.fixed[chosen],
             ),
         )
 
@@ -157,7 +158,7 @@ class Problem:
             options.threads,
             len(costs),
             lambda lo, hi, _: settle(
-                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point, o.fixed,
                 options.sigma_px, options.loss_scale**2, before.points_m, costs_before, lo, hi, costs,
             ),
         )  # fmt: skip
@@ -186,7 +187,8 @@ class Problem:
             coupling.shares(parts),
             lambda lo, hi, t: accumulate(
                 *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, coupling.image, o.xy_px,
-                o.first_of_point, *slots, *coupling.arrays, options.sigma_px, options.loss_scale**2, damping, lo, hi,
+                o.first_of_point, o.fixed, *slots, *coupling.arrays,
+                options.sigma_px, options.loss_scale**2, damping, lo, hi,
                 images[t], *(part[t] for part in blocks), gradient[t], v_inverse, v_gradient,
             ),
         )  # fmt: skip
@@ -293,7 +295,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
     damping, raise_by, iterations = 1e-4, 2.0, 0
     termination = Termination.ITERATIONS
     free = np.setdiff1d(np.arange(layout.size), layout.held())
-    if not len(free) and not problem.observations.num_points:
+    if not len(free) and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
@@ -324,6 +326,6 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
         iterations=iterations,
         termination=termination,
         observations=len(problem.observations.unit),
-        parameters=len(free) + 3 * problem.observations.num_points,
+        parameters=len(free) + 3 * problem.observations.num_free_points,
         pose_parameters=len(free),
     )

@@ -248,19 +248,21 @@ def test_the_optimum_is_that_of_ceres(seed: int) -> None:
         case.truth, rng, units=np.flatnonzero(free_units).tolist(), cameras=np.flatnonzero(free_cameras).tolist(),
         unit_m=0.03, unit_deg=0.1, camera_deg=0.1, point_m=0.05, focal=0.002 if seed > 3 else 0.0,
     )  # fmt: skip
+    fixed = rng.random(o.num_points) < 0.2
+    start.points_m[fixed] = case.truth.points_m[fixed]
     problem = replace(
         case.problem,
         state=start,
-        observations=replace(o, xy_px=noisy),
+        observations=replace(o, xy_px=noisy, fixed=fixed),
         options=SolverOptions(max_iterations=300, function_tolerance=1e-12, decrement_tolerance=0.0),
     )
     solution, report = solve(problem)
     _, their_report = solve_with_ceres(problem)
     assert report.final_cost < 0.9 * report.initial_cost
     assert report.parameters == their_report.parameters
-    # From afar Ceres leaves many points on the wrong side of an outlier; it never finds a better place,
-    assert report.final_cost <= their_report.final_cost * (1 + 1e-4)
-    # and neither does it where it starts from ours.
+    # From afar either may leave a point on the wrong side of an outlier. Ceres finds no place that is clearly better,
+    assert report.final_cost <= their_report.final_cost * (1 + 1e-3)
+    # and none at all where it starts from ours.
     theirs, their_report = solve_with_ceres(replace(problem, state=solution))
     assert their_report.final_cost == pytest.approx(report.final_cost, rel=1e-5)
     assert position_errors_m(solution, theirs).max() < 1e-3
@@ -271,6 +273,17 @@ def test_what_colmap_cannot_say_is_refused() -> None:
     case = drive()
     with pytest.raises(ValueError, match="other terms"):
         solve_with_ceres(replace(case.problem, terms=[calibration_prior(case.truth)]))
+
+
+def test_fixed_points_stay_and_hold_the_poses() -> None:
+    case = drive()
+    o = replace(case.problem.observations, fixed=np.ones(case.problem.observations.num_points, dtype=np.bool_))
+    start = perturbed(case.truth, np.random.default_rng(4), units=range(8), unit_m=0.1, unit_deg=0.5, point_m=0.0)
+    layout = Layout.of(np.ones(8, dtype=np.bool_), np.zeros(6, dtype=np.bool_))
+    solution, report = solve(replace(case.problem, state=start, observations=o, layout=layout))
+    np.testing.assert_array_equal(solution.points_m, case.truth.points_m)
+    assert report.parameters == report.pose_parameters == 48
+    assert 1e-6 < position_errors_m(solution, case.truth).max() < 5e-3
 
 
 def test_points_follow_a_step_by_themselves_and_never_for_the_worse() -> None:
