@@ -1,9 +1,9 @@
 """Camera set bundle adjustment by Ceres, through pycolmap: slower, by other people, and therefore the reference.
 
 It takes a `Problem` and returns what `solver.solve` returns. What COLMAP has no words for is refused: terms besides the
-observations, and shots apart from their unit's timestamp. A rig of COLMAP's stands where one of its cameras does, which
-is held: the first that is fixed. (A rig whose reference sees nothing keeps all of its cameras where they are, whatever
-the options say.)
+observations, one focal factor for fx and fy, and shots apart from their unit's timestamp. A rig of COLMAP's stands
+where one of its cameras does, which is held: the first that is fixed. (A rig whose reference sees nothing keeps all of
+its cameras where they are, whatever the options say.)
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF
+from mrasfm_engine.adjustment.problem import UNIT_DOF
 from mrasfm_engine.adjustment.solver import Problem, Report, Termination
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
@@ -52,6 +52,8 @@ class CeresProblem:
         """
         if problem.terms or problem.motion is not None:
             raise ValueError("COLMAP knows neither other terms nor images apart from their unit's timestamp")
+        if problem.layout.free_focal:
+            raise ValueError("COLMAP varies fx and fy each on its own")
         if not (problem.layout.camera_slot < 0).any():
             raise ValueError("COLMAP holds one camera of a rig, and all are free")
         reconstruction = pycolmap.Reconstruction()
@@ -83,8 +85,8 @@ class CeresProblem:
         """COLMAP's adjuster with the options of the problem; `solve` does the work."""
         problem, layout = self.problem, self.problem.layout
         options = pycolmap.BundleAdjustmentOptions()
-        options.refine_principal_point = options.refine_extra_params = options.print_summary = False
-        options.refine_focal_length = layout.free_focal
+        options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+        options.print_summary = False
         options.refine_sensor_from_rig = layout.num_cameras > 0
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         # COLMAP's residuals are in pixels.
@@ -151,7 +153,7 @@ def solve_with_ceres(problem: Problem) -> tuple[State, Report]:
         raise RuntimeError(f"Ceres found no solution: {summary.brief_report()}")
     state, layout = handed.state(), problem.layout
     converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
-    free = UNIT_DOF * layout.num_units + (CAMERA_DOF if layout.free_focal else UNIT_DOF) * layout.num_cameras
+    free = UNIT_DOF * (layout.num_units + layout.num_cameras)  # focal lengths are held
     return state, Report(
         initial_cost=problem.cost(problem.state),
         final_cost=problem.cost(state),
