@@ -14,6 +14,7 @@
 | 10 | ablation: the method without each of its parts |
 | 11 | the road from above, before and after recalibration |
 | 12 | learned keypoints and matches: accuracy on a real drive, and light that changes |
+| 13 | camera set bundle adjustment beside Ceres, on one problem |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -38,6 +39,7 @@ from rich.console import Console
 
 from mrasfm_engine import __version__
 from tests.benchmarks.ablation import ablation
+from tests.benchmarks.adjustment import adjustment
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
@@ -76,6 +78,7 @@ LINES = {
     "10": Line(timed=(ablation,)),
     "11": Line(untimed=(birds_eye,)),
     "12": Line(untimed=(learned,)),
+    "13": Line(timed=(adjustment,)),
 }
 
 

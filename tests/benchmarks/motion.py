@@ -58,8 +58,7 @@ def compared(simultaneous: Path, apart: Path, work: Path, seed: int) -> Iterator
             value=errors["ignored"][key],
             unit="m",
             above=FAR * allowed,
-            # Where the scale comes out too wrong for GNSS to be believed, the calibration is held and its places stay.
-            most=100.0 if key == "units" else None,
+            most=100.0,
         )
     for scene in scenes.values():
         shutil.rmtree(scene)
