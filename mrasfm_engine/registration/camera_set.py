@@ -1,6 +1,7 @@
 """Camera set registration: the pose of a rigid unit from points its cameras see, as one.
 
-First one generalised PnP over all cameras. Where that fails, or a camera disagrees with it, every camera is registered
+First the pose that the vehicle's motion lets expect is refined; where that does not explain what all cameras see, one
+generalised PnP over all cameras is asked. Where that fails, or a camera disagrees with it, every camera is registered
 alone, its pose turned into one of the unit through `rig_from_cam`, and the unit's pose is their robust average (MRASfM,
 section 3(a), see `camera_vote`); cameras far from it are voted out by name. Either way all images of the unit get their
 pose from the unit, also those that see too little to be registered alone, or nothing but what covers them.
@@ -18,6 +19,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.registration.camera_vote import Vote, agree, consensus
 from mrasfm_engine.registration.model import Model
+from mrasfm_engine.registration.resection import resect
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -26,6 +28,7 @@ MAX_ERROR_PX = 8.0  # of an inlier; wider than elsewhere, as calibration may be 
 MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
 MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
 MIN_CAMERA_INLIER_RATIO = 0.25
+MIN_EXPECTED_INLIER_RATIO = 0.7  # below it is asked whether more points agree with a pose elsewhere
 VOTE_BEATS_JOINT = 0.9  # of the joint pose's inliers: what the vote loses on a wrong camera it may lose
 
 
@@ -86,18 +89,44 @@ class Eyes:
 
 def register_unit(model: Model, unit: int) -> Registration:
     """Find the pose of a unit from the points of its tracks."""
-    return register_seen(model, unit, points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers)
+    expected = model.motion.expected_pose(model.state, model.registered, unit)
+    return register_seen(
+        model, unit, points_seen(model, unit), min_inliers=model.config.mapping.min_pnp_inliers, expected=expected
+    )
 
 
-def register_seen(model: Model, unit: int, seen: Seen, *, min_inliers: int, by_vote: bool = True) -> Registration:
-    """Find the pose of a unit from given correspondences; `by_vote` also by the cameras' own poses."""
+def register_seen(
+    model: Model,
+    unit: int,
+    seen: Seen,
+    *,
+    min_inliers: int,
+    by_vote: bool = True,
+    expected: Floats | None = None,
+) -> Registration:
+    """Find the pose of a unit from given correspondences.
+
+    Parameters
+    ----------
+    by_vote
+        Also by the cameras' own poses.
+    expected
+        Where the unit (4, 4) is by the motion of others, if they tell.
+    """
     if len(seen.camera) < min_inliers:
         return failed(unit, seen, 0, f"it sees {len(seen.camera)} points of the scene, {min_inliers} are needed")
     sample = seen.of(_spread(len(seen.camera), MAX_CORRESPONDENCES))
-    pose = _joint_pose(model, sample)
+    pose = None if expected is None else _as_expected(model, sample, expected)
     inlier = np.zeros(len(seen.camera), dtype=np.bool_)
     if pose is not None:
         inlier = _errors_px(model, pose, seen) < MAX_ERROR_PX
+        if inlier.mean() < MIN_EXPECTED_INLIER_RATIO or _disagreeing(model, seen, inlier):
+            pose = None
+    if pose is None:
+        pose = _joint_pose(model, sample)
+        inlier[:] = False
+        if pose is not None:
+            inlier = _errors_px(model, pose, seen) < MAX_ERROR_PX
     disagreeing = _disagreeing(model, seen, inlier)
     method = "joint"
     votes: list[Vote] = []
@@ -191,6 +220,20 @@ def _joint_pose(model: Model, seen: Seen) -> Floats | None:
         estimation_options=_ransac(model),
     )
     return None if result is None else se3.inverse(matrix_of(result["rig_from_world"]))
+
+
+def _as_expected(model: Model, seen: Seen, expected: Floats) -> Floats | None:
+    """world_from_rig near an expected pose."""
+    eyes = Eyes.of(model, seen.camera, seen.shot)
+    return resect(
+        expected,
+        seen.xy_px,
+        seen.points_m,
+        eyes.index,
+        eyes.rig_from_eye,
+        model.camera_kind[eyes.camera],
+        model.state.camera_params[eyes.camera],
+    )
 
 
 def _errors_px(model: Model, world_from_rig: Floats, seen: Seen) -> Floats:

@@ -143,6 +143,22 @@ class RigMotion:
         at_shot = moved(self.shots.time_offset_s[rows, None] * velocity)
         self._write(state, rows, at_shot, moved(self._offset_of_image(rows)[:, None] * velocity))
 
+    def expected_pose(self, state: State, registered: Bools, unit: int) -> Floats | None:
+        """Where a unit (4, 4) is if it moves as the two registered nearest in time do; None where these are far."""
+        known = np.flatnonzero(registered)
+        known = known[known != unit]
+        nearest = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
+        if len(nearest) < 2:
+            return None
+        pair = np.sort(nearest)
+        around = local_motion(state.world_from_rig[pair], self._time_s[pair], np.ones(2, dtype=np.bool_))
+        near = int(np.argmin(np.abs(self._time_s[pair] - self._time_s[unit])))
+        elapsed_s = self._time_s[unit] - self._time_s[pair[near]]
+        if not around.known.all() or abs(elapsed_s) > MAX_GAP_S:
+            return None
+        result: Floats = state.world_from_rig[pair[near]] @ moved(elapsed_s * around.velocity[near : near + 1])[0]
+        return result
+
     def unit_from_image(self, state: State) -> Floats:
         """The rig's poses (images, 4, 4) at the images' own timestamps, relative to their units'."""
         if state.simultaneous:
