@@ -33,6 +33,7 @@ PAIRS = (
 )
 TRUCK = 14  # of the masks
 COVERAGE = (0.85, 0.95)
+HALF = 0.5
 MIN_KEYPOINTS = 200  # on what covers an image
 MAX_POSITION_M, MAX_ROTATION_DEG = 0.05, 0.1
 OFF_M = 0.5
@@ -54,11 +55,7 @@ def occlusion(work: Path, seed: int) -> Iterator[Figure]:
 
 
 def _coverage(drive: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure]:
-    shares = [
-        float((cv2.imread(str(drive / "masks" / camera / f"{unit:06d}.png"), cv2.IMREAD_UNCHANGED) == TRUCK).mean())
-        for camera in cameras
-        for unit in COVERED
-    ]
+    shares = [_share(drive, f"images/{camera}/{unit:06d}.jpg") for camera in cameras for unit in COVERED]
     for name, value in (("least", min(shares)), ("most", max(shares))):
         yield Figure(
             line="7",
@@ -67,6 +64,12 @@ def _coverage(drive: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure
             above=COVERAGE[0],
             most=COVERAGE[1],
         )
+
+
+def _share(drive: Path, file: str) -> float:
+    """Of an image's pixels, those that show a lorry."""
+    mask = cv2.imread(str(drive / "masks" / Path(file).relative_to("images").with_suffix(".png")), cv2.IMREAD_UNCHANGED)
+    return float((mask == TRUCK).mean())
 
 
 def _without_masks(drive: Path, out: Path) -> Path:
@@ -104,7 +107,9 @@ def with_the_set(drive: Path, scene: Path, cameras: Sequence[str], seed: int) ->
     )
     named = [image["file"] for image in read_report(scene)["by_stage"]["mapping"]["images_occluded"]]
     yield exactly("7a", f"{title}: covered images that are named", len(set(named) & set(files)), len(files))
-    yield exactly("7a", f"{title}: others that are named + 1", len(set(named) - set(files)) + 1, 1)
+    # Lorries beside the car reach into the image between them: to name what they cover by half is right as well.
+    wrong = [file for file in set(named) - set(files) if _share(drive, file) < HALF]
+    yield exactly("7a", f"{title}: named although less than half is covered + 1", len(wrong) + 1, 1)
 
 
 def image_by_image(drive: Path, scene: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure]:
