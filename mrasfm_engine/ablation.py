@@ -214,7 +214,7 @@ def _row(
     features = stages.features(run)
     matches = stages.matches(run, features, prior)
     if name == FULL:
-        _warm_up(run, features, matches, prior)
+        warm_up(run, features, matches, prior)
     model = stages.mapping(run, features, matches, prior)
     scene = stages.scene(run, model, features, matches, prior)
     done = {stage["stage"]: stage for stage in run.report["stages"]}
@@ -237,7 +237,7 @@ def _row(
     )
 
 
-def _warm_up(
+def warm_up(
     run: stages.Run, features: Sequence[ImageFeatures], matches: Sequence[PairMatches], prior: PriorTrajectory
 ) -> None:
     """Map the first units, so that no row's time has the loading of compiled code in it."""

@@ -59,7 +59,7 @@ class Run:
     progress: Progress
     cancel: Callable[[], bool]
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
-    _key: str = ""
+    key: str = ""  # fingerprint of what has been done so far; of the files of the drive where it is empty
 
     @cached_property
     def plugins(self) -> Plugins:
@@ -79,7 +79,7 @@ class Run:
 
     def next_key(self, name: str, settings: object) -> str:
         """The fingerprint of a stage that follows those done so far."""
-        return fingerprint(self._key or drive_fingerprint(self.drive), name, settings, code_version())
+        return fingerprint(self.key or drive_fingerprint(self.drive), name, settings, code_version())
 
     def stage(
         self, name: str, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]
@@ -90,13 +90,13 @@ class Run:
         """
         if self.cancel():
             raise CancelledError
-        self._key = self.next_key(name, settings)
+        self.key = self.next_key(name, settings)
         started = time.perf_counter()
-        found = self.store.load(name, self._key)
+        found = self.store.load(name, self.key)
         reused = found is not None
         if found is None:
             found = work()
-            self.store.save(name, self._key, *found)
+            self.store.save(name, self.key, *found)
         arrays, report = found
         self.report["stages"].append(
             {"stage": name, "seconds": round(time.perf_counter() - started, 3), "reused": reused, **report}
@@ -227,7 +227,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             progress=run.step("matches"),
             cancel=run.cancel,
         )
-        return _pack_pairs(result.pairs), {
+        return pack_pairs(result.pairs), {
             "candidate_pairs": len(pairs),
             "verified_pairs": len(result.pairs),
             "rejected_pairs": {"few matches": result.few_matches, "few inliers": result.few_inliers},
@@ -245,10 +245,11 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             remedy="Check that consecutive frames show the same scene, and that images are sharp and not mixed up.",
             code="nothing-matches",
         )
-    return _unpack_pairs(arrays)
+    return unpack_pairs(arrays)
 
 
-def _pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
+def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
+    """Matches of all pairs in a few arrays."""
     return {
         "ends": np.array([(p.image_a, p.image_b, len(p.matches)) for p in pairs], dtype=np.int64).reshape(-1, 3),
         "matches": np.concatenate([p.matches for p in pairs] or [np.zeros((0, 2), np.int32)]),
@@ -256,7 +257,8 @@ def _pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
     }
 
 
-def _unpack_pairs(arrays: Arrays) -> list[PairMatches]:
+def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
+    """What `pack_pairs` packed."""
     stops = np.cumsum(arrays["ends"][:, 2])
     return [
         PairMatches(

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,9 +14,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from mrasfm_engine.commands.work_folder import work_folder, write_document
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.drive_bundle import read_drive, storage_error
+from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
 
@@ -60,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, progress_bars
 
     switches, console = switches_named(arguments.only), Console(stderr=True)
-    with _folder(arguments.out) as work:
+    with work_folder(arguments.out, prefix="mrasfm-ablation-") as work:
         with cancel_on_interrupt(console) as cancelled, progress_bars(console) as bars:
             rows = ablate(
                 arguments.drive,
@@ -74,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
         document = _document(rows, source)
         if arguments.out is not None:
-            _write(document, work / RESULT)
+            write_document(document, work / RESULT)
     if arguments.json:
         print(json.dumps(document, allow_nan=False))
     else:
@@ -94,26 +93,6 @@ def _true_calibration(arguments: argparse.Namespace) -> tuple[np.ndarray | None,
             f"{path} has no pose of {', '.join(missing)}", remedy="Give the calibration of this drive's cameras."
         )
     return np.stack([poses[name] for name in names]), str(path)
-
-
-@contextmanager
-def _folder(out: Path | None) -> Iterator[Path]:
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="mrasfm-ablation-") as folder:
-            yield Path(folder)
-        return
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(out, error) from error
-    yield out
-
-
-def _write(document: dict[str, Any], path: Path) -> None:
-    try:
-        path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise storage_error(path, error) from error
 
 
 def _document(rows: Sequence[Row], source: str) -> dict[str, Any]:

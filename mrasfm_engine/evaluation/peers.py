@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import math
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_trajectories
+from mrasfm_engine.evaluation.own_process import Progress, memory_bytes, run_apart
+from mrasfm_engine.evaluation.trajectory import TrajectoryErrors, compare_known
 from mrasfm_engine.geometry import se3
 
 Floats = NDArray[np.float64]
@@ -39,13 +41,15 @@ class PeerResult:
     Attributes
     ----------
     seconds
-        Of mapping alone, from the database to the model.
+        Of mapping alone, from the database to the model; NaN where there is no model.
     registered_images
         Of the largest model, where there are several.
     world_from_rig
         Poses (units, 4, 4) in that model's own world; NaN for units that are not in it.
     failure
         Why there is no model; empty where there is one.
+    peak_memory_bytes, start_memory_bytes
+        What its process had resident at most, and before it began to map; None where that is not known.
     """
 
     mapper: Mapper
@@ -53,6 +57,8 @@ class PeerResult:
     registered_images: int
     world_from_rig: Floats
     failure: str = ""
+    peak_memory_bytes: int | None = None
+    start_memory_bytes: int | None = None
 
     @property
     def registered(self) -> Bools:
@@ -61,60 +67,54 @@ class PeerResult:
         return result
 
     def errors(self, truth_world_from_rig: Floats) -> TrajectoryErrors | None:
-        """Errors over the registered units against the truth (units, 4, 4); None for fewer than three of them."""
-        kept = self.registered
-        if kept.sum() < MIN_POSES:
-            return None
-        return compare_trajectories(self.world_from_rig[kept], truth_world_from_rig[kept])
+        """Errors over the registered units against the truth (units, 4, 4), NaN where there is none; None for fewer
+        than three of them."""
+        return compare_known(self.world_from_rig, truth_world_from_rig[: len(self.world_from_rig)])
 
 
-def run_peer(database: Path, mapper: Mapper, *, threads: int, timeout_s: float = 3600.0) -> PeerResult:
+def run_peer(
+    database: Path,
+    mapper: Mapper,
+    *,
+    threads: int,
+    timeout_s: float = 3600.0,
+    cancel: Callable[[], bool] = lambda: False,
+) -> PeerResult:
     """Run one mapper on a copy of a scene's `features.db`, in a process of its own because COLMAP may abort it.
 
     Parameters
     ----------
     database
-        As `export_scene` writes it: with the rig as refined, and verified matches.
+        As `export_scene` writes it: with the rig, and verified matches. Every frame must be a unit.
 
     Raises
     ------
     InputError
         Where there is no such file.
+    CancelledError
+        Where `cancel` answers True.
     """
     if not database.is_file():
         raise InputError(f"{database} does not exist", remedy="Give the features.db of a scene.")
     with tempfile.TemporaryDirectory(prefix="mrasfm-peer-") as name:
         folder = Path(name)
         shutil.copyfile(database, folder / "features.db")  # COLMAP writes into databases that it only reads
-        started = time.perf_counter()
-        process = multiprocessing.get_context("spawn").Process(target=_map, args=(folder, mapper, threads))
-        process.start()
-        process.join(timeout_s)
-        if process.is_alive():
-            process.kill()
-            process.join()
-        seconds = time.perf_counter() - started
-        if not (folder / "result.npz").is_file():
-            why = f"not finished within {timeout_s:g} s" if seconds >= timeout_s else f"ended with {process.exitcode}"
-            return PeerResult(
-                mapper=mapper, seconds=seconds, registered_images=0, world_from_rig=np.zeros((0, 4, 4)), failure=why
-            )
-        with np.load(folder / "result.npz") as result:
-            return PeerResult(
-                mapper=mapper,
-                seconds=float(result["seconds"]),
-                registered_images=int(result["images"]),
-                world_from_rig=result["world_from_rig"],
-                failure="" if int(result["images"]) else "no model",
-            )
+        ran = run_apart(_map, folder, mapper, threads, timeout_s=timeout_s, cancel=cancel)
+    if ran.result is None:
+        return PeerResult(
+            mapper=mapper, seconds=math.nan, registered_images=0, world_from_rig=np.zeros((0, 4, 4)),
+            failure=ran.failure, peak_memory_bytes=ran.peak_memory_bytes,
+        )  # fmt: skip
+    return replace(ran.result, peak_memory_bytes=ran.peak_memory_bytes)
 
 
-def _map(folder: Path, mapper: Mapper, threads: int) -> None:
+def _map(progress: Progress, folder: Path, mapper: Mapper, threads: int) -> PeerResult:
     pycolmap.logging.minloglevel = 3
     out = folder / "models"
     out.mkdir()
     database = str(folder / "peer.db")
     reference_from_rig, units = _rewrite(folder / "features.db", folder / "peer.db")
+    start_memory_bytes = memory_bytes()
     started = time.perf_counter()
     if mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
         models = pycolmap.global_mapping(database, folder, out, _global_options(mapper, threads))
@@ -122,11 +122,13 @@ def _map(folder: Path, mapper: Mapper, threads: int) -> None:
         models = pycolmap.incremental_mapping(database, folder, out, _incremental_options(mapper, threads))
     seconds = time.perf_counter() - started
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    np.savez(
-        folder / "result.npz",
+    return PeerResult(
+        mapper=mapper,
         seconds=seconds,
-        images=0 if largest is None else largest.num_reg_images(),
+        registered_images=0 if largest is None else largest.num_reg_images(),
         world_from_rig=_world_from_rig(largest, units, reference_from_rig),
+        failure="no model" if largest is None else "",
+        start_memory_bytes=start_memory_bytes,
     )
 
 

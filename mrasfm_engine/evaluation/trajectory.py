@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MIN_POSES = 3
+FIRST_UNITS = 5  # on which a route is aligned to see the error of its end
+ARM_M = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +91,39 @@ def compare_trajectories(estimate: Floats, truth: Floats) -> TrajectoryErrors:
         similarity_rmse_m=_rms(similar),
         similarity_scale=alignment.scale,
     )
+
+
+def compare_known(estimate: Floats, truth: Floats) -> TrajectoryErrors | None:
+    """`compare_trajectories` over the poses (n, 4, 4) that both know, others are NaN; None for fewer than 3."""
+    known = np.isfinite(estimate[:, 0, 0]) & np.isfinite(truth[:, 0, 0])
+    return compare_trajectories(estimate[known], truth[known]) if known.sum() >= MIN_POSES else None
+
+
+def end_error_m(estimate: Floats, truth: Floats) -> float | None:
+    """Distance of the last unit from its true place, after a rigid alignment on the first units' poses.
+
+    Aligned are the first units' positions and points 10 m along each of their axes, so that rotations count as well: a
+    few positions on a line leave the roll about it free. None where the last unit or all of the first ones are missing.
+
+    Parameters
+    ----------
+    estimate, truth
+        Poses (units, 4, 4); NaN for units that are not registered. A shorter estimate misses the last ones.
+    """
+    if len(estimate) < len(truth) or not np.isfinite(estimate[-1]).all():
+        return None
+    known = np.flatnonzero(np.isfinite(estimate[:FIRST_UNITS, 0, 0]))
+    if not len(known):
+        return None
+    arms = np.concatenate([np.zeros((1, 3)), ARM_M * np.eye(3)])
+
+    def points(poses: Floats) -> Floats:
+        first = poses[known]
+        result: Floats = (first[:, None, :3, :3] @ arms[..., None])[..., 0] + first[:, None, :3, 3]
+        return result.reshape(-1, 3)
+
+    aligned = align_rigid(points(truth), points(estimate)).a_from_b @ estimate[-1]
+    return float(np.linalg.norm(aligned[:3, 3] - truth[-1, :3, 3]))
 
 
 def _rms(values: Floats) -> float:

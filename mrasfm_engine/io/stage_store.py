@@ -19,7 +19,7 @@ import schemas
 from mrasfm_engine.io.drive_bundle import storage_error
 from mrasfm_engine.scene.drive import Drive
 
-NOT_IN_STAGES = ("ablation.py", "commands", "evaluation", "synthetic", "views")
+NOT_IN_STAGES = ("ablation.py", "benchmark", "commands", "evaluation", "synthetic", "views")
 
 Arrays = dict[str, NDArray[Any]]
 

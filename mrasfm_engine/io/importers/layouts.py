@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -12,7 +13,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.importers import kitti, nuscenes, rig_folder
 from mrasfm_engine.io.importers.bundle_writer import ImportSummary, write_recording
-from mrasfm_engine.io.importers.recording import Recording, SourceUnit, select_units
+from mrasfm_engine.io.importers.recording import Recording, SourceUnit, select_cameras, select_units
 from mrasfm_engine.io.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from schemas import Gnss, GnssSample
 from schemas.drive import MAX_RIG_EXTENT_M
@@ -28,6 +29,7 @@ def import_recording(
     out: Path,
     *,
     frames: str | None = None,
+    cameras: Sequence[str] | None = None,
     gnss_file: Path | None = None,
     scene: str | None = None,
     copy: bool = False,
@@ -43,6 +45,8 @@ def import_recording(
         Where the drive goes.
     frames
         A slice START:STOP:STEP over the recording's frames in order of time.
+    cameras
+        Names of those that are wanted; all by default.
     gnss_file
         GNSS table to use instead of the recording's own; a relative path is looked up in `folder`, then in the working
         directory.
@@ -66,7 +70,7 @@ def import_recording(
         raise InputError(
             f"the drive {out} would replace the recording {folder}", remedy="Give another folder.", code="output-in-use"
         )
-    recording = select_units(_read(folder, scene), frames)
+    recording = select_units(select_cameras(_read(folder, scene), cameras), frames)
     return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
 
 

@@ -110,14 +110,8 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     InputError
         If the scene is not there, or a table is missing or malformed.
     """
-    versions = _versions(folder)
-    if len(versions) > 1:
-        raise InputError(
-            f"{folder} holds several versions: {', '.join(v.name for v in versions)}",
-            remedy="Give the folder of one of them.",
-            code="several-versions",
-        )
-    tables, data = versions[0], versions[0].resolve().parent
+    tables = _tables(folder)
+    data = tables.resolve().parent
     chosen = _choose(_table(tables, "scene", _Scene), scene, tables)
     samples = _samples_of(chosen, _by_token(_table(tables, "sample", _Sample)), tables)
     sensors = _by_token(_table(tables, "sensor", _Sensor))
@@ -143,6 +137,32 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         units=units,
         notes=[FLAT_NOTE],
     )
+
+
+def scene_names(folder: Path) -> list[str]:
+    """Names of all scenes, in the order of the table.
+
+    Raises
+    ------
+    InputError
+        If the folder is not nuScenes', or its table of scenes is malformed.
+    """
+    return [scene.name for scene in _table(_tables(folder), "scene", _Scene)]
+
+
+def _tables(folder: Path) -> Path:
+    versions = _versions(folder)
+    if not versions:
+        raise InputError(
+            f"{folder} has no table v1.0-*/scene.json", remedy="Give the folder of nuScenes.", code="unknown-layout"
+        )
+    if len(versions) > 1:
+        raise InputError(
+            f"{folder} holds several versions: {', '.join(v.name for v in versions)}",
+            remedy="Give the folder of one of them.",
+            code="several-versions",
+        )
+    return versions[0]
 
 
 def _table(folder: Path, name: str, row: type[Row]) -> list[Row]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -94,6 +95,34 @@ def select_units(recording: Recording, frames: str | None) -> Recording:
             code="empty-selection",
         )
     return replace(recording, units=units)
+
+
+def select_cameras(recording: Recording, names: Sequence[str] | None) -> Recording:
+    """The recording with only the named cameras, in its own order.
+
+    Raises
+    ------
+    InputError
+        If it has no camera of such a name.
+    """
+    if names is None:
+        return recording
+    known = [camera.name for camera in recording.cameras]
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(
+            f"the recording has no camera {', '.join(unknown)}",
+            remedy=f"Choose among {', '.join(known)}.",
+            code="unknown-camera",
+        )
+    units = [
+        replace(unit, images={name: image for name, image in unit.images.items() if name in names})
+        for unit in recording.units
+    ]
+    return replace(
+        recording,
+        cameras=[camera for camera in recording.cameras if camera.name in names],
+        units=[unit for unit in units if unit.images],
+    )
 
 
 def flu_world(world_from_rig: Floats) -> Floats | None:

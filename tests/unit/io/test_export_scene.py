@@ -37,7 +37,7 @@ from mrasfm_engine.io import (
 from mrasfm_engine.io.export_calibration import calibration_document
 from mrasfm_engine.io.export_check import check_features
 from mrasfm_engine.io.export_scene import write_scene
-from mrasfm_engine.io.feature_database import write_features
+from mrasfm_engine.io.feature_database import write_features, write_matches
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.scene.scene import CalibrationVerdict, ImageFeatures, Scene
@@ -174,6 +174,24 @@ def test_float_descriptors_are_kept_bit_for_bit(scene: Scene, tmp_path: Path) ->
     database.close()
     assert all(d.type == pycolmap.FeatureExtractorType.UNDEFINED for d in read)
     np.testing.assert_array_equal(read[0].data.view(np.float32), numbers[0])
+
+
+def test_matches_alone_have_the_given_calibration_and_units_as_frames(scene: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "matches.db"
+    write_matches(scene.drive, scene.features, scene.pairs, path)
+    with closing(pycolmap.Database.open(str(path))) as database:
+        images = scene.drive.images
+        assert database.num_images() == len(images)
+        assert database.num_descriptors() == 0
+        assert [f.frame_id for f in database.read_all_frames()] == sorted({image.unit + 1 for image in images})
+        np.testing.assert_array_equal(database.read_keypoints(1), scene.features[0].xy_px)
+        np.testing.assert_array_equal(database.read_camera(1).params, scene.drive.cameras[0].params)
+        (rig,) = database.read_all_rigs()
+        given = [rig.sensor_from_rig(s).inverse().matrix() for s in sorted(rig.non_ref_sensors, key=lambda s: s.id)]
+        np.testing.assert_allclose(given, scene.drive.rig_from_cam[:, :3], atol=1e-12)
+        pair = scene.pairs[0]
+        verified = database.read_two_view_geometry(pair.image_a + 1, pair.image_b + 1)
+        np.testing.assert_array_equal(verified.inlier_matches, pair.matches[pair.inliers])
 
 
 def test_the_database_is_one_file_that_a_read_only_folder_can_hold(written: Path) -> None:

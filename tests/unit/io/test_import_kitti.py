@@ -77,6 +77,15 @@ def test_one_camera_without_times_and_truth(sequence: Path, tmp_path: Path) -> N
     assert read_drive(tmp_path / "drive").timestamps_us.tolist() == [0, 100000, 200000, 300000, 400000]
 
 
+def test_some_cameras(sequence: Path, tmp_path: Path) -> None:
+    summary = import_recording(sequence, tmp_path / "drive", cameras=["image_3"])
+    assert (summary.cameras, summary.images) == (1, 5)
+    assert [camera.name for camera in read_drive(tmp_path / "drive").cameras] == ["image_3"]
+    with pytest.raises(InputError, match="no camera image_7") as caught:
+        import_recording(sequence, tmp_path / "other", cameras=["image_2", "image_7"])
+    assert "image_2, image_3" in caught.value.remedy
+
+
 def test_own_truth_comes_first(sequence: Path, tmp_path: Path) -> None:
     (sequence / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 7\n" * 5)
     import_recording(sequence, tmp_path / "drive")
