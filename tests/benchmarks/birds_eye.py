@@ -14,17 +14,10 @@ CAMERAS, UNITS, SEED = 6, 40, 1
 PERTURBATION = ("--perturb-rotation-deg", 0.5, "--perturb-translation-m", 0.02)
 
 
-def perturbed_surround(work: Path) -> Path:
-    """A rendered drive whose given calibration is off by 0.5 deg and 2 cm; rendered once."""
-    drive = work / "surround off by half a degree"
-    if not drive.exists():
-        mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", SEED, *PERTURBATION, "--out", drive)
-    return drive
-
-
 def birds_eye(data: Path, work: Path) -> Iterator[Figure]:
     """Line 11."""
-    drive = perturbed_surround(work)
+    drive = work / "surround off by half a degree"
+    mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", SEED, *PERTURBATION, "--out", drive)
     found = _found(reconstructed(drive, work / "surround off by half a degree, scene"))
     title = "rendered, calibration off by 0.5 deg and 2 cm"
     before, after = found["before"], found["after"]
