@@ -14,15 +14,8 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.adjustment.coupling import Coupling
-from mrasfm_engine.adjustment.normal_equations import (
-    IMAGE_SUMS,
-    accumulate,
-    add_images,
-    point_costs,
-    settle,
-    squared_errors,
-    substitute,
-)
+from mrasfm_engine.adjustment.normal_equations import IMAGE_SUMS, accumulate, add_images, squared_errors, substitute
+from mrasfm_engine.adjustment.point_settling import point_costs, settle
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
 from mrasfm_engine.adjustment.reduced import Extra, Reduced
