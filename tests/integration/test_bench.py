@@ -36,6 +36,7 @@ def test_a_simulated_route(mrasfm: Run) -> None:
     assert 50e6 < ours["start_memory_bytes"] <= ours["peak_memory_bytes"] < 2e9
 
 
+@pytest.mark.slow
 def test_a_drive_beside_colmap(variant: Variant, mrasfm: Run, tmp_path: Path) -> None:
     drive = variant.keep(cameras=["front", "left"], units=UNITS).save().root
     out = tmp_path / "bench"
