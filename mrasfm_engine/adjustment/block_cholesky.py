@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BLOCK = 6
+FULL = 0.8  # of all places: where so many are taken, no order leaves others empty
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +75,8 @@ class Elimination:
     def of(pattern: BlockPattern) -> Elimination:
         """A minimum degree order for a pattern (Liu's, of A' + A, as SuperLU has it)."""
         n, row, column = pattern.columns, pattern.row, pattern.column_of_block()
-        position = _minimum_degree(n, row, column)
+        full = len(row) > FULL * n * (n + 1) / 2
+        position = np.arange(n, dtype=np.int64) if full else _minimum_degree(n, row, column)
         i, j = position[row], position[column]
         ordered = BlockPattern.of_pairs(n, i, j)
         first, rows = _fill(ordered.first, ordered.row)

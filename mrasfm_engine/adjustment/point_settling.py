@@ -18,6 +18,8 @@ from numba import njit
 from mrasfm_engine.adjustment.normal_equations import BEHIND_PX, MIN_DEPTH_M, camera_point, invert3, linearise
 from mrasfm_engine.geometry.camera_model import project
 
+SETTLED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
+
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_cost(
@@ -76,12 +78,13 @@ def _point_system(
 def settle(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
     obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, fixed: Any,
-    sigma: float, loss2: float, before: Any, costs_before: Any, lo: int, hi: int, costs: Any,
+    sigma: float, loss2: float, before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
     """Move points lo..hi, in place, to where the poses and the calibration of now want them; what they cost to costs.
 
     Points have followed a step of the poses by its derivatives. One that costs more than `costs_before` where it was
-    `before` goes back there if that is better, and every point makes a step of its own, if it is for the better.
+    `before` goes back there if that is better. A point whose cost has hardly changed needs no more; every other makes a
+    step of its own, if it is for the better, and up to `steps` as long as these gain.
     """
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     jx, jc, v, e, inv = np.empty((2, 3)), np.empty((2, 7)), np.empty(6), np.empty(3), np.empty(6)
@@ -109,11 +112,17 @@ def settle(
                 cost = back
                 for i in range(3):
                     x[i] = trial[i]
-        _point_system(
-            unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
-            begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
-        )  # fmt: skip
-        if invert3(v, inv):
+        gained = abs(cost - costs_before[p])
+        for _ in range(steps):
+            if gained <= SETTLED * (end - begin):
+                break
+            gained = 0.0
+            _point_system(
+                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
+            )  # fmt: skip
+            if not invert3(v, inv):
+                break
             trial[0] = x[0] - (inv[0] * e[0] + inv[1] * e[1] + inv[2] * e[2])
             trial[1] = x[1] - (inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2])
             trial[2] = x[2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])
@@ -122,6 +131,7 @@ def settle(
                 begin, end, scale2, trial, d, rig, cam, work, proj,
             )  # fmt: skip
             if own < cost:
+                gained = cost - own
                 cost = own
                 for i in range(3):
                     x[i] = trial[i]

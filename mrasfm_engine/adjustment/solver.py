@@ -43,9 +43,11 @@ class SolverOptions:
 
     max_iterations: int = 50
     function_tolerance: float = 1e-6  # relative decrease of the cost below which it has converged
-    # Newton decrement of units and cameras, in squared standard deviations an unknown, below which it has converged:
-    # what is left is points that settle between their robust weights, which moves no pose.
-    decrement_tolerance: float = 1e-4
+    # Newton decrement below which poses and calibration have converged, in squared standard deviations: no combination
+    # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that settle
+    # between their robust weights, which moves no pose.
+    decrement_tolerance: float = 5e-3
+    initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most
     loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
     sigma_px: float = 1.0  # standard deviation of an observation
     threads: int = 1
@@ -140,11 +142,10 @@ class Problem:
     def with_points_settled(self, state: State) -> State:
         """The state with every point moved to where poses and calibration want it; only those that gain move."""
         result = replace(state, points_m=state.points_m.copy())
-        for _ in range(SETTLING):
-            self.settle(result, state, np.full(len(state.points_m), np.inf))
+        self.settle(result, state, np.full(len(state.points_m), np.inf), steps=SETTLING)
         return result
 
-    def settle(self, state: State, before: State, costs_before: Floats) -> tuple[Floats, float]:
+    def settle(self, state: State, before: State, costs_before: Floats, *, steps: int = 1) -> tuple[Floats, float]:
         """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
         o, options, costs = self.observations, self.options, np.empty(self.observations.num_points)
         _in_ranges(
@@ -152,7 +153,7 @@ class Problem:
             len(costs),
             lambda lo, hi, _: settle(
                 *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point, o.fixed,
-                options.sigma_px, options.loss_scale**2, before.points_m, costs_before, lo, hi, costs,
+                options.sigma_px, options.loss_scale**2, before.points_m, costs_before, steps, lo, hi, costs,
             ),
         )  # fmt: skip
         return costs, self._sum(state, costs)
@@ -285,7 +286,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
     options, layout, state = problem.options, problem.layout, problem.state
     costs = problem.point_costs(state)
     cost = initial = problem._sum(state, costs)
-    damping, raise_by, iterations = 1e-4, 2.0, 0
+    damping, raise_by, iterations = options.initial_damping, 2.0, 0
     termination = Termination.ITERATIONS
     free = np.setdiff1d(np.arange(layout.size), layout.held())
     if not len(free) and not problem.observations.num_free_points:
@@ -308,7 +309,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
             continue
         decrement = -float(step @ reduced.gradient)
         if cost - trial_cost <= options.function_tolerance * cost or (
-            len(free) and decrement <= options.decrement_tolerance * len(free)
+            len(free) and decrement <= options.decrement_tolerance
         ):
             termination = Termination.CONVERGED
         state, cost, costs = trial, trial_cost, trial_costs

@@ -102,7 +102,7 @@ def register_all(
             log.local_adjustments += 1
             since_local = 0
         if model.registered.sum() >= at_global * (1 + config.mapping.global_growth):
-            adjust_globally(model, log, cancel)
+            adjust_globally(model, log, cancel, growing=True)
             at_global = int(model.registered.sum())
         if progress is not None:
             progress(int(model.registered.sum()), int(model.keyframe.sum()))
@@ -243,8 +243,13 @@ def _adjust_locally(model: Model, unit: int) -> None:
     )
 
 
-def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | None) -> None:
-    """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter."""
+def adjust_globally(
+    model: Model, log: MappingLog, cancel: Callable[[], bool] | None, *, growing: bool = False
+) -> None:
+    """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter.
+
+    Once while the scene is still `growing`: the next time is near. Else once more, with what is clearly wrong left out.
+    """
     free_units = model.registered.copy()
     free_units[np.flatnonzero(model.registered)[0]] = False
     options = SolverOptions(
@@ -259,7 +264,8 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
         or judge_calibration(model, free_units=free_units, terms=(), georeferenced=False, options=options).free
     )
     free, priors = log.calibration_free, model.config.adjustment.priors
-    for error_px in (model.config.mapping.max_error_px, model.config.mapping.filter_error_px):
+    limits_px = (model.config.mapping.max_error_px, model.config.mapping.filter_error_px)
+    for error_px in limits_px[:1] if growing else limits_px:
         report = model.adjust(
             free_units,
             free_cameras=np.full(len(model.camera_kind), free),

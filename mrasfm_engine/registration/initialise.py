@@ -26,6 +26,7 @@ RELATIVE_ERROR_PX = 4.0
 ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
 MOTION_ROUNDS = 3
 FULL_PARALLAX_RAD = np.radians(0.5)
+MAX_PARALLAX_MATCHES = 100  # looked at of a pair
 MIN_POINTS = 30
 GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
 INSIDE = "points inside the first unit"
@@ -58,8 +59,10 @@ def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.
 
 def _share_that_moves(model: Model, pair: PairMatches) -> float:
     """How far the matches show motion, 0 to 1: units at which the car stands match best, but give no points."""
-    a = model.keypoints.rays[model.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0]]
-    b = model.keypoints.rays[model.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1]]
+    matches = pair.matches[pair.inliers]
+    matches = matches[:: 1 + len(matches) // MAX_PARALLAX_MATCHES]
+    a = model.keypoints.rays[model.keypoints.first[pair.image_a] + matches[:, 0]]
+    b = model.keypoints.rays[model.keypoints.first[pair.image_b] + matches[:, 1]]
     return min(1.0, parallax_rad(a, b) / float(FULL_PARALLAX_RAD))
 
 

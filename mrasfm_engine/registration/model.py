@@ -89,7 +89,9 @@ class Model:
             max_error_px=config.mapping.max_error_px,
             min_angle_deg=config.mapping.min_angle_deg,
         )
-        # Keypoints by unit, and the tracks they are in: what registration asks for again and again.
+        # Of every member of a track its track and its unit: what registration asks for again and again.
+        self._track_of_member = np.repeat(np.arange(len(tracks), dtype=np.int64), np.diff(tracks.first))
+        self._unit_of_member = keypoints.unit[tracks.keypoints]
         order = np.argsort(keypoints.unit, kind="stable")
         bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
         tracked = tracks.of_keypoint >= 0
@@ -148,8 +150,10 @@ class Model:
 
     def tracks_of_units(self, units: Ints) -> Ints:
         """Tracks seen by any of the units, ascending."""
-        rows = [self.rows_of_unit[int(u)] for u in units]
-        return np.unique(self.tracks.of_keypoint[np.concatenate(rows)]) if rows else np.zeros(0, dtype=np.int64)
+        seen = np.zeros(len(self.tracks), dtype=np.bool_)
+        for unit in units:
+            seen[self.tracks.of_keypoint[self.rows_of_unit[int(unit)]]] = True
+        return np.flatnonzero(seen)
 
     def matched_keypoints(self, pair: PairMatches, unit: int) -> tuple[Ints, Ints]:
         """Keypoints of a pair's verified matches: those in an image of `unit` first, then those of the other unit."""
@@ -159,10 +163,8 @@ class Model:
 
     def visible_counts(self) -> Ints:
         """How many keypoints with a point every unit has (units,)."""
-        rows = self.tracks.of_keypoint >= 0
-        seen = rows.copy()
-        seen[rows] = self.solved[self.tracks.of_keypoint[rows]]
-        return np.bincount(self.keypoints.unit[seen], minlength=len(self.registered)).astype(np.int64)
+        seen = self.solved[self._track_of_member]
+        return np.bincount(self._unit_of_member[seen], minlength=len(self.registered)).astype(np.int64)
 
     def triangulate(self, which: Ints | None = None) -> int:
         """Triangulate tracks (all by default) from registered units; how many of them have a point."""
@@ -239,13 +241,13 @@ class Model:
 
     def observation_rows(self, tracks: Ints | None = None) -> Ints:
         """Keypoints that are observations (of the given solved tracks), sorted by track."""
-        rows = np.flatnonzero(self.kept)
+        members = self.tracks.keypoints
+        kept = self.kept[members]
         if tracks is not None:
             wanted = np.zeros(len(self.tracks), dtype=np.bool_)
             wanted[tracks] = True
-            rows = rows[wanted[self.tracks.of_keypoint[rows]]]
-        result: Ints = rows[np.argsort(self.tracks.of_keypoint[rows], kind="stable")]
-        return result
+            kept &= wanted[self._track_of_member]
+        return members[kept]
 
     def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
         """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by
@@ -253,8 +255,9 @@ class Model:
         everything = everything or bool((free_units | ~self.registered).all())
         seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
         rows = self.observation_rows(None if seen is None else seen[self.solved[seen]])
-        tracks, point = np.unique(self.tracks.of_keypoint[rows], return_inverse=True)
-        return rows, tracks, point.astype(np.int64)
+        track = self.tracks.of_keypoint[rows]
+        begins = np.diff(track, prepend=-1) > 0
+        return rows, track[begins], np.cumsum(begins) - 1
 
     def problem(
         self,

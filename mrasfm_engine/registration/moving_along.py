@@ -8,14 +8,17 @@ what it shows must therefore move by so much between two units, and what moves b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.scene.scene import PairMatches
 
@@ -27,6 +30,7 @@ NEAREST_M = 1.0  # nearer things than this are not expected
 FARTHEST_M = 1000.0
 MAX_CAMERA_HEIGHT_M = 4.0  # of any camera above the ground
 MAX_GRADE = 0.1  # by which the ground may fall away from the vehicle
+MIN_DEPTH_M = 1e-3
 DEPTHS = 24  # tried between nearest and farthest, evenly in inverse depth
 MIN_FLOW_PX = 6.0  # what the world must move by before standing still means something
 STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
@@ -147,27 +151,36 @@ def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats,
     deepest = np.where(
         falling * FARTHEST_M > MAX_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_M / np.maximum(falling, 1e-9), FARTHEST_M
     )
-    deepest = np.maximum(deepest, NEAREST_M)
-    steps = np.linspace(0.0, 1.0, DEPTHS)
-    inverse = (1 - steps) / deepest[:, None] + steps / NEAREST_M
-    points = rays[:, None, :] / inverse[..., None]
-    pixels = project_points(kind, params, se3.apply(b_from_a, points.reshape(-1, 3))).reshape(len(rays), DEPTHS, 2)
-    from_a = pixels - xy_px[:, None, :]
-    return _distance_to_path(from_a)
-
-
-def _distance_to_path(path: Floats) -> Floats:
-    """Distances (n,) of the origin from polylines (n, k, 2); knots that are NaN are left out."""
-    start, step = path[:, :-1], np.diff(path, axis=1)
-    length2 = np.maximum((step**2).sum(-1), 1e-12)
-    at = np.clip(-(start * step).sum(-1) / length2, 0.0, 1.0)
-    distance = np.linalg.norm(start + at[..., None] * step, axis=-1)
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    result: Floats = np.minimum(distance.min(1), _knots(path))
+    turned = rays @ b_from_a[:3, :3].T
+    result = np.empty(len(rays))
+    _distances_to_paths(kind, params, turned, b_from_a[:3, 3], np.maximum(deepest, NEAREST_M), xy_px, result)
     return result
 
 
-def _knots(path: Floats) -> Floats:
-    distance = np.linalg.norm(path, axis=-1)
-    result: Floats = np.where(np.isfinite(distance), distance, np.inf).min(1)
-    return result
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any) -> None:
+    """Distances (n,) of pixels from where rays (n, 3) from an origin are seen, from their deepest point to the nearest.
+
+    The way is followed in straight steps between DEPTHS knots; those behind the camera are left out.
+    """
+    work, proj = np.empty(6), np.empty(8)
+    for i in range(len(rays)):
+        best, before = np.inf, False
+        u0, v0 = 0.0, 0.0
+        for s in range(DEPTHS):
+            part = s / (DEPTHS - 1)
+            inverse = (1.0 - part) / deepest[i] + part / NEAREST_M
+            z = rays[i, 2] / inverse + origin[2]
+            if z <= MIN_DEPTH_M:
+                before = False
+                continue
+            project(kind, params, rays[i, 0] / inverse + origin[0], rays[i, 1] / inverse + origin[1], z, work, proj)
+            u, v = proj[0] - xy_px[i, 0], proj[1] - xy_px[i, 1]
+            best = min(best, u * u + v * v)
+            if before:
+                du, dv = u - u0, v - v0
+                at = -(u0 * du + v0 * dv) / max(du * du + dv * dv, 1e-12)
+                if 0.0 < at < 1.0:
+                    best = min(best, (u0 + at * du) ** 2 + (v0 + at * dv) ** 2)
+            u0, v0, before = u, v, True
+        out[i] = math.sqrt(best)

@@ -41,7 +41,9 @@ Bools = NDArray[np.bool_]
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering
 TOLERANCE = 1e-6
-DECREMENT_TOLERANCE = 1e-6  # scale is a weak direction: it must arrive as well
+DECREMENT_TOLERANCE = 5e-3  # in the last round; a tenth of a standard deviation
+ROUGH_DECREMENT_TOLERANCE = 0.5  # in those before, after which observations change anyway
+INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
 
 
@@ -114,7 +116,7 @@ def refine(
         free_units=free_units,
         terms=_terms(model, positions, result),
         georeferenced=positions is not None,
-        options=_options(model, result.sigma_px, iterations=1),
+        options=_options(model, result.sigma_px),
     )
     result.recalibrated = np.full(len(model.camera_kind), result.calibration.free)
     if not result.calibration.free:
@@ -130,7 +132,7 @@ def refine(
                 free_cameras=result.recalibrated,
                 free_focal=result.focal_free,
                 terms=terms,
-                options=_options(model, result.sigma_px, iterations=40 if done == ROUNDS - 1 else 15),
+                options=_options(model, result.sigma_px, rough=done < ROUNDS - 1),
                 cancel=cancel,
             )
         )
@@ -181,7 +183,7 @@ def _wrong_although_held(
         free_units,
         free_cameras=np.ones(cameras, dtype=np.bool_),
         terms=[calibration_prior(model), *_terms(model, positions, result)],
-        options=_options(model, result.sigma_px, iterations=15),
+        options=_options(model, result.sigma_px, rough=True),
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return wrong
@@ -227,7 +229,7 @@ def _hold_unobserved(
             free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
             free_focal=result.focal_free,
             terms=terms,
-            options=_options(model, result.sigma_px, iterations=40),
+            options=_options(model, result.sigma_px),
             cancel=cancel,
         )
     )
@@ -241,11 +243,12 @@ def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
         settle_scale(model, terms)
 
 
-def _options(model: Model, sigma_px: float, *, iterations: int) -> SolverOptions:
+def _options(model: Model, sigma_px: float, *, rough: bool = False) -> SolverOptions:
     return SolverOptions(
-        max_iterations=iterations,
+        max_iterations=15 if rough else 40,
         function_tolerance=TOLERANCE,
-        decrement_tolerance=DECREMENT_TOLERANCE,
+        decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
+        initial_damping=INITIAL_DAMPING,
         loss_scale=model.config.adjustment.loss_scale,
         sigma_px=sigma_px,
         threads=model.config.threads,
@@ -327,7 +330,7 @@ def _certainty(model: Model, positions: PositionPrior | None, result: Refinement
         free_cameras=np.full(len(model.camera_kind), several),
         free_focal=result.focal_free,
         terms=terms,
-        options=_options(model, result.sigma_px, iterations=1),
+        options=_options(model, result.sigma_px),
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return None
