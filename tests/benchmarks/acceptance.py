@@ -3,7 +3,7 @@
 | line | what |
 |---|---|
 | 1 | accuracy on real drives, and COLMAP beside it on the same matches |
-| 2 | time of mapping against COLMAP's global mapper on the same matches |
+| 2 | time of mapping a real drive beside COLMAP's mappers on the same matches, and of the whole way from images |
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
@@ -15,6 +15,8 @@
 | 11 | the road from above, before and after recalibration |
 | 12 | learned keypoints and matches: accuracy on a real drive, and light that changes |
 | 13 | camera set bundle adjustment beside Ceres, on one problem |
+| 14 | time of mapping a rendered drive of six cameras beside COLMAP's mappers on the same matches |
+| 15 | how time, memory and error grow with the length of simulated routes |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -46,11 +48,12 @@ from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
 from tests.benchmarks.occlusion import occlusion
-from tests.benchmarks.real_drives import accuracy, speed
+from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import service
+from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.table import Figure, failed, save, show
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -79,6 +82,8 @@ LINES = {
     "11": Line(untimed=(birds_eye,)),
     "12": Line(untimed=(learned,)),
     "13": Line(timed=(adjustment,)),
+    "14": Line(timed=(surround_speed,)),
+    "15": Line(timed=(long_routes,)),
 }
 
 

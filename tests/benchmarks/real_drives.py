@@ -1,10 +1,9 @@
-"""Lines 1 and 2: real drives, alone and beside COLMAP on the same matches."""
+"""Line 1: real drives, alone and beside COLMAP on the same matches."""
 
 from __future__ import annotations
 
 import json
 import os
-import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +14,10 @@ from mrasfm_engine.evaluation.cameras import compare_camera_poses
 from mrasfm_engine.evaluation.peers import Mapper, run_peer
 from mrasfm_engine.io.read_scene import read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
-from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.commands import evaluate, mrasfm
 from tests.benchmarks.table import Figure, exactly
 
 THREADS = os.cpu_count() or 1
-REPETITIONS = 3
-MAPPING_SHARE = 0.25  # of COLMAP's global mapper
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,31 +102,3 @@ def _peers(data: Path, work: Path) -> Iterator[Figure]:
         if errors is not None:
             yield Figure(line="1", what=f"{title}: metric RMSE", value=errors.metric_rmse_m, unit="m")
             yield Figure(line="1", what=f"{title}: similarity RMSE", value=errors.similarity_rmse_m, unit="m")
-
-
-def speed(data: Path, work: Path) -> Iterator[Figure]:
-    """Line 2: mapping and refinement after matching, against COLMAP's global mapper on the same matches."""
-    drive = imported(data, "kitti06", work)
-    scene = reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
-    ours = statistics.median(_mapping_seconds(drive, scene) for _ in range(REPETITIONS))
-    yield Figure(line="2", what=f"mapping of kitti06, median of {REPETITIONS}", value=ours, unit="s")
-    for mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
-        result = run_peer(scene / "features.db", mapper, threads=THREADS)
-        yield Figure(line="2", what=f"COLMAP {mapper} on the same matches", value=result.seconds, unit="s")
-        yield Figure(
-            line="2",
-            what=f"ours as a part of COLMAP {mapper}",
-            value=ours / result.seconds,
-            most=MAPPING_SHARE if mapper is Mapper.GLOBAL else None,
-            remark=result.failure,
-        )
-
-
-def _mapping_seconds(drive: Path, scene: Path) -> float:
-    """Map again from the kept matches."""
-    (scene / ".stages" / "mapping.npz").unlink(missing_ok=True)
-    mrasfm("reconstruct", drive, "--out", scene, "--no-gnss")
-    stages = read_report(scene)["by_stage"]
-    if stages["mapping"]["reused"] or not stages["matches"]["reused"]:
-        raise AssertionError("the mapping stage alone was to run again")
-    return float(stages["mapping"]["seconds"] + stages["refinement"]["seconds"])
