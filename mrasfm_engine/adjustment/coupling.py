@@ -33,9 +33,10 @@ class Coupling:
     first_block: Ints  # (groups + 1,)
     places: Ints  # of all groups: block of the pattern for units i >= j of the group, at i (i + 1) / 2 + j
     first_place: Ints  # (groups + 1,)
-    image: Ints  # (n,) of each observation: its shot, or else unit and camera
-    image_unit: Ints  # (images,) -1 where nothing was observed
+    image: Ints  # (n,) of each observation, among those that were observed
+    image_unit: Ints  # (images,)
     image_camera: Ints  # (images,)
+    image_shot: Ints  # (images,) 0 where there are no shots
     pattern: BlockPattern  # of the units
     elimination: Elimination
 
@@ -56,11 +57,12 @@ class Coupling:
         blocks, first_block = _blocks_of_groups(points, first_point, blocks, first_block)
         first, row, places, first_place = _pattern(layout.num_units, blocks, first_block)
         pattern = BlockPattern(first=first, row=row)
-        image, image_unit, image_camera = _images(o, layout, motion)
+        image, image_unit, image_camera, image_shot = _images(o, layout)
         return Coupling(
             image=image,
             image_unit=image_unit,
             image_camera=image_camera,
+            image_shot=image_shot,
             points=points,
             first_point=first_point,
             observations_before=np.concatenate([[0], np.cumsum(np.diff(o.first_of_point)[points])]),
@@ -87,13 +89,16 @@ class Coupling:
         return bounds
 
 
-def _images(o: Observations, layout: Layout, motion: ShotMotion | None) -> tuple[Ints, Ints, Ints]:
-    cameras = len(layout.camera_slot)
-    image = o.unit * cameras + o.camera if o.shot is None else o.shot
-    count = len(layout.unit_slot) * cameras if motion is None else len(motion.weight)
-    of_unit, of_camera = np.full(count, -1), np.zeros(count, dtype=np.int64)
-    of_unit[image], of_camera[image] = o.unit, o.camera
-    return image, of_unit, of_camera
+def _images(o: Observations, layout: Layout) -> tuple[Ints, Ints, Ints, Ints]:
+    """Images (or shots) that are observed, numbered: of each observation, and their units, cameras and shots."""
+    name = o.unit * len(layout.camera_slot) + o.camera if o.shot is None else o.shot
+    row = np.full(int(name.max(initial=-1)) + 1, -1, dtype=np.int64)
+    row[name] = np.arange(len(name))  # an observation of each
+    row = row[row >= 0]
+    number = np.zeros(int(name.max(initial=-1)) + 1, dtype=np.int64)
+    number[name[row]] = np.arange(len(row))
+    shot = np.zeros(len(row), dtype=np.int64) if o.shot is None else o.shot[row]
+    return number[name], o.unit[row], o.camera[row], shot
 
 
 @njit(cache=True, inline="always")

@@ -383,7 +383,7 @@ def _subtract_products(
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def add_images(
     unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_t: Any, support: Any, weight: Any, image_unit: Any,
-    image_camera: Any, unit_slot: Any, camera_slot: Any, num_units: int, first_row: Any, rows: Any,
+    image_camera: Any, image_shot: Any, unit_slot: Any, camera_slot: Any, num_units: int, first_row: Any, rows: Any,
     images: Any, s_units: Any, s_border: Any, s_cameras: Any, diagonal: Any, g: Any,
 ) -> None:  # fmt: skip
     """Add the sums of every image to the matrix, to the undamped diagonal (n,) and to the gradient (n,).
@@ -397,9 +397,7 @@ def add_images(
     """
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
-        u, c = image_unit[image], image_camera[image]
-        if u < 0:
-            continue
+        u, c, shot = image_unit[image], image_camera[image], image_shot[image]
         s = images[image]
         k = 0
         for i in range(6):
@@ -408,7 +406,7 @@ def add_images(
                 k += 1
         sc = camera_slot[c]
         if sc >= 0:
-            _camera_from_unit(unit_r[u], shot_r, shot_t, weight, image, cam_t[c], r, q, t)
+            _camera_from_unit(unit_r[u], shot_r, shot_t, weight, shot, cam_t[c], r, q, t)
             for i in range(6):
                 for j in range(6):
                     x = 0.0
@@ -440,8 +438,8 @@ def add_images(
                     break
                 wa, sa = 1.0, unit_slot[u]
             else:
-                wa = weight[image, a]
-                sa = -1 if wa == 0.0 else unit_slot[support[image, a]]
+                wa = weight[shot, a]
+                sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
             if sa < 0:
                 continue
             for i in range(6):
@@ -459,8 +457,8 @@ def add_images(
                         break
                     wb, sb = 1.0, sa
                 else:
-                    wb = weight[image, b]
-                    sb = -1 if wb == 0.0 else unit_slot[support[image, b]]
+                    wb = weight[shot, b]
+                    sb = -1 if wb == 0.0 else unit_slot[support[shot, b]]
                 if sb < 0 or sb > sa:
                     continue
                 at = first_row[sb] + np.searchsorted(rows[first_row[sb] : first_row[sb + 1]], sa)

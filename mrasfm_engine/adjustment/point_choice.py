@@ -59,12 +59,12 @@ def choose_points(observations: Observations, free_units: Bools, image_size_px: 
     o, (columns, rows) = observations, GRID
     cell_px = image_size_px[o.camera] / GRID
     place = np.clip((o.xy_px / cell_px).astype(np.int64), 0, np.array(GRID) - 1)
-    cameras = len(image_size_px)
-    bucket = ((o.unit * cameras + o.camera) * rows + place[:, 1]) * columns + place[:, 0]
-    wanted = np.zeros((len(free_units), cameras * rows * columns), dtype=np.int64)
-    wanted[free_units] = -(-an_image // (rows * columns))
+    slot = np.where(free_units, np.cumsum(free_units) - 1, -1)[o.unit]
+    bucket = ((slot * len(image_size_px) + o.camera) * rows + place[:, 1]) * columns + place[:, 0]
+    cells = int(free_units.sum()) * len(image_size_px) * rows * columns
+    wanted = np.full(cells, -(-an_image // (rows * columns)), dtype=np.int64)
     length = np.diff(o.first_of_point)
-    result: Bools = _choose(np.argsort(-length, kind="stable"), o.first_of_point, bucket, wanted.ravel())
+    result: Bools = _choose(np.argsort(-length, kind="stable"), o.first_of_point, bucket, wanted)
     return result
 
 
@@ -73,9 +73,10 @@ def _choose(order: Any, first: Any, bucket: Any, wanted: Any) -> Any:
     chosen = np.zeros(len(order), np.bool_)
     for p in order:
         for n in range(first[p], first[p + 1]):
-            if wanted[bucket[n]] > 0:
+            if bucket[n] >= 0 and wanted[bucket[n]] > 0:  # below: images of units that are held
                 chosen[p] = True
         if chosen[p]:
             for n in range(first[p], first[p + 1]):
-                wanted[bucket[n]] -= 1
+                if bucket[n] >= 0:
+                    wanted[bucket[n]] -= 1
     return chosen

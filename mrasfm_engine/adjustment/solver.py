@@ -189,7 +189,8 @@ class Problem:
         sums = tuple(part[0] if parts == 1 else part.sum(0) for part in (*blocks, np.zeros_like(gradient), gradient))
         add_images(
             *_arrays(state, self.camera_kind)[:4], state.camera_position_m, *self._motion(),
-            coupling.image_unit, coupling.image_camera, *slots, coupling.pattern.first, coupling.pattern.row,
+            coupling.image_unit, coupling.image_camera, coupling.image_shot, *slots,
+            coupling.pattern.first, coupling.pattern.row,
             images.sum(0), *sums,
         )  # fmt: skip
         extra = Extra.none(layout)

@@ -28,7 +28,7 @@ MAX_ERROR_PX = 8.0  # of an inlier; wider than elsewhere, as calibration may be 
 MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
 MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
 MIN_CAMERA_INLIER_RATIO = 0.25
-MIN_EXPECTED_INLIER_RATIO = 0.7  # below it is asked whether more points agree with a pose elsewhere
+MIN_EXPECTED_INLIER_RATIO = 0.5  # with more, no pose elsewhere can have more points on its side
 VOTE_BEATS_JOINT = 0.9  # of the joint pose's inliers: what the vote loses on a wrong camera it may lose
 
 

@@ -243,9 +243,7 @@ def _adjust_locally(model: Model, unit: int) -> None:
     )
 
 
-def adjust_globally(
-    model: Model, log: MappingLog, cancel: Callable[[], bool] | None, *, growing: bool = False
-) -> None:
+def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | None, *, growing: bool = False) -> None:
     """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter.
 
     Once while the scene is still `growing`: the next time is near. Else once more, with what is clearly wrong left out.

@@ -67,8 +67,7 @@ def find_revisits(model: Model, far_pairs: Sequence[PairMatches]) -> tuple[list[
     steps = np.linalg.norm(np.diff(model.state.unit_position_m[known], axis=0), axis=1)
     way = dict(zip(known.tolist(), np.concatenate([[0.0], np.cumsum(steps)]), strict=True))
     plausible = [r for r in found if _plausible(r, model, float(way[r.later] - way[r.earlier]))]
-    believed = [r for r in plausible if sum(_agree(r, other, model) for other in plausible) >= MIN_SUPPORT]
-    return believed, len(by_units)
+    return _supported(plausible, model), len(by_units)
 
 
 def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -> Revisit | None:
@@ -86,10 +85,10 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
         camera=model.keypoints.camera[rows],
         shot=model.keypoints.shot[rows],
     )
-    registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS, by_vote=False)
+    current = model.state.world_from_rig_of(np.array([later]))[0]
+    registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS, by_vote=False, expected=current)
     if registration.world_from_rig is None:
         return None
-    current = model.state.world_from_rig[later]
     return Revisit(
         earlier=earlier,
         later=later,
@@ -98,27 +97,31 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
     )
 
 
-def _moved(drift: Floats, at: Floats) -> Floats:
-    """By how much a drift moves a point of the world."""
-    result: Floats = drift[:3, :3] @ at + drift[:3, 3] - at
-    return result
-
-
 def _plausible(revisit: Revisit, model: Model, way_m: float) -> bool:
-    shift = np.linalg.norm(_moved(revisit.drift, model.state.unit_position_m[revisit.later]))
+    at = model.state.unit_position_m[revisit.later]
+    shift = np.linalg.norm(revisit.drift[:3, :3] @ at + revisit.drift[:3, 3] - at)
     turn = float(se3.rotation_angle_deg(revisit.drift[:3, :3]))
     return bool(shift <= MAX_DRIFT_M + MAX_DRIFT_PER_M * way_m and turn <= MAX_DRIFT_DEG)
 
 
-def _agree(one: Revisit, other: Revisit, model: Model) -> bool:
-    """Whether two revisits (or one and itself) are neighbours and report the same drift."""
-    near = abs(one.earlier - other.earlier) <= NEIGHBOUR_UNITS and abs(one.later - other.later) <= NEIGHBOUR_UNITS
-    if not near:
-        return False
-    at = model.state.unit_position_m[one.later]
-    shift = np.linalg.norm(_moved(one.drift, at) - _moved(other.drift, at))
-    turn = float(se3.rotation_angle_deg(one.drift[:3, :3] @ other.drift[:3, :3].T))
-    return bool(shift <= SAME_DRIFT_M and turn <= SAME_DRIFT_DEG)
+def _supported(revisits: Sequence[Revisit], model: Model) -> list[Revisit]:
+    """Those that several neighbours, themselves among them, agree with: they report the same drift."""
+    if not revisits:
+        return []
+    units = np.array([(r.earlier, r.later) for r in revisits])
+    drifts = np.stack([r.drift for r in revisits])
+    at = model.state.unit_position_m[units[:, 1]]
+    result = []
+    for i, revisit in enumerate(revisits):
+        # Revisits are in the order of their earlier units.
+        low, high = np.searchsorted(units[:, 0], [units[i, 0] - NEIGHBOUR_UNITS, units[i, 0] + NEIGHBOUR_UNITS + 1])
+        near = low + np.flatnonzero(np.abs(units[low:high, 1] - units[i, 1]) <= NEIGHBOUR_UNITS)
+        moved = drifts[near, :3, :3] @ at[i] + drifts[near, :3, 3]
+        shift = np.linalg.norm(moved - (drifts[i, :3, :3] @ at[i] + drifts[i, :3, 3]), axis=1)
+        turn = se3.rotation_angle_deg(drifts[i, :3, :3] @ drifts[near, :3, :3].swapaxes(1, 2))
+        if np.count_nonzero((shift <= SAME_DRIFT_M) & (turn <= SAME_DRIFT_DEG)) >= MIN_SUPPORT:
+            result.append(revisit)
+    return result
 
 
 def close_loops(model: Model, revisits: Sequence[Revisit]) -> float:

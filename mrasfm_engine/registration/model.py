@@ -22,7 +22,7 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, kept_members
 from mrasfm_engine.triangulation.triangulate import Triangulator
 
 Floats = NDArray[np.float64]
@@ -89,9 +89,9 @@ class Model:
             max_error_px=config.mapping.max_error_px,
             min_angle_deg=config.mapping.min_angle_deg,
         )
-        # Of every member of a track its track and its unit: what registration asks for again and again.
-        self._track_of_member = np.repeat(np.arange(len(tracks), dtype=np.int64), np.diff(tracks.first))
-        self._unit_of_member = keypoints.unit[tracks.keypoints]
+        # What registration asks for again and again: how many points every unit sees, as of which points; keypoints
+        # by unit, and the tracks they are in.
+        self._visible, self._visible_of = np.zeros(units, dtype=np.int64), np.zeros(len(tracks), dtype=np.bool_)
         order = np.argsort(keypoints.unit, kind="stable")
         bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
         tracked = tracks.of_keypoint >= 0
@@ -162,9 +162,11 @@ class Model:
         return (a, b) if self.image_unit[pair.image_a] == unit else (b, a)
 
     def visible_counts(self) -> Ints:
-        """How many keypoints with a point every unit has (units,)."""
-        seen = self.solved[self._track_of_member]
-        return np.bincount(self._unit_of_member[seen], minlength=len(self.registered)).astype(np.int64)
+        """How many keypoints with a point every unit has (units,); not to be written to."""
+        changed = np.flatnonzero(self.solved != self._visible_of)
+        count_members(self.tracks, changed, self.solved, self.keypoints.unit, self._visible)
+        self._visible_of[changed] = self.solved[changed]
+        return self._visible
 
     def triangulate(self, which: Ints | None = None) -> int:
         """Triangulate tracks (all by default) from registered units; how many of them have a point."""
@@ -240,14 +242,11 @@ class Model:
         return int(bad.sum()), int(lost.sum())
 
     def observation_rows(self, tracks: Ints | None = None) -> Ints:
-        """Keypoints that are observations (of the given solved tracks), sorted by track."""
-        members = self.tracks.keypoints
-        kept = self.kept[members]
+        """Keypoints that are observations (of the given solved tracks, ascending), sorted by track."""
         if tracks is not None:
-            wanted = np.zeros(len(self.tracks), dtype=np.bool_)
-            wanted[tracks] = True
-            kept &= wanted[self._track_of_member]
-        return members[kept]
+            return kept_members(self.tracks, tracks, self.kept)
+        members = self.tracks.keypoints
+        return members[self.kept[members]]
 
     def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
         """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by

@@ -136,7 +136,7 @@ class RigMotion:
         nearest = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
         if len(nearest) == 2:
             pair = np.sort(nearest)
-            around = local_motion(state.world_from_rig[pair], self._time_s[pair], np.ones(2, dtype=np.bool_))
+            around = local_motion(state.world_from_rig_of(pair), self._time_s[pair], np.ones(2, dtype=np.bool_))
             if around.known.all():
                 velocity = around.velocity[0]
         rows = self._shots_of(np.array([unit]))
@@ -151,12 +151,12 @@ class RigMotion:
         if len(nearest) < 2:
             return None
         pair = np.sort(nearest)
-        around = local_motion(state.world_from_rig[pair], self._time_s[pair], np.ones(2, dtype=np.bool_))
+        around = local_motion(state.world_from_rig_of(pair), self._time_s[pair], np.ones(2, dtype=np.bool_))
         near = int(np.argmin(np.abs(self._time_s[pair] - self._time_s[unit])))
         elapsed_s = self._time_s[unit] - self._time_s[pair[near]]
         if not around.known.all() or abs(elapsed_s) > MAX_GAP_S:
             return None
-        result: Floats = state.world_from_rig[pair[near]] @ moved(elapsed_s * around.velocity[near : near + 1])[0]
+        result: Floats = state.world_from_rig_of(pair)[near] @ moved(elapsed_s * around.velocity[near : near + 1])[0]
         return result
 
     def unit_from_image(self, state: State) -> Floats:

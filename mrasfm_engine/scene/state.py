@@ -34,6 +34,10 @@ class State:
         """The units' poses (u, 4, 4)."""
         return se3.transform(self.unit_rotation, self.unit_position_m)
 
+    def world_from_rig_of(self, units: NDArray[np.int64]) -> Floats:
+        """The poses (n, 4, 4) of some units, without those of all others."""
+        return se3.transform(self.unit_rotation[units], self.unit_position_m[units])
+
     @property
     def rig_from_cam(self) -> Floats:
         """The cameras' poses (c, 4, 4)."""

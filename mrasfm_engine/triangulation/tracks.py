@@ -97,6 +97,40 @@ class Tracks:
         return len(self.first) - 1
 
 
+def kept_members(tracks: Tracks, which: Ints, kept: NDArray[np.bool_]) -> Ints:
+    """Keypoints (m,) of some tracks that are kept (keypoints,), track by track."""
+    result: Ints = _kept_members(tracks.first, tracks.keypoints, which, kept)
+    return result
+
+
+def count_members(tracks: Tracks, which: Ints, more: NDArray[np.bool_], unit: Ints, counts: Ints) -> None:
+    """Count the keypoints of some tracks by their unit (keypoints,): in where `more` (tracks,), out where not."""
+    _count_members(tracks.first, tracks.keypoints, which, more, unit, counts)
+
+
+@njit(cache=True, nogil=True)
+def _kept_members(first: Any, members: Any, which: Any, kept: Any) -> Any:
+    total = 0
+    for t in which:
+        total += first[t + 1] - first[t]
+    out = np.empty(total, np.int64)
+    end = 0
+    for t in which:
+        for m in range(first[t], first[t + 1]):
+            if kept[members[m]]:
+                out[end] = members[m]
+                end += 1
+    return out[:end].copy()
+
+
+@njit(cache=True, nogil=True)
+def _count_members(first: Any, members: Any, which: Any, more: Any, unit: Any, counts: Any) -> None:
+    for t in which:
+        step = 1 if more[t] else -1
+        for m in range(first[t], first[t + 1]):
+            counts[unit[members[m]]] += step
+
+
 @njit(cache=True, nogil=True)
 def _join(edges: Any, image: Any, parent: Any, following: Any, last: Any, stamp: Any) -> None:
     """Union-find over edges in the given order that never joins two keypoints of one image.
