@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine import stages
+from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.io.drive_bundle import read_drive
@@ -48,16 +49,18 @@ def reconstruct(
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
-    stages.load_models(run)
-    stages.preflight(run)
-    prior = stages.prior(run)
-    stages.probe(run)
-    features = stages.features(run)
-    matches = stages.matches(run, features, prior)
-    model = stages.mapping(run, features, matches, prior)
-    scene = stages.scene(run, model, features, matches, prior)
-    pictures = stages.pictures(run, scene)
+    with watched_compilation() as compiled:
+        stages.load_models(run)
+        stages.preflight(run)
+        prior = stages.prior(run)
+        stages.probe(run)
+        features = stages.features(run)
+        matches = stages.matches(run, features, prior)
+        model = stages.mapping(run, features, matches, prior)
+        scene = stages.scene(run, model, features, matches, prior)
+        pictures = stages.pictures(run, scene)
     if cancel():
         raise CancelledError
+    run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
     write_scene(scene, out, run.report, pictures)
     return run.report

@@ -31,10 +31,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, show progress, and say what there is and how good."""
     config = read_config(arguments.config, **({"use_gnss": False} if arguments.no_gnss else {}))
     # The engine takes a second to load; help and argument errors should not wait for it.
+    from mrasfm_engine.compilation import watched_compilation
     from mrasfm_engine.pipeline import reconstruct
 
     console = Console(stderr=True)
-    with cancel_on_interrupt(console) as cancelled, progress_bars(console) as progress:
+    with (
+        cancel_on_interrupt(console) as cancelled,
+        watched_compilation(lambda: console.print("compiling for this machine: about a minute, once")),
+        progress_bars(console) as progress,
+    ):
         report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled)
     _say(report, arguments.out)
     return 0

@@ -19,7 +19,7 @@ Bools = NDArray[np.bool_]
 
 MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
-MAX_UNKNOWNS_FOR_COVARIANCE = 12_000  # of units and cameras; above, the inverse would take gigabytes
+MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 
 
 def calibration_prior(model: Model, held: Bools | None = None) -> CalibrationPrior:

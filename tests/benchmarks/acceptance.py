@@ -17,6 +17,7 @@
 | 13 | camera set bundle adjustment beside Ceres, on one problem |
 | 14 | time of mapping a rendered drive of six cameras beside COLMAP's mappers on the same matches |
 | 15 | how time, memory and error grow with the length of simulated routes |
+| 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -44,6 +45,7 @@ from tests.benchmarks.ablation import ablation
 from tests.benchmarks.adjustment import adjustment
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
+from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
@@ -84,6 +86,7 @@ LINES = {
     "13": Line(timed=(adjustment,)),
     "14": Line(timed=(surround_speed,)),
     "15": Line(timed=(long_routes,)),
+    "16": Line(timed=(correspondence,)),
 }
 
 
