@@ -28,7 +28,7 @@ MIN_DEPTH_M = 0.05
 ALL_SHOTS = 4096  # up to so many, the poses of all are computed at once; rolling shutters have hundreds a unit
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, work: Any, proj: Any) -> Any:
     """Squared reprojection error of x under cam_from_world (r, t); huge behind the camera."""
     for i in range(3):
@@ -39,7 +39,7 @@ def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, w
     return (proj[0] - xy[0]) ** 2 + (proj[1] - xy[1]) ** 2
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _refine(
     count: int, use: Any, members: Any, shot: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any,
     params: Any, x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
