@@ -198,10 +198,8 @@ def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:
 def _register_next(model: Model, log: MappingLog) -> Registration | None:
     """Register the unit that sees most points; units that failed wait until they see more."""
     counts = model.visible_counts()
-    for unit in np.argsort(-counts, kind="stable"):
-        unit = int(unit)
-        if model.registered[unit] or not model.keyframe[unit] or counts[unit] < model.config.mapping.min_pnp_inliers:
-            continue
+    waiting = np.flatnonzero(~model.registered & model.keyframe & (counts >= model.config.mapping.min_pnp_inliers))
+    for unit in waiting[np.argsort(-counts[waiting], kind="stable")].tolist():
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue
