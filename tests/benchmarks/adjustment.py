@@ -39,16 +39,15 @@ START = {"unit_deg": 0.05, "unit_m": 0.02, "camera_deg": 0.05, "camera_m": 0.005
 THREADS = 2
 TOLERANCE, WITHIN = 1e-6, 1e-4
 MAX_ITERATIONS = 100
-REPETITIONS = 3
 MIN_SPEED, MAX_MEMORY_SHARE = 6.0, 0.5
 
 
-def adjustment(data: Path, work: Path) -> Iterator[Figure]:
+def adjustment(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 13."""
     goal = (1 + WITHIN) * min(_measured(solver)["cost"] for solver in ("ours", "ceres"))
     # Solvers take the same way every time: how far they must go is asked once.
     ours, theirs = ([_measured(solver, goal)] for solver in ("ours", "ceres"))
-    for _ in range(REPETITIONS - 1):
+    for _ in range(repeat - 1):
         ours.append(_measured("ours", goal, int(ours[0]["iterations"])))
         theirs.append(_measured("ceres", goal, int(theirs[0]["iterations"])))
     title = f"{UNITS} units of {CAMERAS} cameras, {ours[0]['observations']} observations"

@@ -18,19 +18,18 @@ from tests.benchmarks.commands import mrasfm, read_report
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure
 
-REPETITIONS = 3
 KEYPOINTS = 2048
 MAX_ERROR_PX = 2.0
 TIMES_AS_FAST = 2.0
 THREADS = os.cpu_count() or 1
 
 
-def correspondence(data: Path, work: Path) -> Iterator[Figure]:
+def correspondence(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 16. Inliers of both are those that COLMAP's verification finds among the matches of either."""
     drive = imported(data, "kitti06", work)
     out = work / "correspondence"
     ours, theirs = [], []
-    for repetition in range(REPETITIONS):
+    for repetition in range(repeat):
         scene = out / str(repetition)
         mrasfm("reconstruct", drive, "--out", scene)
         stages = read_report(scene)["by_stage"]

@@ -16,7 +16,6 @@ from tests.benchmarks.commands import mrasfm
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure
 
-REPETITIONS = 3
 TIMES_AS_FAST = {
     "kitti06": {"colmap-global": 12.0, "colmap-global-fixed": 8.0, "colmap-incremental": 25.0},
     "surround": {"colmap-global": 6.0, "colmap-incremental": 15.0},
@@ -29,18 +28,18 @@ ROUTES = (500, 1000, 2000, 4541)
 MAX_GROWTH, MAX_MEMORY_GB, MAX_ERROR_PERCENT = 1.5, 8.0, 0.1
 
 
-def speed(data: Path, work: Path) -> Iterator[Figure]:
+def speed(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 2: a real drive; mapping after matching, and the whole way from images."""
     drive = imported(data, "kitti06", work)
-    yield from _beside_peers("2", "kitti06", drive, work / "bench kitti06", repeat=REPETITIONS)
-    yield from _whole_way(drive, data, work)
+    yield from _beside_peers("2", "kitti06", drive, work / "bench kitti06", repeat)
+    yield from _whole_way(drive, data, work, repeat)
 
 
-def surround_speed(data: Path, work: Path) -> Iterator[Figure]:
+def surround_speed(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 14: a rendered drive of six cameras."""
     drive = work / "surround for speed"
     mrasfm("synth", "--out", drive, "--units", SURROUND_UNITS, "--cameras", 6, "--seed", 1)
-    yield from _beside_peers("14", "surround", drive, work / "bench surround", repeat=1)
+    yield from _beside_peers("14", "surround", drive, work / "bench surround", repeat)
 
 
 def long_routes(data: Path, work: Path) -> Iterator[Figure]:
@@ -71,7 +70,7 @@ def long_routes(data: Path, work: Path) -> Iterator[Figure]:
     )
 
 
-def _beside_peers(line: str, name: str, drive: Path, out: Path, *, repeat: int) -> Iterator[Figure]:
+def _beside_peers(line: str, name: str, drive: Path, out: Path, repeat: int) -> Iterator[Figure]:
     wanted = TIMES_AS_FAST[name]
     alone = _row(_bench(drive, "--out", out), "mrasfm")
     patience_s = PATIENCE * max(wanted.values()) * alone["whole_s"]
@@ -91,10 +90,10 @@ def _beside_peers(line: str, name: str, drive: Path, out: Path, *, repeat: int) 
         yield Figure(line=line, what=f"{name}: times as fast as {peer}", value=ratio, above=times, most=1e4)
 
 
-def _whole_way(drive: Path, data: Path, work: Path) -> Iterator[Figure]:
+def _whole_way(drive: Path, data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """From images to what there is in the end, beside OpenCV's SIFT, nearest neighbours and COLMAP's global mapper."""
     ours = []
-    for repetition in range(REPETITIONS):
+    for repetition in range(repeat):
         started = time.perf_counter()
         mrasfm("reconstruct", drive, "--out", work / f"whole way {repetition}")
         ours.append(time.perf_counter() - started)
