@@ -31,7 +31,7 @@ check: setup ## lint, types, import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-acceptance: setup ## every figure that the README claims, as a table (real drives needed; ACCEPTANCE="--only 1,2")
+acceptance: setup ## every figure that the README claims, as a table (real drives needed; ACCEPTANCE="--only 1,2", ACCEPTANCE=--thorough)
 	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)
 
 lock: ## renew the locks from pyproject.toml: all, and what the container image needs (needs uv)
