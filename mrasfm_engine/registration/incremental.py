@@ -36,6 +36,7 @@ Bools = NDArray[np.bool_]
 
 LOCAL_TOLERANCE = 1e-3
 GLOBAL_TOLERANCE = 1e-4
+DECREMENT_TOLERANCE = 0.1  # while the scene grows: less than half a standard deviation
 
 
 @dataclass(kw_only=True)
@@ -234,6 +235,7 @@ def _adjust_locally(model: Model, unit: int) -> None:
         options=SolverOptions(
             max_iterations=10,
             function_tolerance=LOCAL_TOLERANCE,
+            decrement_tolerance=DECREMENT_TOLERANCE,
             loss_scale=model.config.adjustment.loss_scale,
             threads=model.config.threads,
         ),
@@ -251,6 +253,7 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
     options = SolverOptions(
         max_iterations=20,
         function_tolerance=GLOBAL_TOLERANCE,
+        decrement_tolerance=DECREMENT_TOLERANCE,
         loss_scale=model.config.adjustment.loss_scale,
         threads=model.config.threads,
     )
@@ -274,7 +277,8 @@ def adjust_globally(model: Model, log: MappingLog, cancel: Callable[[], bool] | 
         if free and priors:
             # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
             scale_with_baselines(model, scale_of_baselines(model)[0])
-        model.complete()
-        model.filter(error_px)
+        model.complete()  # filters, too
+        if error_px < model.config.mapping.max_error_px:
+            model.filter(error_px)
         if model.config.mapping.semantic_triangulation:
             log.roads.append(drop_off_road(model))

@@ -219,6 +219,7 @@ def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int
     tracks = model.tracks_of_units(np.array([u, v]))
     free = np.zeros(len(model.registered), dtype=np.bool_)
     free[v] = True
+    options = SolverOptions(max_iterations=30, function_tolerance=1e-3, threads=model.config.threads)
     threshold = model.triangulator.max_error_px
     # Baselines between cameras that are not simultaneous follow from the pose that is sought: it takes some turns.
     rough_rounds = 1 if model.state.simultaneous else MOTION_ROUNDS
@@ -227,7 +228,7 @@ def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int
             model.triangulator.max_error_px = max(error_px, threshold)
             if model.triangulate(tracks) < MIN_POINTS:
                 return 0
-            model.adjust(free, options=SolverOptions(max_iterations=30, function_tolerance=1e-4))
+            model.adjust(free, options=options, an_image=model.config.mapping.pose_observations)
     finally:
         model.triangulator.max_error_px = threshold
     return model.triangulate(tracks)

@@ -83,6 +83,7 @@ def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
         world_from_rig,
         radius_m=config.road_patch_m,
         rng=np.random.default_rng(model.config.seed),
+        rounds=2 if final else 1,
     )
     if fitted is None:
         return f"{len(tracks)} points of the road are too few, or lie on no surface"

@@ -99,7 +99,13 @@ def most_frequent(values: Floats) -> float:
 
 
 def fit_road(
-    points_m: Floats, sigma_m: Floats, world_from_rig: Floats, *, radius_m: float, rng: np.random.Generator
+    points_m: Floats,
+    sigma_m: Floats,
+    world_from_rig: Floats,
+    *,
+    radius_m: float,
+    rng: np.random.Generator,
+    rounds: int = 2,
 ) -> FittedRoad | None:
     """The surface through points of the road, robustly: half of them and more may be wrong.
 
@@ -111,6 +117,8 @@ def fit_road(
         The vehicle's poses (u, 4, 4), z up.
     radius_m
         Of a patch.
+    rounds
+        Of fitting: after the first the roughness is known, and with it which points can be the road's.
 
     Returns
     -------
@@ -127,7 +135,7 @@ def fit_road(
     below = (world_from_rig[:, :3, 3] - rig_height * world_from_rig[:, :3, 2]) @ axes.T
     slopes = _slopes(world_from_rig[:, :3, 2] @ axes.T)
     roughness, fitted = FIRST_ROUGHNESS_M, None
-    for _ in range(2):
+    for _ in range(rounds):
         fitted = _grow(points, below, slopes, axes, radius_m=radius_m, roughness_m=roughness, rng=rng)
         if fitted is None:
             return None
