@@ -15,7 +15,18 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.errors import ServiceError
-from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Project, SceneFile, new_id, now_us
+from service.persistence.tables import (
+    Blob,
+    Checkpoint,
+    Drive,
+    DriveFile,
+    MapCheckpoint,
+    MapFile,
+    Project,
+    SceneFile,
+    new_id,
+    now_us,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +177,8 @@ def unused() -> ColumnElement[bool]:
         | sql_exists().where(DriveFile.blob_id == Blob.id)
         | sql_exists().where(SceneFile.blob_id == Blob.id)
         | sql_exists().where(Checkpoint.blob_id == Blob.id)
+        | sql_exists().where(MapFile.blob_id == Blob.id)
+        | sql_exists().where(MapCheckpoint.blob_id == Blob.id)
     )
 
 

@@ -70,8 +70,9 @@ def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
 _FIRST_RECORDS = (
     "INSERT INTO projects (id, name, used_bytes, max_bytes, max_active_jobs, max_drives, created_us) "
     "VALUES ('prj_1', 'p', 0, 1, 1, 1, 1)",
-    "INSERT INTO jobs (id, project_id, kind, drive_id, settings, state, revision, attempt, fence, not_before_us, percent, "
-    "reused, created_us) VALUES ('job_1', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'SUCCEEDED', 1, 1, 1, 0, 100, '[]', 1)",
+    "INSERT INTO jobs (id, project_id, kind, drive_id, settings, state, revision, attempt, fence, not_before_us, "
+    "percent, reused, created_us) VALUES "
+    "('job_1', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'SUCCEEDED', 1, 1, 1, 0, 100, '[]', 1)",
     "INSERT INTO job_attempts (job_id, fence, attempt, owner, started_us) VALUES ('job_1', 1, 1, 'w', 1)",
     "INSERT INTO job_events (job_id, kind, data, created_us) VALUES ('job_1', 'state', '{}', 1)",
 )

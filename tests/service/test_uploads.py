@@ -341,9 +341,7 @@ def test_the_disk_fills_up(client: Client, api: Api, monkeypatch: pytest.MonkeyP
     assert patch(client, url, kept, data[kept:]).status_code == 204
 
 
-def test_killed_between_the_last_byte_and_the_end(
-    client: Client, api: Api, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_between_the_last_byte_and_the_end(client: Client, api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     """All bytes are there, and the drive does not have them yet: whoever asks for the offset brings it to its end."""
     data, drive_id = image(1000), client.create()
     url = begin(client, drive_id, PATH, data, sha256=sha256_of(data))

@@ -29,9 +29,7 @@ def begin(client: httpx.Client, drive_id: str, path: str, data: bytes, **values:
     return answer.headers["location"]
 
 
-def patch(
-    client: httpx.Client, url: str, offset: int, data: bytes | Iterator[bytes], **headers: str
-) -> httpx.Response:
+def patch(client: httpx.Client, url: str, offset: int, data: bytes | Iterator[bytes], **headers: str) -> httpx.Response:
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     headers = {**VERSION, "Content-Type": OFFSET_TYPE, "Upload-Offset": str(offset), **named}
     return client.patch(url, content=data, headers=headers)

@@ -24,7 +24,7 @@ class OfTree(TypedDict, total=False):
     map_id: str
     request: dict[str, Any]
     is_child: bool
-    children_percent: float
+    waiting_for: int
 
 
 def create(

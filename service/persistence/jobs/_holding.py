@@ -73,6 +73,7 @@ def claim(session: Session, job_id: str, *, owner: str, lease_us: int) -> Claim 
     job = session.get_one(Job, job_id, populate_existing=True)
     session.add(JobAttempt(job_id=job_id, fence=job.fence, attempt=job.attempt, owner=owner))
     tell_state(session, job_id)
+    tell_parents(session, job)
     return claim_of(job)
 
 

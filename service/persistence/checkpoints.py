@@ -1,0 +1,116 @@
+"""Finished stages, so that another attempt or another job does not repeat them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.persistence import blobs
+from service.persistence.artifacts import ArtifactStore
+from service.persistence.database import Database
+from service.persistence.storing import StoredFile
+from service.persistence.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
+
+
+def settings_sha256(settings: Mapping[str, Any]) -> str:
+    """Tells apart the settings under which stages were finished, and scenes made."""
+    return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class DriveShelf:
+    """Stages of one drive under certain settings."""
+
+    drive_id: str
+    settings_sha256: str
+
+
+@dataclass(frozen=True)
+class MapShelf:
+    """Stages of an aggregation of certain inputs; those of another map of the project serve as well."""
+
+    map_id: str
+    project_id: str
+    inputs_sha256: str
+
+
+Shelf = DriveShelf | MapShelf
+
+
+def restore(database: Database, artifacts: ArtifactStore, shelf: Shelf, folder: Path) -> list[str]:
+    """Bring finished stages into a folder; the names of the files brought."""
+    table: type[Checkpoint] | type[MapCheckpoint]
+    match shelf:
+        case DriveShelf():
+            table = Checkpoint
+            mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
+        case MapShelf():
+            table = MapCheckpoint
+            of_project = MapCheckpoint.project_id == shelf.project_id
+            mine = of_project & (MapCheckpoint.inputs_sha256 == shelf.inputs_sha256)
+    with database.read() as session:
+        rows = session.execute(
+            select(table.name, Blob.key, Blob.sha256)
+            .join(Blob, table.blob_id == Blob.id)
+            .where(mine)
+            .order_by(table.created_us)
+        ).all()
+    found = {name: (key, sha256) for name, key, sha256 in rows}  # the newest of a name
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    for name, (key, sha256) in found.items():
+        artifacts.fetch(key, folder / name, sha256)
+    return list(found)
+
+
+def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> None:
+    """Note checkpoints, by name, that were put into the artifact store; older ones of the same names are replaced.
+
+    Nothing is kept where the drive or the map has been deleted.
+    """
+    owner: Drive | Map | None
+    match shelf:
+        case DriveShelf():
+            owner = session.get(Drive, shelf.drive_id)
+        case MapShelf():
+            owner = session.get(Map, shelf.map_id)
+    if owner is None:
+        return
+    for name, file in stored.items():
+        blob = blobs.record(session, project_id=owner.project_id, within_quota=False, **file.identity)
+        checkpoint = _find(session, shelf, name)
+        if checkpoint is None:
+            session.add(_new(shelf, name, blob.id))
+        else:
+            checkpoint.blob_id = blob.id
+            checkpoint.created_us = now_us()
+
+
+def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoint | None:
+    match shelf:
+        case DriveShelf():
+            return session.get(Checkpoint, (shelf.drive_id, shelf.settings_sha256, name))
+        case MapShelf():
+            return session.get(MapCheckpoint, (shelf.map_id, shelf.inputs_sha256, name))
+
+
+def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
+    match shelf:
+        case DriveShelf():
+            return Checkpoint(
+                drive_id=shelf.drive_id, settings_sha256=shelf.settings_sha256, name=name, blob_id=blob_id
+            )
+        case MapShelf():
+            return MapCheckpoint(
+                map_id=shelf.map_id,
+                project_id=shelf.project_id,
+                inputs_sha256=shelf.inputs_sha256,
+                name=name,
+                blob_id=blob_id,
+            )
