@@ -34,39 +34,57 @@ class DriveShelf:
 
 @dataclass(frozen=True)
 class MapShelf:
-    """Stages of an aggregation of certain inputs; those of another map of the project serve as well."""
+    """Stages of an aggregation: each of a pair of scenes, wherever in the project the two were put together before.
+
+    Attributes
+    ----------
+    slots
+        By the name of a stage's file, the digest of all that it is made of.
+    """
 
     map_id: str
     project_id: str
-    inputs_sha256: str
+    slots: Mapping[str, str]
+
+    @staticmethod
+    def of(map_id: str, project_id: str, *, scenes: Mapping[str, str], settings: Mapping[str, Any]) -> MapShelf:
+        """Of the scenes of a map, ids by name, under some settings."""
+        under = settings_sha256(settings)
+        slots = {
+            f"seam-{a}--{b}.npz": hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
+            for a, first in scenes.items()
+            for b, second in scenes.items()
+            if a != b
+        }
+        return MapShelf(map_id, project_id, slots)
 
 
 Shelf = DriveShelf | MapShelf
+_SEAM = "seam"
 
 
 def restore(database: Database, artifacts: ArtifactStore, shelf: Shelf, folder: Path) -> list[str]:
     """Bring finished stages into a folder; the names of the files brought."""
-    table: type[Checkpoint] | type[MapCheckpoint]
-    match shelf:
-        case DriveShelf():
-            table = Checkpoint
-            mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
-        case MapShelf():
-            table = MapCheckpoint
-            of_project = MapCheckpoint.project_id == shelf.project_id
-            mine = of_project & (MapCheckpoint.inputs_sha256 == shelf.inputs_sha256)
     with database.read() as session:
-        rows = session.execute(
-            select(table.name, Blob.key, Blob.sha256)
-            .join(Blob, table.blob_id == Blob.id)
-            .where(mine)
-            .order_by(table.created_us)
-        ).all()
-    found = {name: (key, sha256) for name, key, sha256 in rows}  # the newest of a name
+        found = _shelved(session, shelf)
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     for name, (key, sha256) in found.items():
         artifacts.fetch(key, folder / name, sha256)
     return list(found)
+
+
+def _shelved(session: Session, shelf: Shelf) -> dict[str, tuple[str, str]]:
+    """Key and digest of the finished stages, by name."""
+    if isinstance(shelf, DriveShelf):
+        mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
+        of_drive = select(Checkpoint.name, Blob.key, Blob.sha256).join(Blob, Checkpoint.blob_id == Blob.id)
+        return {name: (key, sha256) for name, key, sha256 in session.execute(of_drive.where(mine))}
+    of_maps = select(MapCheckpoint.inputs_sha256, Blob.key, Blob.sha256).join(Blob, MapCheckpoint.blob_id == Blob.id)
+    rows = session.execute(
+        of_maps.where(MapCheckpoint.project_id == shelf.project_id).order_by(MapCheckpoint.created_us)
+    )
+    known = {inputs: (key, sha256) for inputs, key, sha256 in rows}  # the newest
+    return {name: known[inputs] for name, inputs in shelf.slots.items() if inputs in known}
 
 
 def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> None:
@@ -83,6 +101,8 @@ def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> No
     if owner is None:
         return
     for name, file in stored.items():
+        if isinstance(shelf, MapShelf) and name not in shelf.slots:
+            continue
         blob = blobs.record(session, project_id=owner.project_id, within_quota=False, **file.identity)
         checkpoint = _find(session, shelf, name)
         if checkpoint is None:
@@ -97,7 +117,7 @@ def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoi
         case DriveShelf():
             return session.get(Checkpoint, (shelf.drive_id, shelf.settings_sha256, name))
         case MapShelf():
-            return session.get(MapCheckpoint, (shelf.map_id, shelf.inputs_sha256, name))
+            return session.get(MapCheckpoint, (shelf.map_id, shelf.slots[name], _SEAM))
 
 
 def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
@@ -110,7 +130,7 @@ def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
             return MapCheckpoint(
                 map_id=shelf.map_id,
                 project_id=shelf.project_id,
-                inputs_sha256=shelf.inputs_sha256,
-                name=name,
+                inputs_sha256=shelf.slots[name],
+                name=_SEAM,
                 blob_id=blob_id,
             )
