@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.io.export_colmap import frame_of_image
 from mrasfm_engine.scene.scene import Scene
+from schemas import DriveManifest
 
 Floats = NDArray[np.float64]
 
@@ -129,6 +130,21 @@ def check_road(scene: Scene, path: Path) -> None:
         on_road = np.flatnonzero(scene.point_patches >= 0)
         away = np.linalg.norm(scene.points_m[on_road] - centre[scene.point_patches[on_road]], axis=1)
         require(bool((away < 2 * document["patch_radius_m"]).all()), path, "a point is far from its patch")
+
+
+def check_manifest(scene: Scene, path: Path) -> None:
+    """Check that the drive's manifest reads back as what it is."""
+    with checking(path):
+        read, given = DriveManifest.model_validate(_read_json(path)), scene.drive.manifest
+        require(read.frames == given.frames and read.gnss == given.gnss, path, "frames or gnss are not the drive's")
+        names = [camera.name for camera in read.rig.cameras]
+        require(names == [camera.name for camera in given.rig.cameras], path, "its cameras are not the drive's")
+        # Reading a quaternion normalises it once more.
+        for camera, expected in zip(read.rig.cameras, given.rig.cameras, strict=True):
+            poses = [
+                matrices([p.rotation_xyzw], [p.translation_m]) for p in (camera.rig_from_cam, expected.rig_from_cam)
+            ]
+            require_close(*poses, path=path, what=f"{camera.name}'s pose", tolerance=POSE_TOLERANCE)
 
 
 def check_features(scene: Scene, path: Path) -> None:

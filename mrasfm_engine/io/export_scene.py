@@ -1,8 +1,9 @@
 """Writes a scene's files, checks them, and puts them in place.
 
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
-`poses.json`, `calibration.json`, `frame.json`, `features.db`, `pictures/` where any were drawn, `road.json` where the
-road was found, and `report.json`. One with a `report.json` is complete.
+`poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
+scene can be aggregated without the drive), `pictures/` where any were drawn, `road.json` where the road was found, and
+`report.json`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ PICTURES = "pictures"
 NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
 LEFTOVER_AGE_S = 3600.0
 ROAD_FILE = "road.json"
+MANIFEST_FILE = "manifest.json"
 
 
 def write_scene(
@@ -126,6 +128,9 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
     _write_json(work / "poses.json", export_poses.poses_document(scene))
     _write_json(work / "calibration.json", export_calibration.calibration_document(scene))
     _write_json(work / "frame.json", export_frame.frame_document(scene))
+    manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
+    (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
+    export_check.check_manifest(scene, work / MANIFEST_FILE)
     _write_json(work / COMPLETE_MARK, {**report, "summary": figures})
     export_check.check_documents(scene, work)
 
