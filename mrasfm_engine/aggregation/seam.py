@@ -52,13 +52,14 @@ class Seam:
     shared: Ints  # (n, 2) points of a and of b that are one
     units_a: Ints  # that see shared points
     units_b: Ints
+    place_b_m: Floats  # (3,) the middle of b's units there, in b's frame
     quality: dict[str, Any] = field(default_factory=dict)
 
     def pack(self) -> tuple[Arrays, dict[str, Any]]:
         """As a finished stage keeps it; names are not part of it."""
         arrays = {
             name: getattr(self, name)
-            for name in ("coarse_a_from_b", "a_from_b", "covariance", "shared", "units_a", "units_b")
+            for name in ("coarse_a_from_b", "a_from_b", "covariance", "shared", "units_a", "units_b", "place_b_m")
         }
         return arrays, {"accepted": self.accepted, "reason": self.reason, "quality": self.quality}
 
@@ -211,6 +212,7 @@ def _judged(
         shared=fine.shared.pairs - [0, assembly.first_point[1]],
         units_a=units_a,
         units_b=units_b,
+        place_b_m=at,
         quality=quality,
     )
 
@@ -298,5 +300,6 @@ def _unconnected(a: SourceScene, b: SourceScene, coarse: Floats, reason: str, qu
         shared=np.zeros((0, 2), dtype=np.int64),
         units_a=none,
         units_b=none,
+        place_b_m=b.midpoint_m,
         quality=quality,
     )
