@@ -20,8 +20,9 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.correspondence.plugins import Plugins, load_plugins
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.io.export_map import MAP_FILE, SCENES_FOLDER, SEAMS_FOLDER
+from mrasfm_engine.io.export_map import SCENES_FOLDER, SEAMS_FOLDER
 from mrasfm_engine.io.findings import Finding, as_json, warning
+from mrasfm_engine.io.read_map import MAP_FILE
 from mrasfm_engine.io.stage_store import StageStore, code_version, fingerprint
 
 Floats = NDArray[np.float64]

@@ -29,6 +29,7 @@ from mrasfm_engine.io import (
 from mrasfm_engine.io.export_check import checking, require, require_close
 from mrasfm_engine.io.export_scene import PICTURES, check_scene, summary, write_json
 from mrasfm_engine.io.publishing import COMPLETE_MARK, publishing
+from mrasfm_engine.io.read_map import MAP_FILE
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.drive import matrix_from_pose
@@ -38,7 +39,7 @@ from schemas import Pose
 Floats = NDArray[np.float64]
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
-MAP_FILE = "map.json"
+
 CALIBRATION_FOLDER = "calibration"
 SCENES_FOLDER, SEAMS_FOLDER = "scenes", "seams"
 REPLACED = (PICTURES, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
