@@ -27,7 +27,7 @@ from service.persistence import uploads as upload_records
 from service.persistence.tables import now_us
 from service.readiness import Readiness
 from service.request_log import RequestLog
-from service.routes import drives, files, jobs, operations, reconstructions, scenes, uploads
+from service.routes import aggregations, drives, files, jobs, maps, operations, reconstructions, scenes, uploads
 from service.routes.documentation import add_documentation
 from service.settings import Settings
 from service.uploads.resumable import sweep as sweep_resumable
@@ -48,8 +48,9 @@ Send a drive (images of a vehicle's cameras, GNSS, calibration), get a metric sc
 3. `POST /v1/drives/{id}:commit`
 4. `POST /v1/reconstructions`, then poll `/v1/jobs/{id}` or read its events
 5. `GET /v1/scenes/{id}` and its files
+6. `POST /v1/aggregations` with several drives or scenes makes one map of them: `GET /v1/maps/{id}` and its versions
 
-`mrasfm upload` does all of it. Every error is an RFC 9457 problem whose `remedy` says what to do.
+`mrasfm upload` and `mrasfm map` do all of it. Every error is an RFC 9457 problem whose `remedy` says what to do.
 """
 
 
@@ -72,7 +73,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.state.readiness = Readiness(context)
-    for module in (drives, files, uploads, reconstructions, jobs, scenes, operations):
+    for module in (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, operations):
         app.include_router(module.router)
     app.include_router(operations.metrics_route(metrics))
     add_documentation(app)
