@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
@@ -36,6 +36,7 @@ from service.uploads.spool import sweep
 log = logging.getLogger("mrasfm.api")
 
 _SPOOL_KEPT_S = 24 * 3600
+_UPLOADS_SWEPT_AFTER_S = 60  # at its start an API has other things to do
 _SWEEP_EVERY_S = 3600
 _EXPIRED_KEPT_S = 7 * 24 * 3600
 _DATABASE_FULL = ("database or disk is full", "No space left on device")
@@ -85,24 +86,31 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 async def _sweep_for_ever(context: Context) -> None:
     """Remove what killed processes left in the spool, and uploads that nobody went on with."""
+    settings = context.settings
+    await asyncio.gather(
+        _repeat(0.0, lambda: sweep(settings.spool_dir, older_than_s=_SPOOL_KEPT_S)),
+        _repeat(_UPLOADS_SWEPT_AFTER_S, lambda: sweep_uploads(context)),
+    )
+
+
+async def _repeat(after_s: float, step: Callable[[], object]) -> None:
+    await asyncio.sleep(after_s)
     while True:
         try:
-            await asyncio.to_thread(sweep_spool, context)
+            await asyncio.to_thread(step)
         except (OSError, SQLAlchemyError):
             log.exception("the spool could not be swept")
         await asyncio.sleep(_SWEEP_EVERY_S)
 
 
-def sweep_spool(context: Context) -> None:
+def sweep_uploads(context: Context) -> None:
     """Remove what is nobody's any more. An upload that expired is answered with 410 for a while, then with 404."""
-    settings = context.settings
-    sweep(settings.spool_dir, older_than_s=_SPOOL_KEPT_S)
 
     def alive(upload_ids: Sequence[str]) -> set[str]:
         with context.database.read() as session:
             return upload_records.alive(session, upload_ids)
 
-    sweep_resumable(settings.uploads_dir, alive)
+    sweep_resumable(context.settings.uploads_dir, alive)
     with context.database.write() as session:
         upload_records.forget_expired(session, before_us=now_us() - int(_EXPIRED_KEPT_S * 1e6))
 

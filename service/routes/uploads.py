@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from schemas.api.uploads import UploadResource
 from service.errors import ServiceError
-from service.persistence import uploads
+from service.persistence import drives, uploads
 from service.persistence.idempotency import Answer
 from service.persistence.tables import Upload, now_us
 from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, moment, problems
@@ -48,10 +48,12 @@ _PATCH_BODY = {"requestBody": {"required": True, "content": {tus.CONTENT_TYPE: _
 _OFFSET = {"Upload-Offset": {"description": "how many bytes are here for good", "schema": {"type": "integer"}}}
 
 
-@router.options("", status_code=204, responses=problems(401))
+@router.options("", status_code=204, responses=problems(401, 404))
 @router.options("/{upload_id}", status_code=204, include_in_schema=False)
 def describe_protocol(drive_id: str, caller: CallerDep, context: ContextDep, response: Response) -> None:
     """Which version and extensions of tus this service speaks, and how large an upload may be."""
+    with context.database.read() as session:
+        drives.get(session, caller.project_id, drive_id)
     response.headers["Tus-Version"] = tus.VERSION
     response.headers["Tus-Extension"] = tus.EXTENSIONS
     response.headers["Tus-Checksum-Algorithm"] = ",".join(tus.ALGORITHMS)

@@ -14,7 +14,7 @@ import httpx
 import pytest
 from sqlalchemy import update
 
-from service.app import sweep_spool
+from service.app import sweep_uploads
 from service.persistence import durability
 from service.persistence.tables import Upload, now_us
 from service.uploads.resumable import PartialFile
@@ -198,13 +198,13 @@ def test_expiry(api: Api, client: Client) -> None:
     assert head(client, url).status_code == 410
     problem_of(patch(client, url, 500, data[500:]), 410, "upload-expired")
     assert any(name.startswith(upload_id) for name in bytes_left(api))
-    sweep_spool(api.context)
+    sweep_uploads(api.context)
     assert not any(name.startswith(upload_id) for name in bytes_left(api))
     assert head(client, url).status_code == 410
     with api.database.write() as session:
         long_ago = now_us() - 8 * 86_400 * 1_000_000
         session.execute(update(Upload).where(Upload.id == upload_id).values(expires_us=long_ago))
-    sweep_spool(api.context)
+    sweep_uploads(api.context)
     assert head(client, url).status_code == 404
     url = begin(client, drive_id, PATH, data)
     assert patch(client, url, 0, data).status_code == 204
@@ -392,5 +392,5 @@ def test_a_deleted_drive_takes_its_uploads_along(client: Client, api: Api) -> No
     assert patch(client, url, 0, data[:500]).status_code == 204
     assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
     assert head(client, url).status_code == 404
-    sweep_spool(api.context)
+    sweep_uploads(api.context)
     assert not any(name.startswith(url.rsplit("/", 1)[1]) for name in bytes_left(api))
