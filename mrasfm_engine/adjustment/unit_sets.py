@@ -1,8 +1,8 @@
 """Units that move as one: the variable of transformation-based bundle adjustment.
 
 The units of a finished scene are a rigid body: `world_from_rig = world_from_scene * scene_from_rig` with one unknown,
-`world_from_scene`, for all of them (MRASfM, section on aggregation). A step (omega, v) of a set turns it about a pivot c,
-the mean place of its units, and moves it:
+`world_from_scene`, for all of them (MRASfM, section on aggregation). A step (omega, v) of a set turns it about a pivot
+c, the mean place of its units, and moves it:
 
     R_u <- exp(omega) R_u        t_u <- exp(omega) (t_u - c) + c + v
 

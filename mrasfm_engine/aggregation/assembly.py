@@ -1,4 +1,4 @@
-"""Several scenes in one frame: their units, cameras, images and keypoints numbered through, as adjustments take them."""
+"""Several scenes in one frame: units, cameras, images and keypoints numbered through, as adjustments take them."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, guided_pairs, nearest_distance_m
+from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, common_view, nearest_distance_m
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.geometry import se3
@@ -59,9 +59,7 @@ def _composed(local_from_ecef: Floats, ecef_from_other: Floats) -> Floats:
     return se3.transform(rotation @ ecef_from_other[:3, :3], rotation @ (ecef_from_other[:3, 3] - origin))
 
 
-def _pairs(
-    scenes: Sequence[SourceScene], map_from_scene: Floats, config: AggregationConfig
-) -> list[tuple[int, int]]:
+def _pairs(scenes: Sequence[SourceScene], map_from_scene: Floats, config: AggregationConfig) -> list[tuple[int, int]]:
     """Pairs of scenes of which one is among the other's candidates: those whose footprints overlap most."""
     reach = config.position_error_m + SIGHT_SHIFT_M
     scores: dict[tuple[int, int], tuple[float, float]] = {}
@@ -69,7 +67,7 @@ def _pairs(
         a_from_b = coarse_transform(scenes[i], scenes[j])
         apart = nearest_distance_m(scenes[i], scenes[j], a_from_b)
         if apart <= reach:
-            scores[i, j] = (float(len(guided_pairs(scenes[i], scenes[j], a_from_b, config))), -apart)
+            scores[i, j] = (common_view(scenes[i], scenes[j], a_from_b, config), -apart)
     chosen: set[tuple[int, int]] = set()
     for k in range(len(scenes)):
         own = sorted((pair for pair in scores if k in pair), key=lambda pair: scores[pair], reverse=True)

@@ -1,9 +1,11 @@
 """How one scene lies in another, from the poses of several of its units, and whether these agree.
 
-Every unit of scene b that sees points of scene a gets a pose there by one PnP over its cameras, and with it says how all
-of b lies in a: a_from_b = a_from_rig * inverse(b_from_rig). One unit alone can be wrong: a facade that repeats gives it a
-perfect pose at another house. So the hypothesis with which most units agree wins, it must be a clear majority of those
-that have something to say, and no other place may have nearly as many.
+Every unit of scene b that sees points of scene a gets a pose there by one PnP over its cameras, and with it says how
+all of b lies in a: a_from_b = a_from_rig * inverse(b_from_rig). One unit alone can be wrong: a facade that repeats
+gives it a perfect pose at another house. So the hypothesis with which most units agree wins, it must be a clear
+majority of those that have something to say, and no other place may explain nearly as much: what is left of a unit's
+matches without those that fit is asked for a pose again, and where several units have a second one that is nearly as
+good as the first, something repeats, and which of the places is the right one nothing says.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ Bools = NDArray[np.bool_]
 MAX_ERROR_FOCAL = 0.012  # of the focal length: reprojection error of an inlier between two scenes, which may be bent
 MIN_SHARE = 0.35  # of a unit's matches that must fit, for it to agree
 MIN_MAJORITY = 0.5  # of the units that have something to say
-MAX_RUNNER_UP = 0.5  # of the winner's units that another place may have
+MAX_RUNNER_UP = 0.5  # of the winner's units for which another place may be nearly as good
+RIVAL_SHARE = 0.3  # of a unit's inliers at the winner's place that make another place nearly as good
 SAME_PLACE_M, SAME_PLACE_DEG = 1.5, 4.0  # hypotheses nearer than that are one place
 TRIALS = 2000
 
@@ -57,13 +60,14 @@ class Consensus:
     reason: str
     units_asked: int  # units with matches enough to have something to say
     units_agreeing: tuple[int, ...]  # units of b
-    runner_up: int  # units that agree on the best other place
+    runner_up: int  # units for which the best other place is nearly as good
     inliers: int  # image points that fit
 
 
 def sightings(a: SourceScene, b: SourceScene, keypoints_a: Ints, keypoints_b: Ints, image_of_b: Ints) -> Sightings:
-    """Matches (n,) of keypoints as image points of b and points of a; each image point of b once."""
-    _, first = np.unique(keypoints_b, return_index=True)
+    """Matches (n,) of keypoints as image points of b and points of a, each pair of these once."""
+    pairs = np.column_stack([keypoints_b, a.keypoint_point[keypoints_a]])
+    _, first = np.unique(pairs, axis=0, return_index=True)
     image = image_of_b[keypoints_b[first]]
     return Sightings(
         unit=b.image_unit[image],
@@ -83,7 +87,6 @@ class Relocaliser:
             pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=c.params) for c in b.drive.cameras
         ]
         self._b_from_cam = b.world_from_cam
-        self._hypotheses: dict[int, Floats] = {}
 
     def errors_focal(self, a_from_b: Floats, seen: Sightings) -> Floats:
         """Reprojection errors (n,) in focal lengths if b lies so in a; infinite behind a camera."""
@@ -127,9 +130,7 @@ class Relocaliser:
             )
             key, eye_from_rig = "cam_from_world", se3.inverse(rig_from_eye[0])
         else:
-            poses = [
-                pycolmap.Rigid3d(pycolmap.Rotation3d(m[:3, :3]), m[:3, 3]) for m in se3.inverse(rig_from_eye)
-            ]
+            poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(m[:3, :3]), m[:3, 3]) for m in se3.inverse(rig_from_eye)]
             result = pycolmap.estimate_and_refine_generalized_absolute_pose(
                 own.xy_px, own.points_m, [int(e) for e in eye], poses, cameras, estimation_options=ransac
             )
@@ -171,20 +172,47 @@ class Relocaliser:
         proposals: list[tuple[Floats, Ints, int]] = []
         for unit in asked:
             a_from_b = self.hypothesis(int(unit), seen)
-            if a_from_b is None:
-                continue
-            for _ in range(2):
-                agreeing, fits = self.agreeing(a_from_b, seen)
-                better = self.refined(a_from_b, seen.of(fits & np.isin(seen.unit, agreeing)))
-                if better is None or not len(agreeing):
-                    break
-                a_from_b = better
-            agreeing, fits = self.agreeing(a_from_b, seen)
-            proposals.append((a_from_b, agreeing, int((fits & np.isin(seen.unit, agreeing)).sum())))
+            if a_from_b is not None:
+                proposals.append(self._with_all_units(a_from_b, seen))
         if not proposals:
             return _none(f"of {len(asked)} units with enough matches none finds a pose", len(asked))
         best = max(proposals, key=lambda p: (len(p[1]), p[2]))
-        return self._judged(best, proposals, asked)
+        return self._judged(best, self._rivals(best, proposals, asked, seen), asked)
+
+    def _with_all_units(self, a_from_b: Floats, seen: Sightings) -> tuple[Floats, Ints, int]:
+        """A transform refined by all units that agree with it, these, and how many image points of theirs fit."""
+        for _ in range(2):
+            agreeing, fits = self.agreeing(a_from_b, seen)
+            better = self.refined(a_from_b, seen.of(fits & np.isin(seen.unit, agreeing)))
+            if better is None or not len(agreeing):
+                break
+            a_from_b = better
+        agreeing, fits = self.agreeing(a_from_b, seen)
+        return a_from_b, agreeing, int((fits & np.isin(seen.unit, agreeing)).sum())
+
+    def _rivals(
+        self,
+        best: tuple[Floats, Ints, int],
+        proposals: Sequence[tuple[Floats, Ints, int]],
+        asked: Ints,
+        seen: Sightings,
+    ) -> int:
+        """For how many units the best other place is nearly as good."""
+        a_from_b, agreeing, _ = best
+        _, fits = self.agreeing(a_from_b, seen)
+        rest = seen.of(~fits)
+        at_best = {int(u): int((fits & (seen.unit == u)).sum()) for u in asked}
+        others = [p[0] for p in proposals]
+        others += [h for u in asked if (h := self.hypothesis(int(u), rest)) is not None]
+        most = 0
+        for other in others:
+            if self._same_place(other, a_from_b, agreeing):
+                continue
+            fitting = self.errors_focal(other, rest) < MAX_ERROR_FOCAL
+            counts = {u: int((fitting & (rest.unit == u)).sum()) for u in at_best}
+            needed = {u: max(self._config.min_unit_inliers, RIVAL_SHARE * at_best[u]) for u in at_best}
+            most = max(most, sum(counts[u] >= needed[u] for u in at_best))
+        return most
 
     def _best_unit_alone(self, seen: Sightings, unit: int, asked: int) -> Consensus:
         """The one unit that sees most decides, as in the paper."""
@@ -194,27 +222,18 @@ class Relocaliser:
         _, fits = self.agreeing(a_from_b, seen)
         return _found((a_from_b, np.array([unit]), int(fits.sum())), asked, 0, "the best unit alone decides")
 
-    def _judged(
-        self, best: tuple[Floats, Ints, int], proposals: Sequence[tuple[Floats, Ints, int]], asked: Ints
-    ) -> Consensus:
-        a_from_b, agreeing, inliers = best
-        others = [p for p in proposals if not self._same_place(p[0], a_from_b, agreeing)]
-        runner_up = max((len(set(p[1].tolist()) - set(agreeing.tolist())) for p in others), default=0)
+    def _judged(self, best: tuple[Floats, Ints, int], runner_up: int, asked: Ints) -> Consensus:
+        agreeing = best[1]
+        reason = ""
         if len(agreeing) < self._config.min_units:
-            return _none(
-                f"{len(agreeing)} units agree how the scenes lie, {self._config.min_units} are needed",
-                len(asked), runner_up=runner_up,
-            )  # fmt: skip
-        if len(agreeing) < MIN_MAJORITY * len(asked):
-            return _none(
-                f"only {len(agreeing)} of {len(asked)} units agree how the scenes lie", len(asked), runner_up=runner_up
-            )
-        if runner_up > MAX_RUNNER_UP * len(agreeing):
-            return _none(
-                f"{len(agreeing)} units agree on one place, {runner_up} others on another: something repeats",
-                len(asked), runner_up=runner_up,
-            )  # fmt: skip
-        return _found((a_from_b, agreeing, inliers), len(asked), runner_up, "")
+            reason = f"{len(agreeing)} units agree how the scenes lie, {self._config.min_units} are needed"
+        elif len(agreeing) < MIN_MAJORITY * len(asked):
+            reason = f"only {len(agreeing)} of {len(asked)} units agree how the scenes lie"
+        elif runner_up > MAX_RUNNER_UP * len(agreeing):
+            reason = f"{len(agreeing)} units agree on one place, but for {runner_up} another is nearly as good"
+        if reason:
+            return _none(reason, len(asked), runner_up=runner_up)
+        return _found(best, len(asked), runner_up, "")
 
     def _same_place(self, one: Floats, other: Floats, units: Ints) -> bool:
         at = self._b.world_from_rig[units].mean(0)[:3, 3] if len(units) else np.zeros(3)
@@ -224,9 +243,7 @@ class Relocaliser:
 
 
 def _none(reason: str, asked: int, *, runner_up: int = 0) -> Consensus:
-    return Consensus(
-        a_from_b=None, reason=reason, units_asked=asked, units_agreeing=(), runner_up=runner_up, inliers=0
-    )
+    return Consensus(a_from_b=None, reason=reason, units_asked=asked, units_agreeing=(), runner_up=runner_up, inliers=0)
 
 
 def _found(best: tuple[Floats, Ints, int], asked: int, runner_up: int, reason: str) -> Consensus:

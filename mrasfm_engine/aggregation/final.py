@@ -159,9 +159,7 @@ def _terms(assembly: Assembly, positions: dict[int, DrivePositions], free: Bools
         units = np.flatnonzero((assembly.scene_of_unit == k) & free)
         if len(units) and assembly.scenes[k].common_world is None:
             terms.append(
-                UprightPrior(
-                    unit=units, sigma_roll_rad=float(SIGMA_ROLL_RAD), sigma_pitch_rad=float(SIGMA_PITCH_RAD)
-                )
+                UprightPrior(unit=units, sigma_roll_rad=float(SIGMA_ROLL_RAD), sigma_pitch_rad=float(SIGMA_PITCH_RAD))
             )
     return terms
 

@@ -21,6 +21,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.matching import CrossMatches
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.triangulate import cam_from_world
 
@@ -60,7 +61,7 @@ def merge_points(assembly: Assembly, matches: CrossMatches, fits: Bools) -> Shar
 
 
 def matches_fit(assembly: Assembly, state: State, matches: CrossMatches, max_error_focal: float) -> Bools:
-    """Which matches (n,) join points that both scenes see where the other has them, to some share of the focal length."""
+    """Which matches (n,) join points that both scenes see where the other has them, to a share of the focal length."""
     a, b = assembly.scenes
     point_a = a.keypoint_point[matches.a]
     point_b = b.keypoint_point[matches.b] + assembly.first_point[1]
@@ -72,8 +73,6 @@ def matches_fit(assembly: Assembly, state: State, matches: CrossMatches, max_err
 
 def errors_focal(assembly: Assembly, state: State, rows: Ints, points_m: Floats) -> Floats:
     """Angles (n,), as shares of the focal length, between keypoints `rows` (n,) and points (n, 3)."""
-    from mrasfm_engine.geometry.camera_model import project_points
-
     image = assembly.keypoint_image[rows]
     camera = assembly.image_camera[image]
     rotation, translation = cam_from_world(

@@ -39,14 +39,18 @@ def rig_height_m(scene: SourceScene) -> float:
 
 def footprints(scene: SourceScene, max_depth_m: float) -> Floats:
     """Points (cameras, s, 3) of every camera's footprint, in its own axes."""
+    if max_depth_m not in scene.footprints:
+        scene.footprints[max_depth_m] = _footprints(scene, max_depth_m)
+    return scene.footprints[max_depth_m]
+
+
+def _footprints(scene: SourceScene, max_depth_m: float) -> Floats:
     height = rig_height_m(scene)
     kind, params = pack_cameras(scene.drive.cameras)
     return np.stack(
         [
             _footprint(int(k), p, (c.width, c.height), rig_from_cam, height, max_depth_m)
-            for k, p, c, rig_from_cam in zip(
-                kind, params, scene.drive.cameras, scene.drive.rig_from_cam, strict=True
-            )
+            for k, p, c, rig_from_cam in zip(kind, params, scene.drive.cameras, scene.drive.rig_from_cam, strict=True)
         ]
     )
 

@@ -104,9 +104,7 @@ class SeamGraph:
                 return contradicting, -len(found.scenes), graph._strength(k)
 
             k = min(suspects, key=left)
-            graph = graph._without(
-                k, f"it contradicts the other seams: a loop does not close by {worst.shift_m:.2f} m"
-            )
+            graph = graph._without(k, f"it contradicts the other seams: a loop does not close by {worst.shift_m:.2f} m")
             chain = graph.chain(start)
         return graph, chain
 

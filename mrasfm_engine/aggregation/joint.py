@@ -53,7 +53,7 @@ def joined_owner(assembly: Assembly, seams: Sequence[Seam]) -> Ints:
                 continue
             parent[rb] = ra
             members[ra] = scenes_a | scenes_b
-    roots = np.array([root(p) for p in np.flatnonzero(parent != np.arange(len(parent)))], dtype=np.int64)
+    roots = np.array([root(int(p)) for p in np.flatnonzero(parent != np.arange(len(parent)))], dtype=np.int64)
     owner = np.full(len(parent), -1, dtype=np.int64)
     if not len(roots):
         return owner

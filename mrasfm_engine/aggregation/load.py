@@ -79,7 +79,7 @@ def read_scene(folder: Path, name: str) -> SourceScene:
     for part, document in (("frame", frame), ("poses", poses), ("calibration", calibration)):
         if document.get("version") != SCHEMA_VERSION:
             raise InputError(
-                f"scene {name}: {part}.json has version {document.get('version')!r}, this engine reads {SCHEMA_VERSION}",
+                f"scene {name}: {part}.json is of version {document.get('version')!r}, not of {SCHEMA_VERSION}",
                 remedy=AGAIN,
                 code="scene-version",
             )
@@ -295,7 +295,9 @@ def _keypoints(
                 "SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (i + 1,)
             ).fetchone()
             if rows != counts[i]:
-                raise ValueError(f"features.db has {rows} descriptors of image {i + 1}, the model {counts[i]} keypoints")
+                raise ValueError(
+                    f"features.db has {rows} descriptors of image {i + 1}, the model {counts[i]} keypoints"
+                )
             table = np.frombuffer(data or b"", np.uint8).reshape(rows, columns)
             descriptors.append(table[found.point >= 0])
     flat = np.concatenate(point) if point else np.zeros(0, dtype=np.int64)

@@ -31,7 +31,9 @@ def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Sc
     classes = np.concatenate([s.point_classes for s in assembly.scenes])[source]
     poses = model.state.world_from_rig.copy()
     poses[~assembly.registered] = np.nan
-    first = np.concatenate([s.keypoint_first[:-1] + f for s, f in zip(assembly.scenes, assembly.first_keypoint, strict=False)])
+    first = np.concatenate(
+        [s.keypoint_first[:-1] + f for s, f in zip(assembly.scenes, assembly.first_keypoint, strict=False)]
+    )
     return Scene(
         drive=_joined_drive(assembly),
         unit_registered=assembly.registered,
@@ -93,9 +95,7 @@ def _features(assembly: Assembly) -> list[ImageFeatures]:
     for scene in assembly.scenes:
         for xy in np.split(scene.keypoint_xy_px, scene.keypoint_first[1:-1]):
             result.append(
-                ImageFeatures(
-                    xy_px=xy, descriptors=np.zeros((0, 128), np.uint8), colors=np.zeros((0, 3), np.uint8)
-                )
+                ImageFeatures(xy_px=xy, descriptors=np.zeros((0, 128), np.uint8), colors=np.zeros((0, 3), np.uint8))
             )
     return result
 

@@ -86,9 +86,7 @@ class _Side:
 class CrossMatcher:
     """Matches images of two scenes; every image is prepared once, every pair compared once."""
 
-    def __init__(
-        self, a: SourceScene, b: SourceScene, matcher: Matcher, config: MatchConfig, *, threads: int
-    ) -> None:
+    def __init__(self, a: SourceScene, b: SourceScene, matcher: Matcher, config: MatchConfig, *, threads: int) -> None:
         self._a, self._b = _Side(a, matcher), _Side(b, matcher)
         self._matcher, self._config, self._threads = matcher, config, threads
         self._known: dict[tuple[int, int], CrossMatches] = {}

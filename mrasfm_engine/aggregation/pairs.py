@@ -1,9 +1,9 @@
 """Which images of two scenes are matched: few, and where their footprints on the ground overlap.
 
 How two scenes lie to one another is known at first from their positions only, metres wrong. So a few units of one are
-compared with all that the other may have seen from around there; when it is known how they lie, images are paired by the
-overlap of their footprints and the angle between their views, over all cameras of both: a vehicle that comes the other
-way has seen with its back camera what the other's front camera saw.
+compared with all that the other may have seen from around there; when it is known how they lie, images are paired by
+the overlap of their footprints and the angle between their views, over all cameras of both: a vehicle that comes the
+other way has seen with its back camera what the other's front camera saw.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Ints = NDArray[np.int64]
 SIGHT_SHIFT_M = 12.0  # cameras this far apart along their views still match
 MIN_OVERLAP = 0.15
 PROBE_PAIRS = 14  # of an image, while it is not known how the scenes lie
-SIMILAR_DISTANCE = 0.35  # by which footprints count less where one camera is that much farther away
+SIMILAR_DISTANCE_M = 10.0  # cameras this far apart count half
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ def thinned(scene: SourceScene, spacing_m: float) -> Ints:
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
     """How near the ways of two scenes come to one another, horizontally, as they lie."""
     way = b.way_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-    return float(cKDTree(a.way_m[:, :2]).query(way[:, :2])[0].min())
+    return float(np.min(cKDTree(a.way_m[:, :2]).query(way[:, :2])[0]))
 
 
 def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> list[Probe]:
@@ -88,7 +88,7 @@ def _images_of(scene: SourceScene, units: Ints) -> Ints:
 
 def _near_pairs(poses_a: Floats, poses_b: Floats, reach_m: float, max_angle_deg: float) -> tuple[Ints, Floats]:
     """Pairs (n, 2) of poses within reach that look in similar directions, and how promising (n,) each is."""
-    near = cKDTree(poses_a[:, :3, 3]).query_ball_point(poses_b[:, :3, 3], reach_m)
+    near: list[list[int]] = list(cKDTree(poses_a[:, :3, 3]).query_ball_point(poses_b[:, :3, 3], reach_m))  # type: ignore[arg-type]
     pairs = np.array([(i, j) for j, found in enumerate(near) for i in sorted(found)], dtype=np.int64).reshape(-1, 2)
     cosine = (poses_a[pairs[:, 0], :3, 2] * poses_b[pairs[:, 1], :3, 2]).sum(1)
     keep = cosine > np.cos(np.radians(max_angle_deg))
@@ -105,21 +105,7 @@ def guided_pairs(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggre
     a_from_b
         How the scenes lie (4, 4), to within the size of a footprint.
     """
-    images_a, images_b = np.flatnonzero(a.image_registered), np.flatnonzero(b.image_registered)
-    poses_a, poses_b = a.world_from_cam[images_a], a_from_b @ b.world_from_cam[images_b]
-    pairs, _ = _near_pairs(poses_a, poses_b, 1.5 * SIGHT_SHIFT_M, config.max_view_angle_deg)
-    if not len(pairs):
-        return pairs
-    cosine = (poses_a[pairs[:, 0], :3, 2] * poses_b[pairs[:, 1], :3, 2]).sum(1)
-    away = np.linalg.norm(poses_a[pairs[:, 0], :3, 3] - poses_b[pairs[:, 1], :3, 3], axis=1)
-    pairs = np.column_stack([images_a[pairs[:, 0]], images_b[pairs[:, 1]]])
-    depth = config.max_depth_m
-    samples = footprints(a, depth), footprints(b, depth)
-    overlap = overlaps(pairs, a, b, a_from_b=a_from_b, samples=samples, max_depth_m=depth)
-    # What is seen from elsewhere, or at another angle, looks different however much the footprints overlap.
-    score = overlap * cosine**2 / (1.0 + SIMILAR_DISTANCE * away / SIGHT_SHIFT_M)
-    keep = overlap >= MIN_OVERLAP
-    pairs, score = pairs[keep], score[keep]
+    pairs, score = _overlapping(a, b, a_from_b, config)
     chosen = np.zeros(len(pairs), dtype=np.bool_)
     for side in (0, 1):
         order = np.lexsort((-score, pairs[:, side]))
@@ -128,3 +114,31 @@ def guided_pairs(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggre
     rows = np.flatnonzero(chosen)
     rows = np.sort(rows[np.argsort(-score[rows], kind="stable")[: config.max_pairs]])
     return pairs[rows]
+
+
+def common_view(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> float:
+    """How much of one scene the other one sees as they lie, in images: the best overlaps of all images, added."""
+    pairs, score = _overlapping(a, b, a_from_b, config)
+    best = [np.zeros(len(scene.image_unit)) for scene in (a, b)]
+    for side in (0, 1):
+        np.maximum.at(best[side], pairs[:, side], score)
+    return float(min(best[0].sum(), best[1].sum()))
+
+
+def _overlapping(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> tuple[Ints, Floats]:
+    """Image pairs (n, 2) whose footprints overlap, and how alike (n,) they should look."""
+    images_a, images_b = np.flatnonzero(a.image_registered), np.flatnonzero(b.image_registered)
+    poses_a, poses_b = a.world_from_cam[images_a], a_from_b @ b.world_from_cam[images_b]
+    pairs, _ = _near_pairs(poses_a, poses_b, 1.5 * SIGHT_SHIFT_M, config.max_view_angle_deg)
+    if not len(pairs):
+        return pairs, np.zeros(0)
+    cosine = (poses_a[pairs[:, 0], :3, 2] * poses_b[pairs[:, 1], :3, 2]).sum(1)
+    away = np.linalg.norm(poses_a[pairs[:, 0], :3, 3] - poses_b[pairs[:, 1], :3, 3], axis=1)
+    pairs = np.column_stack([images_a[pairs[:, 0]], images_b[pairs[:, 1]]])
+    depth = config.max_depth_m
+    samples = footprints(a, depth), footprints(b, depth)
+    overlap = overlaps(pairs, a, b, a_from_b=a_from_b, samples=samples, max_depth_m=depth)
+    # What is seen from elsewhere, or at another angle, looks different however much the footprints overlap.
+    score = overlap * cosine**2 / (1.0 + away / SIMILAR_DISTANCE_M)
+    keep = overlap >= MIN_OVERLAP
+    return pairs[keep], score[keep]

@@ -84,9 +84,7 @@ def aggregate(
     return write_map(map_content(run, result, pictures), out, run.report)
 
 
-def _graph(
-    found: Sequence[SourceScene], known: Association, seams: Sequence[Seam]
-) -> tuple[SeamGraph, list[Chain]]:
+def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Seam]) -> tuple[SeamGraph, list[Chain]]:
     """Seams without contradictions, and the chain of every component; that of the reference comes first."""
     graph = SeamGraph([scene.name for scene in found], seams)
     done: set[int] = set()

@@ -76,6 +76,4 @@ def with_bias(positions: DrivePositions, state: State) -> DrivePositions:
     bias = geometric_median(measured - antenna)
     whitened = np.linalg.norm((measured - bias - antenna) / prior.sigma_m, axis=1)
     factor = max(1.0, float(np.median(whitened)) / USUAL_LENGTH)
-    return DrivePositions(
-        prior=replace(prior, position_m=measured - bias, sigma_m=prior.sigma_m * factor), bias_m=bias
-    )
+    return DrivePositions(prior=replace(prior, position_m=measured - bias, sigma_m=prior.sigma_m * factor), bias_m=bias)

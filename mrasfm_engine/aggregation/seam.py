@@ -135,7 +135,7 @@ def _relocalise(
         matches = CrossMatches.joined(parts)
         seen: Sightings = sightings(a, b, matches.a, matches.b, image_of_b)
         found = relocaliser.consensus(seen)
-        if found.a_from_b is not None and len(found.units_agreeing) >= ENOUGH_AGREEING:
+        if found.a_from_b is not None and len(found.units_agreeing) >= ENOUGH_AGREEING and not found.runner_up:
             return found, start + len(batch)
     return found, len(order)
 
@@ -284,7 +284,7 @@ def _residual_px(assembly: Assembly, a_from_b: Floats, shared: Shared) -> float:
     camera = assembly.image_camera[assembly.keypoint_image[rows]]
     off_px = off * state.camera_params[camera, :2].mean(1)
     finite = off_px[np.isfinite(off_px)]
-    return float(np.median(finite)) if len(finite) else float(np.hypot(*a.drive.cameras[0].params[:2]))
+    return float(np.median(finite)) if len(finite) else float(max(a.drive.cameras[0].width, a.drive.cameras[0].height))
 
 
 def _unconnected(a: SourceScene, b: SourceScene, coarse: Floats, reason: str, quality: dict[str, Any]) -> Seam:

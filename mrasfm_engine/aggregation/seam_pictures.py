@@ -20,7 +20,11 @@ COLOR_A, COLOR_B = (214, 96, 0), (0, 92, 190)
 
 
 def seam_picture(
-    title: Sequence[str], points_m: tuple[Floats, Floats], ways_m: tuple[Floats, Floats], centre_m: Floats, side_m: float
+    title: Sequence[str],
+    points_m: tuple[Floats, Floats],
+    ways_m: tuple[Floats, Floats],
+    centre_m: Floats,
+    side_m: float,
 ) -> Picture:
     """A picture (h, w, 3) of the ground around a place, east to the right and north up.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,7 @@ class SourceScene:
     keypoint_xy_px: NDArray[np.float32]  # (n, 2)
     keypoint_point: Ints  # (n,) -1 for none
     descriptors: NDArray[Any]  # (m, D) of the keypoints that observe a point, in their order
+    footprints: dict[float, Floats] = field(default_factory=dict, repr=False, compare=False)  # by depth; see footprint
 
     @cached_property
     def drive(self) -> Drive:
@@ -134,12 +135,11 @@ class SourceScene:
         known = {field.name for field in fields(SourceScene)}
         rest = {key: value for key, value in documents.items() if key in known and key != "manifest"}
         manifest = DriveManifest.model_validate(documents["manifest"])
-        return SourceScene(name=name, manifest=manifest, **rest, **arrays)
+        everything: dict[str, Any] = {**rest, **arrays}
+        return SourceScene(name=name, manifest=manifest, **everything)
 
 
-def unit_from_images(
-    world_from_rig: Floats, world_from_cam: Floats, rig_from_cam: Floats, registered: Bools
-) -> Floats:
+def unit_from_images(world_from_rig: Floats, world_from_cam: Floats, rig_from_cam: Floats, registered: Bools) -> Floats:
     """Poses (i, 4, 4) of the rig at the images' times relative to their units'; (0, 4, 4) where they are the same."""
     result = np.tile(np.eye(4), (len(world_from_cam), 1, 1))
     rows = np.flatnonzero(registered)

@@ -41,7 +41,9 @@ class Run:
     into: Path | None  # the map that is extended
     progress: Progress
     cancel: Callable[[], bool]
-    report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": []})
+    report: dict[str, Any] = field(
+        default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": []}
+    )
 
     def step(self, stage: str) -> Callable[[int, int], None]:
         """The progress callback of a stage."""
@@ -124,7 +126,9 @@ def map_document(folder: Path) -> dict[str, Any]:
         return dict(document)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{folder} is no map: {error}", remedy="Give the folder that `mrasfm aggregate --out` wrote.", code="not-a-map"
+            f"{folder} is no map: {error}",
+            remedy="Give the folder that `mrasfm aggregate --out` wrote.",
+            code="not-a-map",
         ) from error
 
 
@@ -145,9 +149,15 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
                     remedy="Give each drive once.",
                     code="same-drive",
                 )
-    _require_one(found, "features_kind", "different-features", "keypoints", "Reconstruct all drives with one extractor.")
     _require_one(
-        found, "common_world", "different-worlds", "a world", "Give all drives GNSS, or rough_poses in one common_world."
+        found, "features_kind", "different-features", "keypoints", "Reconstruct all drives with one extractor."
+    )
+    _require_one(
+        found,
+        "common_world",
+        "different-worlds",
+        "a world",
+        "Give all drives GNSS, or rough_poses in one common_world.",
     )
     datums = sorted({scene.height_datum for scene in found})
     if len(datums) > 1:
@@ -196,9 +206,7 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
                 "They are in one map, in the frame of the reference; check that this is meant.",
             )
         )
-    run.ended(
-        "association", started, reference=found[result.reference].name, pairs=len(result.pairs)
-    )
+    run.ended("association", started, reference=found[result.reference].name, pairs=len(result.pairs))
     return result
 
 

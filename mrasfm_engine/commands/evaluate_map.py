@@ -80,9 +80,7 @@ def _truths(poses: MapPoses, words: list[str]) -> dict[str, Trajectory]:
     return dict.fromkeys(poses.trajectories, read_tum(Path(words[0])))
 
 
-def _matched(
-    poses: MapPoses, truths: dict[str, Trajectory], folder: Path
-) -> dict[str, tuple[Floats, Floats]]:
+def _matched(poses: MapPoses, truths: dict[str, Trajectory], folder: Path) -> dict[str, tuple[Floats, Floats]]:
     """Estimated and true poses of the units of every scene that has a truth."""
     result = {}
     for name, truth in truths.items():
@@ -98,9 +96,7 @@ def _matched(
     return result
 
 
-def _seams(
-    poses: MapPoses, matched: dict[str, tuple[Floats, Floats]]
-) -> list[tuple[MapSeam, SeamErrors, SeamErrors]]:
+def _seams(poses: MapPoses, matched: dict[str, tuple[Floats, Floats]]) -> list[tuple[MapSeam, SeamErrors, SeamErrors]]:
     result = []
     for seam in poses.seams:
         if seam.a not in matched or seam.b not in matched:
@@ -148,9 +144,7 @@ def _table(poses: MapPoses, errors: MapErrors) -> Table:
     registered = sum(len(t.timestamps_us) for t in poses.trajectories.values())
     table.add_row("units", f"{registered} of {poses.total_units} registered")
     table.add_row("units with truth, connected", f"{all_units.poses}")
-    table.add_row(
-        "position, metric", f"rmse {all_units.metric_rmse_m:.4f} m, median {all_units.metric_median_m:.4f} m"
-    )
+    table.add_row("position, metric", f"rmse {all_units.metric_rmse_m:.4f} m, median {all_units.metric_median_m:.4f} m")
     table.add_row("rotation", f"median {all_units.rotation_median_deg:.4f} deg")
     for seam, fine, coarse in errors.seams:
         table.add_row(

@@ -69,7 +69,9 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
         Where the map contradicts itself, or a file that was written does not read back.
     """
     check_scene(content.scene)
-    kept = [array for part in (content.scenes, content.seams) for _, arrays, _ in part.values() for array in arrays.values()]
+    kept = [
+        array for part in (content.scenes, content.seams) for _, arrays, _ in part.values() for array in arrays.values()
+    ]
     rows = len(content.scene.observation_point)
     needed = sum(array.nbytes for array in kept) + 400 * len(content.scene.points_m) + 200 * rows + 4_000_000
     needed += 60 * sum(len(f.xy_px) for f in content.scene.features) + export_pictures.size_bytes(content.pictures)
