@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -138,13 +137,12 @@ class MapAssignment:
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
     ) -> dict[str, Any]:
         """The map's next version."""
-        document = json.loads((done.out / "map.json").read_text(encoding="utf-8"))
         number = maps.publish(
             session,
             self._held,
             files=files,
-            summary=_map_summary(done.report, document),
-            unconnected=document["unconnected"],
+            summary=_map_summary(done.report),
+            unconnected=done.report["map"]["unconnected"],
             expires_us=_expires_us(settings.map_retention_days),
             reused=_reused(done.report),
         )
@@ -163,12 +161,13 @@ def _scene_summary(report: Mapping[str, Any]) -> SceneSummary:
     return SceneSummary(**_figures(report))
 
 
-def _map_summary(report: Mapping[str, Any], document: Mapping[str, Any]) -> MapSummary:
+def _map_summary(report: Mapping[str, Any]) -> MapSummary:
+    figures = report["map"]
     return MapSummary(
         **_figures(report),
-        scenes=len(document["scenes"]),
-        connected=len(document["scenes"]) - len(document["unconnected"]),
-        seams=sum(bool(seam["accepted"]) for seam in document["seams"]),
+        scenes=figures["scenes"],
+        connected=figures["scenes"] - len(figures["unconnected"]),
+        seams=figures["seams"],
     )
 
 

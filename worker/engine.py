@@ -104,7 +104,16 @@ def _aggregate(
     partial.write_text(json.dumps(written, indent=1, allow_nan=False), encoding="utf-8")
     partial.replace(path)
     progress("export", 1, 1)
-    return written
+    return {**written, "map": _figures(json.loads((request.out / "map.json").read_text(encoding="utf-8")))}
+
+
+def _figures(document: dict[str, Any]) -> dict[str, Any]:
+    """What of `map.json` is recorded with the map's version."""
+    return {
+        "scenes": len(document["scenes"]),
+        "seams": sum(bool(seam["accepted"]) for seam in document["seams"]),
+        "unconnected": document["unconnected"],
+    }
 
 
 def _written_report(out: Path) -> dict[str, Any]:
