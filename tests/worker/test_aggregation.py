@@ -23,7 +23,7 @@ from worker.execution import Runner
 def two_drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two rendered drives of one street. Tests only read them."""
     out = tmp_path_factory.mktemp("rendered") / "drives"
-    options = SynthOptions(cameras=4, units=8, seed=3, drives=2, width=480, height=270, texture_px=256)
+    options = SynthOptions(cameras=4, units=14, seed=1, drives=2, width=480, height=270, texture_px=256)
     return render_drives(options, out)
 
 
@@ -81,7 +81,7 @@ def test_two_drives_become_a_map(unpowered: World, two_drives: list[Path]) -> No
     percents = [event.data["percent"] for event in world.events(job.id) if event.kind == "progress"]
     assert percents == sorted(percents)
     (version,) = versions(world)
-    assert version.summary["registered_units"] == 16
+    assert version.summary["registered_units"] == 28
     assert (version.summary["connected"], version.summary["seams"]) == (2, 1)
     assert {"points.ply", "poses.json", "poses.tum", "frame.json", "map.json", "report.json"} <= paths(world, 1)
     assert document(world, 1, "report.json")["failed_drives"] == []
