@@ -18,7 +18,7 @@ setup: .venv/.done ## a virtual environment in .venv with the mrasfm command
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-demo: setup ## render two drives of six cameras, send them through the service, compare the scenes with the truth
+demo: setup ## render two drives of a street, get their scenes and the map of both through the service, compare with the truth
 	rm -rf demo
 	$(BIN)/mrasfm demo --out demo
 

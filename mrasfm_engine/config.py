@@ -106,6 +106,25 @@ class GnssConfig(_Section):
     max_time_gap_s: Positive = 2.0  # no interpolation across larger gaps
 
 
+class AggregationConfig(_Section):
+    """Putting scenes together to a map."""
+
+    candidates: Count = 3  # scenes that each scene is compared with: those whose views overlap most
+    position_error_m: Positive = 12.0  # how far positions of two scenes may be off against one another
+    max_depth_m: Positive = 40.0  # footprints of views end here
+    max_view_angle_deg: Positive = 50.0  # between optical axes: farther apart, nothing looks alike
+    probe_spacing_m: Positive = 4.0  # between units that are compared to find how two scenes lie
+    pairs_per_image: Count = 3  # of images between two scenes, once it is known how they lie
+    max_pairs: Count = 1200  # of images between two scenes
+    consensus: bool = True  # several units must agree how two scenes lie; false: the best one decides, for comparison
+    min_units: Count = 3  # of a scene that must agree
+    min_unit_inliers: Count = 12  # of a unit's image points, for its pose in the other scene
+    min_inliers: Count = 60  # points that two scenes share at a seam
+    max_scale_error: Positive = 0.05  # by which lengths of two scenes may differ, beyond what is uncertain about them
+    joint: bool = True  # seams that make loops are adjusted together; false: one scene after the other, for comparison
+    final_adjustment: Literal["overlap", "all", "none"] = "overlap"  # which units vary on their own in the end
+
+
 class OutputConfig(_Section):
     """What is written besides the scene itself."""
 
@@ -134,6 +153,7 @@ class EngineConfig(_Section):
     mapping: MappingConfig = MappingConfig()
     adjustment: AdjustmentConfig = AdjustmentConfig()
     gnss: GnssConfig = GnssConfig()
+    aggregation: AggregationConfig = AggregationConfig()
     output: OutputConfig = OutputConfig()
     semantics: SemanticsConfig = SemanticsConfig()
     models: ModelsConfig = ModelsConfig()

@@ -247,6 +247,11 @@ class RoughTrajectory(_Model):
     poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES), FailFast()]
     sigma_translation_m: Positive = 0.5
     sigma_rotation_deg: Positive = 2.0
+    common_world: Name | None = Field(
+        None,
+        description="name of the world frame, where other drives have rough poses in the same one: scenes of drives "
+        "that declare one name can be aggregated without GNSS",
+    )
 
 
 class LabelMap(_Model):

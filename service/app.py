@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
@@ -23,28 +23,35 @@ from service.context import Context
 from service.errors import ServiceError, store_unavailable
 from service.metrics import Metrics
 from service.openapi import allowed_methods, openapi_page
+from service.persistence import uploads as upload_records
+from service.persistence.tables import now_us
 from service.readiness import Readiness
 from service.request_log import RequestLog
-from service.routes import drives, files, jobs, operations, reconstructions, scenes
+from service.routes import aggregations, drives, files, jobs, maps, operations, reconstructions, scenes, uploads
 from service.routes.documentation import add_documentation
 from service.settings import Settings
+from service.uploads.resumable import sweep as sweep_resumable
 from service.uploads.spool import sweep
 
 log = logging.getLogger("mrasfm.api")
 
 _SPOOL_KEPT_S = 24 * 3600
+_UPLOADS_SWEPT_AFTER_S = 60  # at its start an API has other things to do
 _SWEEP_EVERY_S = 3600
+_EXPIRED_KEPT_S = 7 * 24 * 3600
 _DATABASE_FULL = ("database or disk is full", "No space left on device")
 _ABOUT = """
 Send a drive (images of a vehicle's cameras, GNSS, calibration), get a metric scene.
 
 1. `POST /v1/drives` with the manifest, `drive.json`
-2. `PUT /v1/drives/{id}/files/{path}` for each file, or one `PUT /v1/drives/{id}/archive`
+2. `PUT /v1/drives/{id}/files/{path}` for each file, or one `PUT /v1/drives/{id}/archive`; large ones can be sent in
+   pieces, with any tus client, to `/v1/drives/{id}/uploads`
 3. `POST /v1/drives/{id}:commit`
 4. `POST /v1/reconstructions`, then poll `/v1/jobs/{id}` or read its events
 5. `GET /v1/scenes/{id}` and its files
+6. `POST /v1/aggregations` with several drives or scenes makes one map of them: `GET /v1/maps/{id}` and its versions
 
-`mrasfm upload` does all of it. Every error is an RFC 9457 problem whose `remedy` says what to do.
+`mrasfm upload` and `mrasfm map` do all of it. Every error is an RFC 9457 problem whose `remedy` says what to do.
 """
 
 
@@ -56,7 +63,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        sweeping = asyncio.create_task(_sweep_for_ever(settings))
+        sweeping = asyncio.create_task(_sweep_for_ever(context))
         yield
         sweeping.cancel()
         await asyncio.gather(sweeping, return_exceptions=True)
@@ -67,7 +74,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.state.readiness = Readiness(context)
-    for module in (drives, files, reconstructions, jobs, scenes, operations):
+    for module in (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, operations):
         app.include_router(module.router)
     app.include_router(operations.metrics_route(metrics))
     add_documentation(app)
@@ -77,14 +84,35 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-async def _sweep_for_ever(settings: Settings) -> None:
-    """Remove what killed processes left in the spool, once it is old enough to be nobody's."""
+async def _sweep_for_ever(context: Context) -> None:
+    """Remove what killed processes left in the spool, and uploads that nobody went on with."""
+    settings = context.settings
+    await asyncio.gather(
+        _repeat(0.0, lambda: sweep(settings.spool_dir, older_than_s=_SPOOL_KEPT_S)),
+        _repeat(_UPLOADS_SWEPT_AFTER_S, lambda: sweep_uploads(context)),
+    )
+
+
+async def _repeat(after_s: float, step: Callable[[], object]) -> None:
+    await asyncio.sleep(after_s)
     while True:
         try:
-            await asyncio.to_thread(sweep, settings.spool_dir, older_than_s=_SPOOL_KEPT_S)
-        except OSError:
+            await asyncio.to_thread(step)
+        except (OSError, SQLAlchemyError):
             log.exception("the spool could not be swept")
         await asyncio.sleep(_SWEEP_EVERY_S)
+
+
+def sweep_uploads(context: Context) -> None:
+    """Remove what is nobody's any more. An upload that expired is answered with 410 for a while, then with 404."""
+
+    def alive(upload_ids: Sequence[str]) -> set[str]:
+        with context.database.read() as session:
+            return upload_records.alive(session, upload_ids)
+
+    sweep_resumable(context.settings.uploads_dir, alive)
+    with context.database.write() as session:
+        upload_records.forget_expired(session, before_us=now_us() - int(_EXPIRED_KEPT_S * 1e6))
 
 
 def _answer_errors(app: FastAPI) -> None:

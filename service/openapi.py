@@ -15,7 +15,7 @@ from schemas.api.problems import Problem
 from service.routes.bodies import documented
 from service.routes.dependencies import problems
 
-_METHODS = ("get", "head", "post", "put", "delete")
+_METHODS = ("get", "head", "post", "put", "patch", "delete", "options")
 _CHECKED = ("query", "header")  # where parameters can be wrong; ids in a path are any text, and found or not
 
 

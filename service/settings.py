@@ -59,6 +59,8 @@ class Settings(BaseSettings):
     max_compression_ratio: Annotated[float, Field(gt=1)] = 200.0  # of one archive entry; images hardly compress
     min_free_disk_bytes: Annotated[int, Field(ge=0)] = 1_000_000_000  # below, uploads are refused (507)
     max_concurrent_writes: Count = 8  # uploads that write to disk at one time; the others wait their turn
+    upload_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 24.0  # a resumable upload that nobody goes on with ends
+    upload_idle_seconds: Seconds = 60.0  # a resumable upload's request that sends nothing ends; what came is kept
     poll_seconds: Seconds = 1.0  # how often an event stream looks for news
 
     # Quotas of a new project
@@ -83,6 +85,7 @@ class Settings(BaseSettings):
     # Retention; None keeps for ever
     drive_retention_days: Annotated[float, Field(gt=0)] | None = None
     scene_retention_days: Annotated[float, Field(gt=0)] | None = None
+    map_retention_days: Annotated[float, Field(gt=0)] | None = None  # since its newest version
     job_retention_days: Annotated[float, Field(gt=0)] | None = None
     idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
 
@@ -115,6 +118,11 @@ class Settings(BaseSettings):
     def spool_dir(self) -> Path:
         """Where bytes from outside wait until they are checked."""
         return self.data_dir.resolve() / "spool"
+
+    @property
+    def uploads_dir(self) -> Path:
+        """Where the bytes of resumable uploads gather until all are there; of the spool's file system."""
+        return self.data_dir.resolve() / "uploads"
 
     @property
     def scratch_dir(self) -> Path:

@@ -25,6 +25,7 @@ FILES = {
     "calibration.json",
     "frame.json",
     "features.db",
+    "manifest.json",
     "report.json",
 }
 # x right, y down, z forward of a camera that looks along the rig's x axis

@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 import contextvars
-import hashlib
-import json
 import logging
 import os
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
-from service.persistence import jobs
+from service.persistence import checkpoints
 from service.persistence.artifacts import ArtifactStore
+from service.persistence.checkpoints import Shelf
 from service.persistence.database import Database
-from service.persistence.drive_files import keep_checkpoints, restore_checkpoints
 from service.persistence.storing import file_sha256, store_file
 
 log = logging.getLogger("mrasfm.worker")
 
 _LOOK_EVERY_S = 1.0
-
-
-def settings_sha256(settings: Mapping[str, Any]) -> str:
-    """Tells apart the settings under which stages were finished."""
-    return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
 
 
 class CheckpointKeeper:
@@ -36,14 +27,14 @@ class CheckpointKeeper:
     """
 
     def __init__(
-        self, database: Database, artifacts: ArtifactStore, held: jobs.Claim, *, folder: Path, spare: Path
+        self, database: Database, artifacts: ArtifactStore, shelf: Shelf, *, project_id: str, folder: Path, spare: Path
     ) -> None:
         self._database = database
         self._artifacts = artifacts
-        self._held = held
+        self._shelf = shelf
+        self._project_id = project_id
         self._folder = folder
         self._spare = spare
-        self._settings_sha256 = settings_sha256(held.settings)
         self._kept: dict[str, tuple[int, int]] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(
@@ -52,9 +43,7 @@ class CheckpointKeeper:
 
     def restore(self) -> None:
         """Bring what earlier attempts and jobs have finished into the folder."""
-        for name in restore_checkpoints(
-            self._database, self._artifacts, self._held.drive_id, self._settings_sha256, self._folder
-        ):
+        for name in checkpoints.restore(self._database, self._artifacts, self._shelf, self._folder):
             self._kept[name] = _identity(self._folder / name)
 
     def __enter__(self) -> CheckpointKeeper:
@@ -90,18 +79,13 @@ class CheckpointKeeper:
         stored = store_file(
             self._database,
             self._artifacts,
-            project_id=self._held.project_id,
+            project_id=self._project_id,
             path=link,
             sha256=file_sha256(link),
             size_bytes=link.stat().st_size,
         )
         with self._database.write() as session:
-            keep_checkpoints(
-                session,
-                drive_id=self._held.drive_id,
-                settings_sha256=self._settings_sha256,
-                stored={path.name: stored},
-            )
+            checkpoints.keep(session, self._shelf, {path.name: stored})
 
 
 def _identity(path: Path) -> tuple[int, int]:

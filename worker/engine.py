@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine import stages
+from mrasfm_engine.aggregation import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
 from mrasfm_engine.io.drive_bundle import read_drive
@@ -37,8 +38,7 @@ def work(request: ChildRequest) -> ChildResult:
     cancelled = CancelFile(request.cancel_file)
     try:
         config = engine_config(request.settings, threads=request.threads)
-        do = _reconstruct if request.work is Work.RECONSTRUCTION else _preflight
-        return ChildResult(report=do(request, config, progress, cancelled))
+        return ChildResult(report=_WORK[request.work](request, config, progress, cancelled))
     except MrasfmError as problem:
         return ChildResult(error=_described(problem, request))
 
@@ -73,18 +73,65 @@ def _reconstruct(
         if stage == last and done == total:
             progress("export", 0, 1)
 
-    reconstruct(request.drive, request.out, config, progress=report, cancel=cancelled)
+    reconstruct(_drive_of(request), request.out, config, progress=report, cancel=cancelled)
     progress("export", 1, 1)
-    # What was written, and not what was returned: the file has been through the writer's conversions.
-    written: dict[str, Any] = json.loads((request.out / "report.json").read_text(encoding="utf-8"))
+    return _written_report(request.out)
+
+
+def _aggregate(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    last = "pictures" if config.output.pictures else "adjustment"
+
+    def report(stage: str, done: int, total: int) -> None:
+        progress(stage, done, total)
+        if stage == last and done == total:
+            progress("export", 0, 1)
+
+    aggregate(
+        request.scenes,
+        request.out,
+        config,
+        into=request.into,
+        remove=request.remove,
+        progress=report,
+        cancel=cancelled,
+    )
+    written = {**_written_report(request.out), "failed_drives": request.failed}
+    # The engine does not know of drives that it was not given; who reads the map's report shall.
+    path = request.out / "report.json"
+    partial = path.with_name(".report.json.partial")
+    partial.write_text(json.dumps(written, indent=1, allow_nan=False), encoding="utf-8")
+    partial.replace(path)
+    progress("export", 1, 1)
+    return {**written, "map": _figures(json.loads((request.out / "map.json").read_text(encoding="utf-8")))}
+
+
+def _figures(document: dict[str, Any]) -> dict[str, Any]:
+    """What of `map.json` is recorded with the map's version."""
+    return {
+        "scenes": len(document["scenes"]),
+        "seams": sum(bool(seam["accepted"]) for seam in document["seams"]),
+        "unconnected": document["unconnected"],
+    }
+
+
+def _written_report(out: Path) -> dict[str, Any]:
+    """What was written, and not what was returned: the file has been through the writer's conversions."""
+    written: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
     return written
+
+
+def _drive_of(request: ChildRequest) -> Path:
+    assert request.drive is not None, "only an aggregation has none"
+    return request.drive
 
 
 def _preflight(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
     """The findings of a reconstruction's first seconds: manifest, files, images, and the calibration's direction."""
-    run = stages.Run(read_drive(request.drive), config, stages.store_of(request.out), progress, cancelled)
+    run = stages.Run(read_drive(_drive_of(request)), config, stages.store_of(request.out), progress, cancelled)
     findings = inspect_drive(run.drive, use_gnss=config.use_gnss, progress=run.step("preflight"), cancel=cancelled)
     if is_sound(findings):
         progress("calibration", 0, 1)
@@ -96,6 +143,9 @@ def _preflight(
     if cancelled():
         raise CancelledError
     return {"findings": [as_json(finding) for finding in findings], "sound": is_sound(findings)}
+
+
+_WORK = {Work.RECONSTRUCTION: _reconstruct, Work.PREFLIGHT: _preflight, Work.AGGREGATION: _aggregate}
 
 
 def _described(problem: MrasfmError, request: ChildRequest) -> ChildError:
@@ -111,6 +161,8 @@ def _described(problem: MrasfmError, request: ChildRequest) -> ChildError:
 
 def _without_paths(what: str, request: ChildRequest) -> str:
     """Files by their names in the drive or scene: where these lie on this machine is of no interest to who asked."""
-    for folder in (request.drive, request.drive.resolve(), request.out, request.out.resolve()):
-        what = what.replace(f"{folder}/", "")
+    given = (request.drive, request.into, request.out, *request.scenes.values())
+    for folder in (folder for folder in given if folder is not None):
+        for path in (folder, folder.resolve()):
+            what = what.replace(f"{path}/", "").replace(str(path), path.name)
     return what.replace(str(default_folder()), "the models' folder of the worker")

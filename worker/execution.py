@@ -8,37 +8,34 @@ import os
 import socket
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
 
 from obstore.exceptions import BaseError as StoreError
 from sqlalchemy.exc import SQLAlchemyError
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from schemas.api.scenes import SceneSummary
 from service.logs import log_fields
-from service.persistence import jobs, scenes
+from service.persistence import jobs
 from service.persistence.artifacts import ArtifactStore
+from service.persistence.checkpoints import Shelf
 from service.persistence.database import Database
-from service.persistence.drive_files import DriveGoneError, materialise
+from service.persistence.drive_files import DriveGoneError
 from service.persistence.storing import StoredFile, file_sha256, store_file
-from service.persistence.tables import now_us
 from service.settings import Settings
+from worker.assignments import WORK, Counting, assignment_of
 from worker.checkpoints import CheckpointKeeper
 from worker.escalation import StopReason
 from worker.heart import Heart
-from worker.messages import Work
 from worker.outcomes import Abandoned, Cancelled, Failed, Outcome, Succeeded
 from worker.progress import Progress, ProgressMeter
 from worker.scratch import attempt_folder, sweep
 from worker.settling import PATIENCE_S, patiently, settle
-from worker.stages import Attempt, AttemptFolder, Verdict, run_attempt
+from worker.stages import AttemptFolder, Verdict, run_attempt
 
 log = logging.getLogger("mrasfm.worker")
 
-_WORK = {JobKind.PREFLIGHT: Work.PREFLIGHT, JobKind.RECONSTRUCTION: Work.RECONSTRUCTION}
 _TITLES = {
     "out-of-memory": "Memory ran out",
     "engine-abort": "The engine ended unexpectedly",
@@ -47,9 +44,13 @@ _TITLES = {
     "worker-error": "The worker failed",
 }
 
-_PARTING_PATIENCE_S = 5.0  # a process that was told to end does not wait long for the database
+_FAILED = {
+    JobKind.PREFLIGHT: "The drive could not be checked",
+    JobKind.RECONSTRUCTION: "The drive could not be reconstructed",
+    JobKind.AGGREGATION: "No map could be made",
+}
 
-Counting = Callable[[int, int], None]  # done, total
+_PARTING_PATIENCE_S = 5.0  # a process that was told to end does not wait long for the database
 
 
 class _StoppedError(Exception):
@@ -93,7 +94,7 @@ class Runner:
                 log.warning("the job is not ours any more; nothing was published")
 
     def _run_held(self, held: jobs.Claim) -> None:
-        meter = ProgressMeter(_WORK[held.kind], started_s=time.monotonic())
+        meter = ProgressMeter(WORK[held.kind], started_s=time.monotonic())
         try:
             with (
                 attempt_folder(self._settings.scratch_dir, f"{held.job_id}.{held.fence}") as folder,
@@ -125,11 +126,9 @@ class Runner:
             self._record(held, _of_verdict(stopped.verdict, meter.stage), publishing)
 
     def _attempt(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> Outcome:
-        drive = folder.root / "drive"
+        assignment = assignment_of(self._database, self._artifacts, held)
         try:
-            materialise(
-                self._database, self._artifacts, held.drive_id, drive, progress=self._counting(heart, meter, "fetch")
-            )
+            attempt = assignment.lay_out(folder, self._counting(heart, meter, "fetch"))
         except DriveGoneError:
             return Failed(
                 code="drive-deleted",
@@ -138,23 +137,29 @@ class Runner:
                 retryable=False,
                 stage="fetch",
             )
-        keeper = CheckpointKeeper(
-            self._database,
-            self._artifacts,
-            held,
-            folder=folder.finished_stages,
-            spare=folder.root / "checkpoints",
-        )
-        if held.kind is JobKind.RECONSTRUCTION:
-            keeper.restore()
-        with keeper:
+        with self._keeping(held, assignment.shelf, folder):
             return run_attempt(
-                Attempt(work=_WORK[held.kind], drive=drive, settings=held.settings),
+                attempt,
                 scratch=folder.root,
                 tick=lambda progress: self._tick(heart, progress),
                 meter=meter,
                 settings=self._settings,
             )
+
+    def _keeping(self, held: jobs.Claim, shelf: Shelf | None, folder: AttemptFolder) -> AbstractContextManager[object]:
+        """Finished stages brought, and those that are finished now kept."""
+        if shelf is None:
+            return nullcontext()
+        keeper = CheckpointKeeper(
+            self._database,
+            self._artifacts,
+            shelf,
+            project_id=held.project_id,
+            folder=folder.finished_stages,
+            spare=folder.root / "checkpoints",
+        )
+        keeper.restore()
+        return keeper
 
     def _counting(self, heart: Heart, meter: ProgressMeter, stage: str) -> Counting:
         """A callback for one of the worker's own stages, which stops where a child would be stopped."""
@@ -196,7 +201,7 @@ class Runner:
     def _fail(self, held: jobs.Claim, failed: Failed) -> None:
         problem = Problem(
             type=PROBLEM_TYPE + failed.code,
-            title=_TITLES.get(failed.code, "The drive could not be reconstructed"),
+            title=_TITLES.get(failed.code) or _FAILED[held.kind],
             detail=failed.what,
             remedy=failed.remedy,
             findings=[dict(finding) for finding in failed.findings],
@@ -224,21 +229,9 @@ class Runner:
         for i, (name, path) in enumerate(found):
             files[name] = patiently(lambda path=path: self._store(held, path))  # type: ignore[misc]
             progress(i + 1, len(found))
-        kept_days = self._settings.scene_retention_days
-        expires_us = None if kept_days is None else now_us() + int(kept_days * 86400e6)
-        scene_id = settle(
-            self._database,
-            held,
-            lambda session: scenes.publish(
-                session,
-                held,
-                files=files,
-                summary=_summary(done.report),
-                expires_us=expires_us,
-                reused=[stage["stage"] for stage in done.report["stages"] if stage["reused"]],
-            ),
-        )
-        log.info("published", extra={"fields": {"scene_id": scene_id}})
+        assignment = assignment_of(self._database, self._artifacts, held)
+        made = settle(self._database, held, lambda session: assignment.publish(session, done, files, self._settings))
+        log.info("published", extra={"fields": made or {}})
 
     def _store(self, held: jobs.Claim, path: Path) -> StoredFile:
         return store_file(
@@ -268,20 +261,6 @@ def _artifacts(out: Path) -> dict[str, Path]:
     """Files of a scene by the names they are served under; what begins with a dot is the engine's own."""
     found = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
     return {name.as_posix(): path for name, path in found.items() if not any(p.startswith(".") for p in name.parts)}
-
-
-def _summary(report: dict[str, Any]) -> SceneSummary:
-    summary = report["summary"]
-    return SceneSummary(
-        registered_units=summary["registered_units"],
-        units=summary["total_units"],
-        registered_images=summary["registered_images"],
-        images=summary["total_images"],
-        points=summary["points"],
-        georeferenced=summary["georeferenced"],
-        warnings=len(report["findings"]),
-        engine_version=report["engine_version"],
-    )
 
 
 def _of_verdict(verdict: Verdict, stage: str) -> Outcome:

@@ -18,6 +18,7 @@ class Work(StrEnum):
 
     RECONSTRUCTION = "reconstruction"
     PREFLIGHT = "preflight"
+    AGGREGATION = "aggregation"
 
 
 class ErrorKind(StrEnum):
@@ -37,9 +38,9 @@ class ChildRequest:
     Attributes
     ----------
     drive
-        Folder with `drive.json`.
+        Folder with `drive.json`; None for an aggregation.
     out
-        Folder of the scene; finished stages lie in its `.stages`.
+        Folder of the scene or map; finished stages lie in its `.stages`.
     settings
         As in the API's `ReconstructionSettings`.
     cancel_file
@@ -50,10 +51,15 @@ class ChildRequest:
         Inherited descriptor of a pipe that takes lines of progress.
     parent_pid
         The supervisor: without it the child ends.
+    scenes, into, remove
+        Of an aggregation: folders of scenes by name, folder of the map that they are added to, names of scenes that it
+        shall lose.
+    failed
+        Of an aggregation: drives that have no scene, for its report.
     """
 
     work: Work
-    drive: Path
+    drive: Path | None
     out: Path
     settings: dict[str, Any]
     threads: int
@@ -61,6 +67,10 @@ class ChildRequest:
     result_file: Path
     progress_fd: int
     parent_pid: int
+    scenes: dict[str, Path] = field(default_factory=dict)
+    into: Path | None = None
+    remove: list[str] = field(default_factory=list)
+    failed: list[dict[str, Any]] = field(default_factory=list)
 
     def write(self, path: Path) -> None:
         """Put the request where the child reads it."""
@@ -71,8 +81,9 @@ class ChildRequest:
         """The request in a file."""
         values = json.loads(path.read_text(encoding="utf-8"))
         values["work"] = Work(values["work"])
-        for name in ("drive", "out", "cancel_file", "result_file"):
-            values[name] = Path(values[name])
+        for name in ("drive", "into", "out", "cancel_file", "result_file"):
+            values[name] = None if values[name] is None else Path(values[name])
+        values["scenes"] = {name: Path(folder) for name, folder in values["scenes"].items()}
         return cls(**values)
 
 

@@ -23,7 +23,8 @@ class Succeeded:
     Attributes
     ----------
     report
-        Of a reconstruction, the scene's `report.json`; of a preflight, `findings` and `sound`.
+        Of a reconstruction or aggregation, what `report.json` says, and of the latter what the version's record has of
+        `map.json` as `map`; of a preflight, `findings` and `sound`.
     out
         Folder of the scene.
     """

@@ -23,12 +23,24 @@ WEIGHTS: Mapping[Work, Mapping[str, float]] = MappingProxyType(
             "export": 4.0,
             "publish": 3.0,
         },
+        Work.AGGREGATION: {
+            "fetch": 4.0,
+            "scenes": 8.0,
+            "association": 1.0,
+            "seams": 52.0,
+            "joint": 5.0,
+            "adjustment": 16.0,
+            "pictures": 4.0,
+            "export": 6.0,
+            "publish": 4.0,
+        },
         Work.PREFLIGHT: {"fetch": 20.0, "preflight": 30.0, "calibration": 50.0},
     }
 )
 UNITS: Mapping[str, str] = MappingProxyType(
     {
         "fetch": "files",
+        "scenes": "scenes",
         "preflight": "files",
         "features": "images",
         "matches": "pairs",

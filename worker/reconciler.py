@@ -9,11 +9,11 @@ from collections.abc import Callable
 from sqlalchemy import delete, select
 
 from service.logs import log_fields
-from service.persistence import jobs, workers
+from service.persistence import jobs, maps, trees, workers
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.collecting import collect_orphans, collect_unused
 from service.persistence.database import Database
-from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, Scene, now_us
+from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, MapScene, now_us
 from service.persistence.wakeups import BrokerError, Wakeups, task_id
 from service.settings import Settings
 
@@ -73,6 +73,7 @@ class Reconciler:
         """Free jobs whose worker is silent, and wake workers up for those that wait and have no message."""
         with self._database.write() as session:
             lost = jobs.expire_leases(session, max_attempts=self._settings.max_attempts)
+        trees.tend(self._database)
         for job_id in lost:
             with log_fields(job_id=job_id):
                 log.warning("the worker was not heard of any more")
@@ -113,9 +114,11 @@ class Reconciler:
         with self._database.write() as session:
             # Locked first: a job that is asked for at this moment has been recorded then, or finds no drive.
             expired = session.scalars(select(Drive.id).where(Drive.expires_us < now).with_for_update()).all()
-            active = select(Job.drive_id).where(Job.state.not_in(TERMINAL))
-            session.execute(delete(Drive).where(Drive.id.in_(expired), Drive.id.not_in(active)))
-            session.execute(delete(Scene).where(Scene.expires_us < now))
+            active = select(Job.drive_id).where(Job.drive_id.is_not(None), Job.state.not_in(TERMINAL))
+            in_map = select(MapScene.drive_id)
+            idle = Drive.id.not_in(active) & Drive.id.not_in(in_map)
+            session.execute(delete(Drive).where(Drive.id.in_(expired), idle))
+            maps.forget_expired(session, now)
             session.execute(delete(Job).where(Job.expires_us < now, Job.state.in_(TERMINAL)))
             kept_us = int(self._settings.idempotency_hours * _HOUR_US)
             session.execute(delete(IdempotencyKey).where(IdempotencyKey.created_us < now - kept_us))

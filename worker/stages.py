@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -61,15 +61,21 @@ class Attempt:
     Attributes
     ----------
     drive
-        Folder with `drive.json` and the files it names. Finished stages are found again only where the files' times of
-        modification are those of the last time.
+        Folder with `drive.json` and the files it names; None for an aggregation. Finished stages are found again
+        only where the files' times of modification are those of the last time.
     settings
         As in the API's `ReconstructionSettings`.
+    scenes, into, remove, failed
+        Of an aggregation, see ChildRequest.
     """
 
     work: Work
-    drive: Path
     settings: Mapping[str, Any]
+    drive: Path | None = None
+    scenes: Mapping[str, Path] = field(default_factory=dict)
+    into: Path | None = None
+    remove: Sequence[str] = ()
+    failed: Sequence[Mapping[str, Any]] = ()
 
 
 @dataclass(frozen=True)
@@ -135,7 +141,7 @@ def run_attempt(attempt: Attempt, *, scratch: Path, tick: Tick, meter: ProgressM
     def command(progress_fd: int) -> Sequence[str]:
         ChildRequest(
             work=attempt.work,
-            drive=attempt.drive.resolve(),
+            drive=None if attempt.drive is None else attempt.drive.resolve(),
             out=folder.out,
             settings=dict(attempt.settings),
             threads=threads,
@@ -143,6 +149,10 @@ def run_attempt(attempt: Attempt, *, scratch: Path, tick: Tick, meter: ProgressM
             result_file=folder.result,
             progress_fd=progress_fd,
             parent_pid=os.getpid(),
+            scenes={name: scene.resolve() for name, scene in attempt.scenes.items()},
+            into=None if attempt.into is None else attempt.into.resolve(),
+            remove=list(attempt.remove),
+            failed=[dict(drive) for drive in attempt.failed],
         ).write(folder.request)
         # -P: the working directory holds files from outside and is no place to import from.
         return [sys.executable, "-P", "-m", "worker.child", str(folder.request)]

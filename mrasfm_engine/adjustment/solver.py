@@ -19,6 +19,7 @@ from mrasfm_engine.adjustment.point_settling import point_costs, settle
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
 from mrasfm_engine.adjustment.reduced import Extra, Reduced
+from mrasfm_engine.adjustment.unit_sets import UnitSets
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
@@ -77,6 +78,7 @@ class Problem:
     terms: Sequence[Term] = ()
     options: SolverOptions = field(default_factory=SolverOptions)
     motion: ShotMotion | None = None  # needed where the state has shots
+    sets: UnitSets | None = None  # free units that move as one; then calibration is fixed
 
     def errors_px2(self, state: State) -> Floats:
         """Squared reprojection errors (n,) of all observations."""
@@ -96,7 +98,8 @@ class Problem:
 
     def retract(self, state: State, step: Floats, points_m: Floats) -> State:
         """The state after a step of the reduced vector, with new points."""
-        after = retract(state, self.layout, step, points_m)
+        move = retract if self.sets is None else self.sets.retract
+        after = move(state, self.layout, step, points_m)
         return after if self.motion is None else self.motion.follow(after)
 
     def cost(self, state: State) -> float:
@@ -198,6 +201,15 @@ class Problem:
             term.add_to(state, layout, extra)
         return Reduced.of(layout, coupling, sums, (v_inverse, v_gradient), extra)
 
+    def step(self, state: State, reduced: Reduced, damping: float) -> Floats | None:
+        """The damped step (n,) of the reduced vector; None where there is none."""
+        return reduced.step(damping) if self.sets is None else self.sets.step(reduced, state, damping)
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns the reduced vector really has."""
+        return self.layout.size - len(self.layout.held()) if self.sets is None else self.sets.size
+
     def points_after(self, state: State, reduced: Reduced, step: Floats) -> Floats:
         """Points (p, 3) that go with a step of the reduced vector."""
         o, layout, options = self.observations, self.layout, self.options
@@ -284,20 +296,20 @@ def solve(problem: Problem, *, cancel: Callable[[], bool] | None = None) -> tupl
 
 
 def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[State, Report]:
-    options, layout, state = problem.options, problem.layout, problem.state
+    options, state = problem.options, problem.state
     costs = problem.point_costs(state)
     cost = initial = problem._sum(state, costs)
     damping, raise_by, iterations = options.initial_damping, 2.0, 0
     termination = Termination.ITERATIONS
-    free = np.setdiff1d(np.arange(layout.size), layout.held())
-    if not len(free) and not problem.observations.num_free_points:
+    free = problem.unknowns
+    if not free and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
             break
         iterations += 1
         reduced = problem.normal_equations(state, damping)
-        step = reduced.step(damping)
+        step = problem.step(state, reduced, damping)
         if step is not None:
             trial = problem.retract(state, step, problem.points_after(state, reduced, step))
             trial_costs, trial_cost = problem.settle(trial, state, costs)
@@ -310,7 +322,7 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
             continue
         decrement = -float(step @ reduced.gradient)
         if cost - trial_cost <= options.function_tolerance * cost or (
-            len(free) and decrement <= options.decrement_tolerance
+            free and decrement <= options.decrement_tolerance
         ):
             termination = Termination.CONVERGED
         state, cost, costs = trial, trial_cost, trial_costs
@@ -321,6 +333,6 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
         iterations=iterations,
         termination=termination,
         observations=len(problem.observations.unit),
-        parameters=len(free) + 3 * problem.observations.num_free_points,
-        pose_parameters=len(free),
+        parameters=free + 3 * problem.observations.num_free_points,
+        pose_parameters=free,
     )

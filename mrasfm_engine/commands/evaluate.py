@@ -1,4 +1,4 @@
-"""`mrasfm evaluate`: how far a scene's trajectory is from the truth."""
+"""`mrasfm evaluate`: how far a scene's or a map's trajectory is from the truth."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mrasfm_engine.commands.evaluate_map import evaluate_map, show
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_trajectories, match_timestamps
+from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.io.read_scene import ScenePoses, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
 
@@ -20,10 +22,16 @@ TOLERANCE_US = 1000
 
 def register(subparsers: Any) -> None:
     """Add the `evaluate` parser."""
-    parser = subparsers.add_parser("evaluate", help="compare a scene's trajectory with the truth")
-    parser.add_argument("scene", type=Path, metavar="OUT", help="the folder that `mrasfm reconstruct` wrote")
+    parser = subparsers.add_parser("evaluate", help="compare a scene's or map's trajectory with the truth")
     parser.add_argument(
-        "--truth", type=Path, required=True, metavar="FILE", help="true poses of the rig in TUM's format"
+        "scene", type=Path, metavar="OUT", help="the folder that `mrasfm reconstruct` or `mrasfm aggregate` wrote"
+    )
+    parser.add_argument(
+        "--truth",
+        nargs="+",
+        required=True,
+        metavar="FILE",
+        help="true poses of the rig in TUM's format; of a map one file for all drives, or SCENE=FILE for each",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.set_defaults(run=run)
@@ -31,11 +39,21 @@ def register(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare and print."""
-    scene, truth = read_poses(arguments.scene), read_tum(arguments.truth)
+    if is_map(arguments.scene):
+        document, table = evaluate_map(arguments.scene, arguments.truth)
+        if arguments.json:
+            print(json.dumps(document, allow_nan=False))
+        else:
+            show(table)
+        return 0
+    if len(arguments.truth) != 1:
+        raise InputError(f"--truth has {len(arguments.truth)} files", remedy="A scene has one: give one FILE.")
+    file = Path(arguments.truth[0])
+    scene, truth = read_poses(arguments.scene), read_tum(file)
     kept, matched = match_timestamps(scene.trajectory.timestamps_us, truth.timestamps_us, tolerance_us=TOLERANCE_US)
     if len(kept) < MIN_POSES:
         raise InputError(
-            f"{arguments.scene} and {arguments.truth} have {len(kept)} timestamps in common within "
+            f"{arguments.scene} and {file} have {len(kept)} timestamps in common within "
             f"{TOLERANCE_US / 1000:g} ms, {MIN_POSES} are needed",
             remedy="Give the truth of this drive, with timestamps in seconds of the same clock.",
         )

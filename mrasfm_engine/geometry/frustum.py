@@ -89,10 +89,43 @@ def view_overlap(
             for k, p, (w, h) in zip(kind, params, size_px, strict=True)
         ]
     )
-    fractions = np.empty((2, len(pairs)))
-    for out, directed in zip(fractions, (pairs, pairs[:, ::-1]), strict=True):
-        _seen_fractions(
-            np.ascontiguousarray(directed), world_from_cam, camera, kind, params, size_px, samples, max_depth_m, out
+    fractions = [
+        seen_fractions(
+            directed,
+            world_from_cam=world_from_cam,
+            camera=camera,
+            kind=kind,
+            params=params,
+            size_px=size_px,
+            samples=samples,
+            max_depth_m=max_depth_m,
         )
+        for directed in (pairs, pairs[:, ::-1])
+    ]
     result: Floats = np.sqrt(fractions[0] * fractions[1])
     return result
+
+
+def seen_fractions(
+    pairs: Ints,
+    *,
+    world_from_cam: Floats,
+    camera: Ints,
+    kind: Ints,
+    params: Floats,
+    size_px: Ints,
+    samples: Floats,
+    max_depth_m: float,
+) -> Floats:
+    """Shares (n,) of the first image's samples that the second image of each pair sees.
+
+    Parameters
+    ----------
+    samples
+        Points (cameras, s, 3) in every camera's axes; the rest as in `view_overlap`.
+    """
+    out = np.empty(len(pairs))
+    _seen_fractions(
+        np.ascontiguousarray(pairs), world_from_cam, camera, kind, params, size_px, samples, max_depth_m, out
+    )
+    return out

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.io.export_colmap import frame_of_image
 from mrasfm_engine.scene.scene import Scene
+from schemas import DriveManifest
 
 Floats = NDArray[np.float64]
 
@@ -81,16 +82,16 @@ def check_documents(scene: Scene, folder: Path) -> None:
     """Check all JSON files, `poses.tum` and what they say about each other."""
     frame_path, calibration_path, poses_path = (folder / f"{n}.json" for n in ("frame", "calibration", "poses"))
     with checking(frame_path):
-        frame = _read_json(frame_path)
-        _check_frame(scene, frame, frame_path)
+        frame = read_json(frame_path)
+        check_frame(scene, frame, frame_path)
     with checking(calibration_path):
-        rig_from_cam = _check_calibration(scene, _read_json(calibration_path), calibration_path)
+        rig_from_cam = _check_calibration(scene, read_json(calibration_path), calibration_path)
     with checking(poses_path):
-        _check_poses(scene, _read_json(poses_path), frame, rig_from_cam, path=poses_path)
+        check_poses(scene, read_json(poses_path), frame, rig_from_cam, path=poses_path)
     with checking(folder / "poses.tum"):
         _check_tum(scene, folder / "poses.tum")
     with checking(folder / "report.json"):
-        _read_json(folder / "report.json")
+        read_json(folder / "report.json")
 
 
 def check_ply(scene: Scene, path: Path) -> None:
@@ -115,7 +116,7 @@ def check_road(scene: Scene, path: Path) -> None:
     """Check the patches of the road, and that points said to be on one are near its plane."""
     assert scene.road is not None
     with checking(path):
-        document = _read_json(path)
+        document = read_json(path)
         centre, normal = (
             np.array([patch[key] for patch in document["patches"]], dtype=np.float64).reshape(-1, 3)
             for key in ("centre_m", "normal")
@@ -129,6 +130,21 @@ def check_road(scene: Scene, path: Path) -> None:
         on_road = np.flatnonzero(scene.point_patches >= 0)
         away = np.linalg.norm(scene.points_m[on_road] - centre[scene.point_patches[on_road]], axis=1)
         require(bool((away < 2 * document["patch_radius_m"]).all()), path, "a point is far from its patch")
+
+
+def check_manifest(scene: Scene, path: Path) -> None:
+    """Check that the drive's manifest reads back as what it is."""
+    with checking(path):
+        read, given = DriveManifest.model_validate(read_json(path)), scene.drive.manifest
+        require(read.frames == given.frames and read.gnss == given.gnss, path, "frames or gnss are not the drive's")
+        names = [camera.name for camera in read.rig.cameras]
+        require(names == [camera.name for camera in given.rig.cameras], path, "its cameras are not the drive's")
+        # Reading a quaternion normalises it once more.
+        for camera, expected in zip(read.rig.cameras, given.rig.cameras, strict=True):
+            poses = [
+                matrices([p.rotation_xyzw], [p.translation_m]) for p in (camera.rig_from_cam, expected.rig_from_cam)
+            ]
+            require_close(*poses, path=path, what=f"{camera.name}'s pose", tolerance=POSE_TOLERANCE)
 
 
 def check_features(scene: Scene, path: Path) -> None:
@@ -169,7 +185,9 @@ def _check_pairs(scene: Scene, db: sqlite3.Connection, path: Path) -> None:
             require(count == len(matches) and (data or b"") == matches.tobytes(), path, f"{table} of a pair differ")
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; NaN and infinities are refused."""
+
     def refuse_constant(name: str) -> NoReturn:
         refuse(path, f"it holds {name}")
 
@@ -178,7 +196,8 @@ def _read_json(path: Path) -> dict[str, Any]:
     return dict(document)
 
 
-def _check_frame(scene: Scene, frame: dict[str, Any], path: Path) -> None:
+def check_frame(scene: Scene, frame: dict[str, Any], path: Path) -> None:
+    """Check the coordinate contract."""
     place = scene.georeference
     require(frame["georeferenced"] == (place is not None), path, "georeferenced is wrong")
     if place is None:
@@ -220,9 +239,10 @@ def _check_calibration(scene: Scene, document: dict[str, Any], path: Path) -> di
     return refined
 
 
-def _check_poses(
+def check_poses(
     scene: Scene, document: dict[str, Any], frame: dict[str, Any], rig_from_cam: dict[str, Floats], *, path: Path
 ) -> None:
+    """Check every unit's and image's pose, also as composed of rig and cameras, and its place on the earth."""
     units, images = document["units"], document["images"]
     require([u["registered"] for u in units] == scene.unit_registered.tolist(), path, "its units are not the scene's")
     require(

@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mrasfm_engine.io.export_check import POSE_TOLERANCE, checking, matrices, refuse, require, require_close
-from mrasfm_engine.io.export_colmap import BINARY_FILES, TEXT_FILES, frame_of_image
+from mrasfm_engine.io.export_colmap import BINARY_FILES, RIG_ID, TEXT_FILES, frame_of_image
 from mrasfm_engine.scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -103,11 +103,14 @@ def _check_reconstruction(
 
 
 def _check_cameras(scene: Scene, reconstruction: Any, cameras: Path, rigs: Path) -> None:
-    require(reconstruction.num_rigs() == 1, rigs, "there is not one rig")
-    rig = next(iter(reconstruction.rigs.values()))
-    require(rig.num_sensors() == len(scene.calibration) + 1, rigs, "its sensors are not the cameras")
-    require(rig.ref_sensor_id.type == pycolmap.SensorType.IMU, rigs, "its reference is not the vehicle")
+    vehicles, sizes = np.unique(scene.rig_of_camera, return_counts=True)
+    require(sorted(reconstruction.rigs) == (vehicles + RIG_ID).tolist(), rigs, "its rigs are not the vehicles")
+    for vehicle, size in zip(vehicles.tolist(), sizes.tolist(), strict=True):
+        rig = reconstruction.rigs[vehicle + RIG_ID]
+        require(rig.num_sensors() == size + 1, rigs, "its sensors are not the cameras")
+        require(rig.ref_sensor_id.type == pycolmap.SensorType.IMU, rigs, "its reference is not the vehicle")
     for k, (given, refined) in enumerate(zip(scene.drive.cameras, scene.calibration, strict=True)):
+        rig = reconstruction.rigs[int(scene.rig_of_camera[k]) + RIG_ID]
         camera = reconstruction.cameras[k + 1]
         known = (camera.model.name, camera.width, camera.height)
         require(known == (given.model, given.width, given.height), cameras, f"{given.name} is {known}")

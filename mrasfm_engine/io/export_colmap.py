@@ -2,7 +2,8 @@
 
 The binary files are packed here: point by point through pycolmap's Python objects takes many times as long. Ids:
 image = index + 1, frame = unit + 1, camera = index + 1, point = index + 1; keypoints keep their indices. The rig frame
-is the vehicle's, so the rig's reference sensor is a virtual inertial unit and every camera has a `sensor_from_rig`.
+is the vehicle's, so the rig's reference sensor is a virtual inertial unit and every camera has a `sensor_from_rig`. A
+map has a rig for every vehicle.
 
 A frame is one instant. Where images have poses at their own times, every image is a frame of its own (frame = image),
 at the rig's pose at that time: whoever loads the model then finds the poses under which the points were seen.
@@ -80,8 +81,12 @@ def _cameras(scene: Scene) -> bytes:
 
 def _rigs(scene: Scene) -> bytes:
     poses = _wxyz_and_translation(se3.inverse(np.stack([c.rig_from_cam for c in scene.calibration])))
-    parts = [struct.pack("<QII", 1, RIG_ID, len(poses) + 1), struct.pack("<iI", SENSOR_IMU, REFERENCE_SENSOR_ID)]
-    parts += [struct.pack("<iIB7d", SENSOR_CAMERA, k + 1, 1, *pose) for k, pose in enumerate(poses)]
+    rigs = np.unique(scene.rig_of_camera)
+    parts = [struct.pack("<Q", len(rigs))]
+    for rig in rigs:
+        cameras = np.flatnonzero(scene.rig_of_camera == rig)
+        parts.append(struct.pack("<IIiI", RIG_ID + rig, len(cameras) + 1, SENSOR_IMU, REFERENCE_SENSOR_ID + rig))
+        parts += [struct.pack("<iIB7d", SENSOR_CAMERA, k + 1, 1, *poses[k]) for k in cameras.tolist()]
     return b"".join(parts)
 
 
@@ -89,11 +94,13 @@ def _frames(scene: Scene) -> bytes:
     frames = images_of_frames(scene)
     parts = [struct.pack("<Q", len(frames))]
     for frame, images in frames.items():
-        world_from_rig = scene.world_from_rig[scene.drive.images[images[0]].unit]
+        first = scene.drive.images[images[0]]
+        world_from_rig = scene.world_from_rig[first.unit]
         if scene.unit_from_image is not None:
             world_from_rig = world_from_rig @ scene.unit_from_image[images[0]]
         pose = _wxyz_and_translation(se3.inverse(world_from_rig))
-        parts.append(struct.pack("<II7dI", frame, RIG_ID, *pose, len(images)))
+        rig = RIG_ID + int(scene.rig_of_camera[first.camera])
+        parts.append(struct.pack("<II7dI", frame, rig, *pose, len(images)))
         parts += [struct.pack("<iIQ", SENSOR_CAMERA, scene.drive.images[i].camera + 1, i + 1) for i in images]
     return b"".join(parts)
 

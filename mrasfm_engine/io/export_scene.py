@@ -1,18 +1,15 @@
 """Writes a scene's files, checks them, and puts them in place.
 
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
-`poses.json`, `calibration.json`, `frame.json`, `features.db`, `pictures/` where any were drawn, `road.json` where the
-road was found, and `report.json`. One with a `report.json` is complete.
+`poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
+scene can be aggregated without the drive), `pictures/` where any were drawn, `road.json` where the road was found, and
+`report.json`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import secrets
 import shutil
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.errors import MrasfmError, StorageError
+from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.io import (
     export_calibration,
     export_check,
@@ -34,13 +31,13 @@ from mrasfm_engine.io import (
     export_road,
     feature_database,
 )
+from mrasfm_engine.io.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.scene.scene import Scene
 
-COMPLETE_MARK = "report.json"
 PICTURES = "pictures"
 NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
-LEFTOVER_AGE_S = 3600.0
 ROAD_FILE = "road.json"
+MANIFEST_FILE = "manifest.json"
 
 
 def write_scene(
@@ -66,23 +63,11 @@ def write_scene(
     MrasfmError
         Where the scene contradicts itself, or a file that was written does not read back.
     """
-    _check_scene(scene)
-    out = out.resolve()
-    try:
-        # Inside an existing folder, because that may be another file system than its parent.
-        home = out if out.is_dir() else out.parent
-        _prepare(_size_bytes(scene) + export_pictures.size_bytes(pictures), out, home)
-        work = home / f".{out.name}.partial-{os.getpid()}-{secrets.token_hex(4)}"
-        work.mkdir()
-        try:
-            export_pictures.write_pictures(pictures, work / PICTURES)
-            _write(scene, work, report)
-            _put_in_place(work, out)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    except OSError as error:
-        remedy = "Free space on this disk, or choose a folder that can be written."
-        raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
+    check_scene(scene)
+    needed = _size_bytes(scene) + export_pictures.size_bytes(pictures)
+    with publishing(out, needed, replaced=(PICTURES, ROAD_FILE)) as work:
+        export_pictures.write_pictures(pictures, work / PICTURES)
+        _write(scene, work, report)
 
 
 def summary(scene: Scene) -> dict[str, Any]:
@@ -120,17 +105,27 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
     feature_database.write_features(scene, work / "features.db")
     export_check.check_features(scene, work / "features.db")
     if scene.road is not None:
-        _write_json(work / ROAD_FILE, export_road.road_document(scene))
+        write_json(work / ROAD_FILE, export_road.road_document(scene))
         export_check.check_road(scene, work / ROAD_FILE)
     (work / "poses.tum").write_text(export_poses.poses_text(scene), encoding="utf-8")
-    _write_json(work / "poses.json", export_poses.poses_document(scene))
-    _write_json(work / "calibration.json", export_calibration.calibration_document(scene))
-    _write_json(work / "frame.json", export_frame.frame_document(scene))
-    _write_json(work / COMPLETE_MARK, {**report, "summary": figures})
+    write_json(work / "poses.json", export_poses.poses_document(scene))
+    write_json(work / "calibration.json", export_calibration.calibration_document(scene))
+    write_json(work / "frame.json", export_frame.frame_document(scene))
+    manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
+    (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
+    export_check.check_manifest(scene, work / MANIFEST_FILE)
+    write_json(work / COMPLETE_MARK, {**report, "summary": figures})
     export_check.check_documents(scene, work)
 
 
-def _write_json(path: Path, document: Mapping[str, Any]) -> None:
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document.
+
+    Raises
+    ------
+    MrasfmError
+        Where a value has no JSON form.
+    """
     try:
         text = json.dumps(document, allow_nan=False, indent=1, ensure_ascii=False, default=_plain)
     except (TypeError, ValueError) as error:
@@ -150,22 +145,6 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
-def _prepare(needed: int, out: Path, home: Path) -> None:
-    """Make the folder to work in, clear what killed runs left there, and see that the files will fit."""
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
-    home.mkdir(parents=True, exist_ok=True)
-    for leftover in home.glob(f".{out.name}.partial-*"):
-        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
-            shutil.rmtree(leftover, ignore_errors=True)
-    free = shutil.disk_usage(home).free
-    if free < needed:
-        raise StorageError(
-            f"{out} needs about {needed / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
-            remedy="Free space on this disk, or choose another folder.",
-        )
-
-
 def _size_bytes(scene: Scene) -> int:
     """About what the files take, with the database's write-ahead log."""
     keypoints = sum(len(f.xy_px) for f in scene.features)
@@ -173,25 +152,7 @@ def _size_bytes(scene: Scene) -> int:
     return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 300 * len(scene.points_m) + 2_000_000
 
 
-def _put_in_place(work: Path, out: Path) -> None:
-    if not out.exists():
-        work.rename(out)
-        return
-    (out / COMPLETE_MARK).unlink(missing_ok=True)
-    # An older scene's that this one does not have: it would be taken for this scene's.
-    if not (work / ROAD_FILE).exists():
-        (out / ROAD_FILE).unlink(missing_ok=True)
-    items = sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK)
-    if (out / PICTURES).is_dir() and not (work / PICTURES).exists():
-        (out / PICTURES).rename(work / f"old-{PICTURES}")
-    for item in items:
-        target = out / item.name
-        if item.is_dir() and target.is_dir():
-            target.rename(work / f"old-{item.name}")
-        item.rename(target)
-
-
-def _check_scene(scene: Scene) -> None:
+def check_scene(scene: Scene) -> None:
     """Refuse a scene whose arrays contradict each other before anything is written."""
     for what, right in _consistency(scene):
         if not right:

@@ -119,12 +119,16 @@ class Scene:
     point_classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     point_patches: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     road: Road | None = None
+    # (cameras,) of a map: which vehicle each camera is on; empty where all are on one
+    rig_of_camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         if not len(self.point_classes):
             self.point_classes = np.zeros(len(self.points_m), np.uint8)
         if not len(self.point_patches):
             self.point_patches = np.full(len(self.points_m), -1, np.int32)
+        if not len(self.rig_of_camera):
+            self.rig_of_camera = np.zeros(len(self.calibration), np.int64)
 
     @property
     def world_from_cam(self) -> Floats:

@@ -22,7 +22,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.synthetic import gnss
 from mrasfm_engine.synthetic.calibration import given_cameras
-from mrasfm_engine.synthetic.light import along_street, daylight
+from mrasfm_engine.synthetic.light import along_street, daylight, dusk
 from mrasfm_engine.synthetic.motion import Motion, drive_motion
 from mrasfm_engine.synthetic.moving_shadows import street_heading
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
@@ -146,13 +146,19 @@ def _render_drive(
     folder: Path,
     report: Callable[[int], None],
 ) -> None:
-    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(7)]
+    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(8)]
     motion = drive_motion(options, world.layout, drive, rng[0])
     start_us = FIRST_EPOCH_US + drive * _BETWEEN_DRIVES_US
     unit_s = np.arange(options.units) / RATE_HZ
     unit_us = start_us + np.round(unit_s * 1e6).astype(np.int64)
     shots = _plan(options, motion, rig, unit_us, start_us, rng[1])
     light = daylight(rng[2])
+    if options.dusk_drive == drive:
+        light = dusk(light)
+    off_m = (0.0, 0.0)
+    if options.biased_drive == drive:
+        angle = rng[7].uniform(0, 2 * np.pi)
+        off_m = (options.biased_by_m * math.cos(angle), options.biased_by_m * math.sin(angle))
     if options.moving_shadows:
         # In the shade of houses nothing casts a shadow: the sun stands along the street.
         light = along_street(light, street_heading(motion, options))
@@ -162,7 +168,7 @@ def _render_drive(
         name=f"synthetic {options.world} {drive}, seed {options.seed}",
         rig=Rig(cameras=given_cameras(options, rig, np.random.default_rng([options.seed, 3]))),
         frames=_frames(options, shots, rig, unit_us),
-        gnss=gnss.receive(options, world_from_rig, unit_us, rng[4]) if options.gnss else None,
+        gnss=gnss.receive(options, world_from_rig, unit_us, rng[4], off_m=off_m) if options.gnss else None,
         rough_poses=_rough(options, world_from_rig, unit_us, rng[5]) if options.rough_poses else None,
         label_map=LabelMap.cityscapes() if options.masks else None,
         notes=["rendered by mrasfm synth"],

@@ -46,11 +46,17 @@ def antenna_positions(world_from_rig: Floats) -> Floats:
 
 
 def receive(
-    options: SynthOptions, world_from_rig: Floats, timestamps_us: NDArray[np.int64], rng: np.random.Generator
+    options: SynthOptions,
+    world_from_rig: Floats,
+    timestamps_us: NDArray[np.int64],
+    rng: np.random.Generator,
+    *,
+    off_m: tuple[float, float] = (0.0, 0.0),
 ) -> Gnss:
     """Samples at the given poses (n, 4, 4) and instants (n,), with the errors that the options ask for.
 
-    The declared sigmas cover white noise, drift and bias together, but neither outliers nor a clock's offset.
+    All positions are `off_m` to the east and north besides. The declared sigmas cover white noise, drift and bias
+    together, but neither that, nor outliers, nor a clock's offset.
     """
     n = len(world_from_rig)
     axes = np.array([1.0, 1.0, VERTICAL_FACTOR])
@@ -66,6 +72,7 @@ def receive(
     direction = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.5]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     error += np.where(gross[:, None], direction * rng.uniform(5.0, 40.0, (n, 1)), 0.0)
+    error[:, :2] += off_m
     place = Origin().geodetic(antenna_positions(world_from_rig) + error)
     sigma = max(0.01, float(np.hypot(np.hypot(options.gnss_noise_m, options.gnss_drift_m), options.gnss_bias_m)))
     offset_us = round(options.gnss_offset_s * 1e6)

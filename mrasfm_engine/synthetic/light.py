@@ -73,6 +73,20 @@ def daylight(rng: np.random.Generator) -> Light:
     )
 
 
+def dusk(light: Light) -> Light:
+    """The same place late under clouds: the sun is low and faint, what light there is comes from all over the sky."""
+    level = light.to_sun[:2] / np.hypot(light.to_sun[0], light.to_sun[1])
+    low = np.radians(18.0)
+    return replace(
+        light,
+        to_sun=np.array([*(np.cos(low) * level), np.sin(low)]),
+        sun=0.2 * light.sun * np.array([1.0, 0.8, 0.6]),
+        sky=0.75 * light.sky * np.array([0.95, 0.95, 1.1]),
+        cloudiness=1.0,
+        gain=0.8 * light.gain,
+    )
+
+
 def along_street(light: Light, heading_rad: float) -> Light:
     """The same light with the sun within 15 degrees of the street's direction, ahead or behind as it was before."""
     azimuth = float(np.arctan2(light.to_sun[1], light.to_sun[0])) - heading_rad

@@ -70,6 +70,9 @@ class SynthOptions:
     gnss_noise_m: float = 0.3  # white; vertical 1.5 times that
     gnss_drift_m: float = 0.2  # slowly changing (correlation time 20 s)
     gnss_bias_m: float = 0.3  # constant in each drive
+    biased_drive: int | None = None  # whose positions are all off by so much in one horizontal direction, undeclared:
+    biased_by_m: float = 8.0
+    dusk_drive: int | None = None  # that is driven in other light than the others: late, under clouds
     gnss_outliers: float = 0.0  # fraction of samples that are 5 to 40 m off
     gnss_offset_s: float = 0.0  # added to the GNSS timestamps
     rough_poses: bool = False
@@ -109,6 +112,7 @@ class SynthOptions:
             "gnss_noise_m",
             "gnss_drift_m",
             "gnss_bias_m",
+            "biased_by_m",
             "rough_noise_m",
             "rough_noise_deg",
             "perturb_rotation_deg",
@@ -138,6 +142,11 @@ class SynthOptions:
         for name in (*self.occluded_cameras, *([self.wrong_camera] if self.wrong_camera else [])):
             if name not in names:
                 refuse(f"camera {name!r} is not on this vehicle", f"Its cameras are {', '.join(names)}.")
+        for name in ("biased_drive", "dusk_drive"):
+            drive = getattr(self, name)
+            if drive is not None and not 0 <= drive < self.drives:
+                flag = name.replace("_", "-")
+                refuse(f"--{flag} {drive} is none of the drives", f"Their numbers are 0 to {self.drives - 1}.")
         if self.tight and (self.perturb_rotation_deg or self.perturb_translation_m):
             refuse("--tight declares a calibration that is perturbed", "Leave out --tight, or the perturbation.")
         if self.world is World.LOOP and self.loop_length_m < MIN_LOOP_M:

@@ -56,6 +56,7 @@ class JobKind(StrEnum):
 
     PREFLIGHT = "PREFLIGHT"
     RECONSTRUCTION = "RECONSTRUCTION"
+    AGGREGATION = "AGGREGATION"
 
 
 class JobState(StrEnum):
@@ -76,7 +77,11 @@ class JobProgress(Resource):
     done: int | None = None
     total: int | None = None
     unit: str | None = Field(None, description="what done and total count", examples=["pairs"])
-    percent: float = Field(description="of the whole job; never falls within an attempt", ge=0, le=100)
+    percent: float = Field(
+        description="of the whole job, with what an aggregation waits for; never falls within an attempt",
+        ge=0,
+        le=100,
+    )
     eta_low_s: float | None = Field(None, description="seconds to the end, likely at least")
     eta_high_s: float | None = Field(None, description="seconds to the end, likely at most")
     reused_stages: list[str] = Field(default_factory=list, description="finished before, not done again")
@@ -91,6 +96,18 @@ class JobAttempt(Resource):
     finished_at: datetime | None = None
     outcome: str | None = Field(None, description="succeeded, cancelled, released, or the code of a problem")
     problem: Problem | None = None
+
+
+class JobMember(Resource):
+    """A drive that an aggregation brings into its map."""
+
+    name: str = Field(description="of the scene in the map", examples=["ring-road-2026-05-04"])
+    drive_id: str = Field(examples=["drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"])
+    job_id: str | None = Field(None, description="the reconstruction that makes its scene; null: it was there")
+    state: JobState | None = Field(None, description="of that job; null where its record is gone", examples=["RUNNING"])
+    percent: float = Field(description="of that job", ge=0, le=100, examples=[33.5])
+    scene_id: str | None = Field(None, description="its scene, once it is there")
+    problem: Problem | None = Field(None, description="why there will be none")
 
 
 class JobResource(Times):
@@ -129,6 +146,9 @@ class JobResource(Times):
                     "heartbeat_at": "2026-05-04T09:33:40Z",
                     "problem": None,
                     "scene_id": None,
+                    "map_id": None,
+                    "map_version": None,
+                    "members": [],
                     "retry_of": None,
                     "created_at": "2026-05-04T09:31:00Z",
                     "started_at": "2026-05-04T09:31:02Z",
@@ -141,8 +161,11 @@ class JobResource(Times):
 
     id: str
     kind: JobKind
-    drive_id: str
-    state: JobState = Field(description="STALLED is RUNNING without a recent heartbeat: another worker will take over")
+    drive_id: str | None = Field(None, description="null for an aggregation, which has members")
+    state: JobState = Field(
+        description="STALLED is RUNNING without a recent heartbeat: another worker will take over. An aggregation is "
+        "QUEUED, in stage 'reconstructions', while its drives are reconstructed"
+    )
     settings: dict[str, Any] = Field(description="as asked")
     progress: JobProgress
     attempts: list[JobAttempt]
@@ -150,6 +173,9 @@ class JobResource(Times):
     heartbeat_at: datetime | None = None
     problem: Problem | None = Field(None, description="why it failed")
     scene_id: str | None = Field(None, description="what it made")
+    map_id: str | None = Field(None, description="of which an aggregation makes a version")
+    map_version: int | None = Field(None, description="the version that it made")
+    members: list[JobMember] = Field(default_factory=list, description="what an aggregation brings into its map")
     retry_of: str | None = Field(None, description="the job that this one repeats")
     started_at: datetime | None = None
     finished_at: datetime | None = None

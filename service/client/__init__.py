@@ -11,11 +11,11 @@ What can go wrong is a `ClientError`: an `ApiError` carries the problem that the
 """
 
 from service.client.api import Client, JobEvent
-from service.client.download import Downloaded, download_scene
+from service.client.download import Downloaded, download_map, download_scene
 from service.client.drive_folder import DriveFolder, LocalFile
 from service.client.errors import ApiError, ClientError, DriveFolderError, SceneFolderError, UnreachableError
 from service.client.follow import ENDED, JobNews, follow
-from service.client.upload import Sent, start_reconstruction, upload_drive
+from service.client.upload import Sent, start_aggregation, start_reconstruction, upload_drive
 from service.client.upload_state import UploadState
 
 __all__ = [
@@ -33,8 +33,10 @@ __all__ = [
     "Sent",
     "UnreachableError",
     "UploadState",
+    "download_map",
     "download_scene",
     "follow",
+    "start_aggregation",
     "start_reconstruction",
     "upload_drive",
 ]

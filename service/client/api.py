@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
@@ -14,10 +15,13 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
+from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource
 from schemas.api.jobs import JobResource, ReconstructionSettings
+from schemas.api.maps import MapVersionResource
 from schemas.api.scenes import SceneResource
 from schemas.api.status import ServiceStatus
+from schemas.api.uploads import UploadResource
 from service.client.drive_folder import LocalFile
 from service.client.transport import CHECK_TIMEOUT_S, IO_TIMEOUT_S, Body, Patience, Transport, TroubleError, unexpected
 from service.uploads.digests import format_digest
@@ -25,6 +29,7 @@ from service.uploads.digests import format_digest
 Model = TypeVar("Model", bound=BaseModel)
 PATIENCE_S = 300.0  # a service that is being restarted, or moved
 FIRST_PATIENCE_S = 6.0
+_TUS = {"Tus-Resumable": "1.0.0"}
 _SILENCE_S = 40.0  # an event stream says something every 15 s
 
 
@@ -205,11 +210,25 @@ class Client:
         """One scene and its files."""
         return self._get(f"/v1/scenes/{_part(scene_id)}", SceneResource)
 
+    def aggregate(self, asked: AggregationRequest, *, idempotency_key: str | None = None) -> JobResource:
+        """Ask for a map of drives or scenes, or for a new version of one."""
+        content = asked.model_dump_json(exclude_none=True).encode()
+        return self._post("/v1/aggregations", JobResource, content=content, key=idempotency_key)
+
+    def map_version(self, map_id: str, number: int) -> MapVersionResource:
+        """One version of a map and its files."""
+        return self._get(f"/v1/maps/{_part(map_id)}/versions/{number}", MapVersionResource)
+
     @contextmanager
-    def open_scene_file(
-        self, scene_id: str, path: str, *, sha256: str, start: int = 0
+    def open_file(
+        self, resource: str, path: str, *, sha256: str, start: int = 0
     ) -> Iterator[tuple[int, Iterator[bytes]]]:
-        """A file of a scene, from byte `start` on where it still is the one with this SHA-256. One try.
+        """A file of a scene or of a map's version, from byte `start` on where it still is this one. One try.
+
+        Parameters
+        ----------
+        resource
+            Its path, such as `/v1/scenes/ID`.
 
         Yields
         ------
@@ -217,12 +236,39 @@ class Client:
             Where the pieces begin: 0 where the service sends the file from its beginning.
         """
         headers = {} if start == 0 else {"Range": f"bytes={start}-", "If-Range": f'"{sha256}"'}
-        url = f"/v1/scenes/{_part(scene_id)}/files/{quote(path)}"
-        with self._transport.open("GET", url, headers=headers) as response:
+        with self._transport.open("GET", f"{resource}/files/{quote(path)}", headers=headers) as response:
             partial = response.status_code == httpx.codes.PARTIAL_CONTENT
             if partial and not response.headers.get("content-range", "").startswith(f"bytes {start}-"):
                 raise unexpected(response, "the part of the file that was asked for")
             yield (start if partial else 0), response.iter_bytes()
+
+    def create_upload(self, drive_id: str, size_bytes: int, metadata: Mapping[str, str]) -> str:
+        """Begin a resumable upload; its path."""
+        encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
+        headers = {
+            **_TUS,
+            "Upload-Length": str(size_bytes),
+            "Upload-Metadata": ",".join(encoded),
+            "Idempotency-Key": str(uuid.uuid4()),
+        }
+        response = self._transport.request("POST", f"/v1/drives/{_part(drive_id)}/uploads", headers=headers)
+        return f"/v1/drives/{_part(drive_id)}/uploads/{_part(_parsed(response, UploadResource).id)}"
+
+    def upload_offset(self, upload: str) -> int:
+        """How many bytes of a resumable upload the service has."""
+        response = self._transport.request("HEAD", upload, headers=_TUS)
+        offset = response.headers.get("upload-offset", "")
+        if not offset.isdecimal():
+            raise unexpected(response, "an upload's offset")
+        return int(offset)
+
+    def append_to_upload(self, upload: str, offset: int, body: Body) -> None:
+        """Send the bytes of a resumable upload from `offset` on. One try."""
+        headers = {**_TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
+        with self._transport.open(
+            "PATCH", upload, headers=headers, body=body, read_timeout_s=CHECK_TIMEOUT_S
+        ) as answer:
+            answer.read()
 
     def _get(self, path: str, model: type[Model]) -> Model:
         return _parsed(self._transport.request("GET", path), model)

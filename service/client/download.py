@@ -5,13 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
+from urllib.parse import quote
 
 from pydantic import TypeAdapter, ValidationError
 
-from schemas.api.scenes import SceneFileResource, SceneResource
+from schemas.api.maps import MapFileResource, MapVersionResource
+from schemas.api.scenes import SceneFileResource
 from schemas.drive import RelativePath
 from service.client.api import Client
 from service.client.errors import ClientError, SceneFolderError
@@ -23,6 +26,7 @@ OWN_PREFIX = ".mrasfm-"
 MARKER_NAME = f"{OWN_PREFIX}scene.json"  # says which scene the folder is of
 REPORT_NAME = "report.json"  # written last: a folder with it is complete, as the engine's own are
 PARALLEL = 4
+ResultFile = SceneFileResource | MapFileResource
 _relative_path = TypeAdapter(RelativePath)
 
 
@@ -30,7 +34,6 @@ _relative_path = TypeAdapter(RelativePath)
 class Downloaded:
     """What a download brought."""
 
-    scene: SceneResource
     bytes_received: int
     files_received: int
     files_skipped: int
@@ -53,19 +56,50 @@ def download_scene(
         The service does not answer.
     """
     scene = client.scene(scene_id)
-    require_free(out, scene_id)
-    for file in scene.files:
+    resource = f"/v1/scenes/{quote(scene_id, safe='')}"
+    return _bring(_Result(client, scene_id, f"scene {scene_id}", resource, scene.files), out, parallel, report)
+
+
+def download_map(
+    client: Client,
+    version: MapVersionResource,
+    out: Path,
+    *,
+    parallel: int = PARALLEL,
+    report: Report = no_report,
+) -> Downloaded:
+    """Bring all files of a map's version into `out`; as `download_scene`."""
+    resource = f"/v1/maps/{quote(version.map_id, safe='')}/versions/{version.number}"
+    held, what = f"{version.map_id}/{version.number}", f"version {version.number} of map {version.map_id}"
+    return _bring(_Result(client, held, what, resource, version.files), out, parallel, report)
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A scene, or a map's version: `held` is what a folder with it is marked with."""
+
+    client: Client
+    held: str
+    what: str
+    resource: str
+    files: Sequence[ResultFile]
+
+
+def _bring(result: _Result, out: Path, parallel: int, report: Report) -> Downloaded:
+    client = result.client
+    require_free(out, result.held)
+    for file in result.files:
         _require_inside(out, file)
-    _claim(out, scene_id)
-    meter = Meter(report, "download", sum(file.size_bytes for file in scene.files))
+    _claim(out, result.held)
+    meter = Meter(report, "download", sum(file.size_bytes for file in result.files))
     brought: list[int | None] = []
     for is_last in (False, True):
-        files = [file for file in scene.files if (file.path == REPORT_NAME) is is_last]
+        files = [file for file in result.files if (file.path == REPORT_NAME) is is_last]
         brought += in_parallel(
-            lambda file: _Download(client, scene_id, out, file, meter).run(), files, threads=parallel, stop=client.stop
+            lambda file: _Download(result, out, file, meter).run(), files, threads=parallel, stop=client.stop
         )
     received = [count for count in brought if count is not None]
-    return Downloaded(scene, sum(received), len(received), len(brought) - len(received))
+    return Downloaded(sum(received), len(received), len(brought) - len(received))
 
 
 def require_free(out: Path, scene_id: str | None) -> None:
@@ -83,9 +117,13 @@ def require_free(out: Path, scene_id: str | None) -> None:
         return
     held = _scene_in(out)
     if held is None:
-        raise SceneFolderError(f"{out} is not empty, and holds no scene that was downloaded. Give another folder.")
+        raise SceneFolderError(
+            f"{out} is not empty, and holds no scene or map that was downloaded. Give another folder."
+        )
     if scene_id is not None and held != scene_id:
-        raise SceneFolderError(f"{out} holds the scene {held}, not {scene_id}. Give another folder, or remove it.")
+        raise SceneFolderError(
+            f"{out} holds the {_kind(held)} {held}, not {scene_id}. Give another folder, or remove it."
+        )
 
 
 def _scene_in(out: Path) -> str | None:
@@ -93,6 +131,10 @@ def _scene_in(out: Path) -> str | None:
         return str(json.loads((out / MARKER_NAME).read_bytes())["scene_id"])
     except (OSError, ValueError, LookupError, TypeError):
         return None
+
+
+def _kind(held: str) -> str:
+    return "map" if "/" in held else "scene"
 
 
 def _claim(out: Path, scene_id: str) -> None:
@@ -104,7 +146,7 @@ def _claim(out: Path, scene_id: str) -> None:
         raise SceneFolderError(f"{out} cannot be written: {error.strerror}. Give another folder.") from error
 
 
-def _require_inside(out: Path, file: SceneFileResource) -> None:
+def _require_inside(out: Path, file: ResultFile) -> None:
     """Refuse names that would lead out of the folder: a service may be wrong, or not the one it seems to be."""
     try:
         _relative_path.validate_python(file.path)
@@ -121,9 +163,9 @@ def _require_inside(out: Path, file: SceneFileResource) -> None:
 class _Download:
     """One file of a scene. Its bytes gather under a temporary name until all are there and are the right ones."""
 
-    def __init__(self, client: Client, scene_id: str, out: Path, file: SceneFileResource, meter: Meter) -> None:
-        self._client = client
-        self._scene_id = scene_id
+    def __init__(self, result: _Result, out: Path, file: ResultFile, meter: Meter) -> None:
+        self._result = result
+        self._client = result.client
         self._file = file
         self._meter = meter
         self._target = out / file.path
@@ -153,7 +195,7 @@ class _Download:
         if not self._is_right(self._partial):
             self._partial.unlink()
             raise SceneFolderError(
-                f"{self._file.path} of scene {self._scene_id} arrives damaged: its SHA-256 is not the one that the "
+                f"{self._file.path} of {self._result.what} arrives damaged: its SHA-256 is not the one that the "
                 "service states. Try again; if it stays so, tell the service's operator."
             )
         self._target.parent.mkdir(parents=True, exist_ok=True)
@@ -191,7 +233,7 @@ class _Download:
     def _receive(self, partial: BinaryIO) -> None:
         start = self._have_bytes
         path, sha256 = self._file.path, self._file.sha256
-        with self._client.open_scene_file(self._scene_id, path, sha256=sha256, start=start) as (begins_at, pieces):
+        with self._client.open_file(self._result.resource, path, sha256=sha256, start=start) as (begins_at, pieces):
             self._now_have(begins_at)
             partial.seek(begins_at)
             for piece in pieces:

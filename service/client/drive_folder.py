@@ -26,16 +26,16 @@ class LocalFile:
     size_bytes: int
     sha256: str
 
-    def pieces(self) -> Iterator[bytes]:
-        """The file's bytes.
+    def pieces(self, offset: int = 0) -> Iterator[bytes]:
+        """The file's bytes from `offset` on.
 
         Raises
         ------
         DriveFolderError
             Where there are more or fewer than there were: half a request cannot be taken back otherwise.
         """
-        left = self.size_bytes
-        for piece in _pieces(self.source):
+        left = self.size_bytes - offset
+        for piece in _pieces(self.source, offset):
             left -= len(piece)
             if left < 0:
                 raise self.changed()
@@ -106,9 +106,10 @@ def identify(root: Path, path: str) -> LocalFile:
     return LocalFile(path, source, size_bytes, digest.hexdigest())
 
 
-def _pieces(source: Path) -> Iterator[bytes]:
+def _pieces(source: Path, offset: int = 0) -> Iterator[bytes]:
     try:
         with source.open("rb", buffering=0) as file:
+            file.seek(offset)
             while piece := file.read(PIECE_BYTES):
                 yield piece
     except OSError as error:

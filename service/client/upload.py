@@ -6,12 +6,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from pydantic import BaseModel
+
+from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DriveResource, DriveState
 from schemas.api.jobs import JobResource, JobState, ReconstructionSettings
+from service.client import resumable
 from service.client.api import Client
 from service.client.drive_folder import DriveFolder, LocalFile, identify
 from service.client.errors import ApiError, ClientError
 from service.client.parallel import Item, Meter, Report, Result, in_parallel, no_report
+from service.client.resumable import ResumableUpload
 from service.client.upload_state import UploadState
 
 PARALLEL = 4
@@ -75,16 +80,27 @@ def start_reconstruction(
     gone.
     """
     settings = settings or ReconstructionSettings()
+    return _asked(client, settings, state, lambda key: client.reconstruct(drive_id, settings, idempotency_key=key))
+
+
+def start_aggregation(client: Client, asked: AggregationRequest, *, state: UploadState | None = None) -> JobResource:
+    """Ask for a map of committed drives; as `start_reconstruction`."""
+    return _asked(client, asked, state, lambda key: client.aggregate(asked, idempotency_key=key))
+
+
+def _asked(
+    client: Client, what: BaseModel, state: UploadState | None, ask: Callable[[str | None], JobResource]
+) -> JobResource:
     if state is None:
-        return client.reconstruct(drive_id, settings)
-    record = state.job(settings)
+        return ask(None)
+    record = state.job(what)
     if record is not None and record.job_id is not None:
         known = _usable_job(client, record.job_id)
         if known is not None:
             return known
         record = None
-    record = record or state.begin_job(settings)
-    job = client.reconstruct(drive_id, settings, idempotency_key=record.key)
+    record = record or state.begin_job(what)
+    job = ask(record.key)
     record.job_id = job.id
     state.save()
     return job
@@ -95,6 +111,8 @@ def _usable_job(client: Client, job_id: str) -> JobResource | None:
         job = client.job(job_id)
         if job.scene_id is not None:
             client.scene(job.scene_id)
+        if job.map_id is not None and job.map_version is not None:
+            client.map_version(job.map_id, job.map_version)
     except ApiError as error:
         if error.code != "not-found":
             raise
@@ -173,6 +191,24 @@ class _Upload:
         return [file for file in files if file.path in wanted]
 
     def _send(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
+        try:
+            if file.size_bytes >= resumable.FROM_BYTES:
+                self._send_resumably(drive_id, file, meter)
+            else:
+                self._send_whole(drive_id, file, meter)
+        except ApiError as error:
+            if error.code == "wrong-digest":
+                raise file.changed() from error
+            raise
+
+    def _send_resumably(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
+        name = f"{file.path} {file.sha256}"
+        upload = ResumableUpload(self._client, drive_id, file, meter, url=self._state.uploads.get(name))
+        self._state.note_upload(name, upload.begin())
+        upload.send()
+        self._state.note_upload(name, None)
+
+    def _send_whole(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
         sent_bytes = 0
 
         def counted() -> Iterator[bytes]:
@@ -186,13 +222,8 @@ class _Upload:
                 sent_bytes += len(piece)
                 meter.add(len(piece))
 
-        try:
-            # The drive is this folder's: where a file was changed here since it was sent, the new bytes count.
-            self._client.put_file(drive_id, file, body=counted, replace=True)
-        except ApiError as error:
-            if error.code == "wrong-digest":
-                raise file.changed() from error
-            raise
+        # The drive is this folder's: where a file was changed here since it was sent, the new bytes count.
+        self._client.put_file(drive_id, file, body=counted, replace=True)
 
     def _commit(self, drive: DriveResource) -> None:
         if drive.state == DriveState.COMMITTED:

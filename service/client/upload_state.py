@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from schemas.api.jobs import ReconstructionSettings
 from service.client.drive_folder import DriveFolder
 from service.data_folder import write_private_file
 
@@ -37,7 +38,8 @@ class UploadRecord(_Record):
 
     upload: str
     drive_id: str | None = None
-    jobs: dict[str, JobRecord] = {}  # by the settings' digest
+    jobs: dict[str, JobRecord] = {}  # by the digest of what was asked for
+    resumable: dict[str, str] = {}  # paths of uploads under way, by what they send
 
 
 class _Document(_Record):
@@ -62,6 +64,7 @@ class UploadState:
     def __init__(self, folder: DriveFolder, url: str) -> None:
         self._name = f"{url} {folder.manifest_sha256}"
         self._places = [folder.root / STATE_NAME, _cache_of(folder.root)]
+        self._lock = threading.Lock()
         self._document = next((found for place in self._places if (found := _read(place)) is not None), _Document())
         self.record = self._document.uploads.get(self._name) or _new_record()
 
@@ -70,15 +73,29 @@ class UploadState:
         self.record = _new_record()
         self.save()
 
-    def begin_job(self, settings: ReconstructionSettings) -> JobRecord:
-        """Forget the job for these settings, and name the next request."""
-        record = self.record.jobs[_digest(settings)] = JobRecord(key=str(uuid.uuid4()))
+    def begin_job(self, asked: BaseModel) -> JobRecord:
+        """Forget the job that was asked for so, and name the next request."""
+        record = self.record.jobs[_digest(asked)] = JobRecord(key=str(uuid.uuid4()))
         self.save()
         return record
 
-    def job(self, settings: ReconstructionSettings) -> JobRecord | None:
-        """What was asked for with these settings."""
-        return self.record.jobs.get(_digest(settings))
+    def job(self, asked: BaseModel) -> JobRecord | None:
+        """What was asked for so."""
+        return self.record.jobs.get(_digest(asked))
+
+    @property
+    def uploads(self) -> Mapping[str, str]:
+        """Paths of resumable uploads that an earlier run left under way, by what they send."""
+        return self.record.resumable
+
+    def note_upload(self, name: str, path: str | None) -> None:
+        """Remember where something is being sent; None: it is there. May be called from several threads."""
+        with self._lock:
+            if path is None:
+                self.record.resumable.pop(name, None)
+            else:
+                self.record.resumable[name] = path
+            self.save()
 
     def save(self) -> None:
         """Keep the record, where there is a place for it."""
@@ -110,6 +127,6 @@ def _cache_of(root: Path) -> Path:
     return Path(cache) / "mrasfm" / "uploads" / f"{hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:32]}.json"
 
 
-def _digest(settings: ReconstructionSettings) -> str:
-    values: dict[str, Any] = settings.model_dump(mode="json", exclude_none=True)
+def _digest(asked: BaseModel) -> str:
+    values: dict[str, Any] = asked.model_dump(mode="json", exclude_none=True)
     return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()[:16]

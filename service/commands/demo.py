@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from service.client.display import Display
 
 MAX_RMSE_M = 0.2
-SEEDS = (1, 2)
+MAX_SEAM_M = 0.1
+SEED = 1
+DRIVES = 2
 CAMERAS = 6
 EXIT_FAILED, EXIT_REFUSED, EXIT_INTERRUPTED = 1, 2, 130
 _START_PATIENCE_S = 120.0
@@ -38,8 +40,10 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "demo",
         help="show the whole service at work",
-        description="Render two drives, send them to a service of their own, get their scenes, compare with the truth.",
-        epilog=f"exit codes: 0 done; 1 a part failed, or an error is over {MAX_RMSE_M} m; 2 OUT is not empty",
+        description="Render two drives of one street, send them to a service of their own, get scenes and a map, "
+        "compare with the truth.",
+        epilog=f"exit codes: 0 done; 1 a part failed, or an error is over {MAX_RMSE_M} m, at the seam {MAX_SEAM_M} m; "
+        "2 OUT is not empty",
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="OUT", help="folder for all of it: demo")
     parser.add_argument("--units", type=int, default=20, help="instants of each drive (default: 20)")
@@ -71,33 +75,51 @@ class _Demo:
         self._out = out
         self._units = units
         self._display = display
-        self._numbers = range(1, len(SEEDS) + 1)
+        self._numbers = range(DRIVES)
         self._seconds: dict[str, float] = {}
+        self._drive_ids: list[str] = []
+        self._name_of: dict[str, str] = {}  # in the map, by the drive's id
 
     def run(self) -> int:
         from service.client import Client
 
         with self._timed("render"):
-            for number, seed in zip(self._numbers, SEEDS, strict=True):
-                self._render(number, seed)
+            self._render()
         key = self._make_key()
         port = _free_port()
         with self._service(port), Client(f"http://127.0.0.1:{port}", key) as client:
             self._use(client)
         with self._timed("evaluate"):
-            errors = [self._evaluate(number) for number in self._numbers]
-        self._print(errors)
+            errors = [self._evaluate(self._scene(number), self._truth(number)) for number in self._numbers]
+            named = zip(self._numbers, self._drive_ids, strict=True)
+            truths = [f"{self._name_of[drive_id]}={self._truth(number)}" for number, drive_id in named]
+            of_map = self._evaluate(self._map, *truths)
+        self._print(errors, of_map)
+        return self._judge([*errors, of_map], of_map["seams"])
+
+    def _judge(self, errors: Sequence[dict[str, Any]], seams: Sequence[dict[str, Any]]) -> int:
+        """The exit code; comparisons are such that what is not a number fails, too."""
         worst_m = max(float(error["metric"]["rmse_m"]) for error in errors)
-        if not worst_m <= MAX_RMSE_M:  # also where it is not a number
+        if not worst_m <= MAX_RMSE_M:
             self._display.say(f"mrasfm: error: the position error of {worst_m:.3f} m is over {MAX_RMSE_M} m")
+            return EXIT_FAILED
+        if not seams or not all(float(seam["translation_m"]) <= MAX_SEAM_M for seam in seams):
+            self._display.say(f"mrasfm: error: the drives are not put together within {MAX_SEAM_M} m: {list(seams)}")
             return EXIT_FAILED
         return 0
 
+    @property
+    def _map(self) -> Path:
+        return self._out / "map"
+
     def _drive(self, number: int) -> Path:
-        return self._out / f"drive-{number}"
+        return self._out / "drives" / f"drive_{number}"
+
+    def _truth(self, number: int) -> Path:
+        return self._drive(number) / "truth.tum"
 
     def _scene(self, number: int) -> Path:
-        return self._out / f"scene-{number}"
+        return self._out / f"scene_{number}"
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -105,10 +127,13 @@ class _Demo:
         yield
         self._seconds[part] = time.monotonic() - began_s
 
-    def _render(self, number: int, seed: int) -> None:
-        self._display.say(f"rendering {self._drive(number)}: {CAMERAS} cameras, {self._units} units")
-        options = ("--cameras", str(CAMERAS), "--units", str(self._units), "--seed", str(seed))
-        _output_of([*_MRASFM, "synth", *options, "--out", str(self._drive(number))])
+    def _render(self) -> None:
+        out = self._out / "drives"
+        self._display.say(
+            f"rendering {DRIVES} drives of one street: {out}, {CAMERAS} cameras, {self._units} units each"
+        )
+        options = ("--drives", str(DRIVES), "--cameras", str(CAMERAS), "--units", str(self._units), "--seed", str(SEED))
+        _output_of([*_MRASFM, "synth", *options, "--out", str(out)])
 
     def _make_key(self) -> str:
         from service.data_folder import write_private_file
@@ -154,22 +179,32 @@ class _Demo:
         return f"See {self._out / 'service.log'} and {self._out / 'service' / 'logs'}."
 
     def _use(self, client: Client) -> None:
-        from service.client import DriveFolder, follow, start_reconstruction, upload_drive
+        from schemas.api.aggregations import AggregationRequest
+        from service.client import DriveFolder, download_map, follow, start_aggregation, upload_drive
 
-        jobs = []
         with self._timed("upload"):
+            drive_ids = []
             for number in self._numbers:
                 self._display.say(f"uploading {self._drive(number)}")
                 sent = upload_drive(client, DriveFolder.read(self._drive(number)), report=self._display.report)
-                jobs.append(start_reconstruction(client, sent.drive_id).id)
-        with self._timed("reconstruct"):
-            for number, job_id in zip(self._numbers, jobs, strict=True):
-                self._display.say(f"reconstructing {self._drive(number)}: {client.url}/v1/jobs/{job_id}")
-                job = follow(client, job_id, tell=self._display.tell)
-                if job.scene_id is None:
-                    why = "" if job.problem is None else f": {job.problem.detail}\n{job.problem.log_tail or ''}"
-                    raise DemoError(f"job {job_id} {job.state}{why}. {self._log()}")
-                self._download(client, number, job.scene_id)
+                drive_ids.append(sent.drive_id)
+        with self._timed("reconstruct and aggregate"):
+            asked = AggregationRequest(drives=drive_ids, name="demo", require_all=True)
+            job = start_aggregation(client, asked)
+            self._display.say(f"making a map of them: {client.url}/v1/jobs/{job.id}")
+            job = follow(client, job.id, tell=self._display.tell)
+        if job.map_id is None or job.map_version is None:
+            why = "" if job.problem is None else f": {job.problem.detail}\n{job.problem.log_tail or ''}"
+            raise DemoError(f"job {job.id} {job.state}{why}. {self._log()}")
+        version = client.map_version(job.map_id, job.map_version)
+        scene_of = {scene.drive_id: scene.scene_id for scene in version.scenes}
+        self._name_of = {scene.drive_id: scene.name for scene in version.scenes}
+        self._drive_ids = drive_ids
+        with self._timed("download"):
+            for number, drive_id in zip(self._numbers, drive_ids, strict=True):
+                self._download(client, number, scene_of[drive_id])
+            self._display.say(f"downloading {self._map}")
+            download_map(client, version, self._map, report=self._display.report)
 
     def _download(self, client: Client, number: int, scene_id: str) -> None:
         from service.client import download_scene
@@ -177,22 +212,28 @@ class _Demo:
         self._display.say(f"downloading {self._scene(number)}")
         download_scene(client, scene_id, self._scene(number), report=self._display.report)
 
-    def _evaluate(self, number: int) -> dict[str, Any]:
-        truth = str(self._drive(number) / "truth.tum")
-        printed = _output_of([*_MRASFM, "evaluate", str(self._scene(number)), "--truth", truth, "--json"])
+    def _evaluate(self, result: Path, *truths: Path | str) -> dict[str, Any]:
+        words = [str(truth) for truth in truths]
+        printed = _output_of([*_MRASFM, "evaluate", str(result), "--truth", *words, "--json"])
         errors: dict[str, Any] = json.loads(printed)
         return errors
 
-    def _print(self, errors: Sequence[dict[str, Any]]) -> None:
-        print("\nTwo drives went in over HTTP, two scenes came out:")
+    def _print(self, errors: Sequence[dict[str, Any]], of_map: dict[str, Any]) -> None:
+        print("\nTwo drives of one street went in over HTTP, two scenes and the map of both came out:")
         for number, error in zip(self._numbers, errors, strict=True):
             print(
                 f"  {self._scene(number)}: {error['registered_images']} of {error['total_images']} images registered, "
                 f"position error {error['metric']['rmse_m']:.3f} m RMS against the truth (bound {MAX_RMSE_M} m)"
             )
+        print(f"  {self._map}: position error {of_map['metric']['rmse_m']:.3f} m RMS (bound {MAX_RMSE_M} m)")
+        for seam in of_map["seams"]:
+            print(
+                f"    seam {seam['a']} - {seam['b']}: {seam['translation_m']:.3f} m and {seam['rotation_deg']:.3f} deg "
+                f"off (bound {MAX_SEAM_M} m)"
+            )
         parts = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self._seconds.items())
         print(f"It took {sum(self._seconds.values()):.0f} s: {parts}.")
-        print("In each scene: points.ply for a viewer, model/ for COLMAP, report.json for the figures.")
+        print("In each: points.ply for a viewer, model/ for COLMAP, report.json for the figures, pictures/ to look at.")
         print("To look at the service itself, start it again with what it has:")
         print(f"  mrasfm standalone --data {self._out / 'service'}")
         print(f"  then http://127.0.0.1:8000/docs, with the key in {self._out / 'api-key'}")

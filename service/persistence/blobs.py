@@ -15,7 +15,18 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.errors import ServiceError
-from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Project, SceneFile, new_id, now_us
+from service.persistence.tables import (
+    Blob,
+    Checkpoint,
+    Drive,
+    DriveFile,
+    MapCheckpoint,
+    MapFile,
+    Project,
+    SceneFile,
+    new_id,
+    now_us,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,13 +158,14 @@ def _take_space(session: Session, project_id: str, size_bytes: int, *, within_qu
     raise quota_full(project, size_bytes)
 
 
-def quota_full(project: Project, size_bytes: int) -> ServiceError:
-    """413: what is to be stored does not fit the project's quota."""
+def quota_full(project: Project, size_bytes: int, *, coming_bytes: int = 0) -> ServiceError:
+    """413: what is to be stored does not fit the project's quota; `coming_bytes` are announced by open uploads."""
+    coming = f", {coming_bytes} are being uploaded" if coming_bytes else ""
     return ServiceError(
         413,
         "quota-full",
         "The project's storage quota is full",
-        f"{size_bytes} bytes do not fit: {project.used_bytes} of {project.max_bytes} bytes are used",
+        f"{size_bytes} bytes do not fit: {project.used_bytes} of {project.max_bytes} bytes are used{coming}",
         remedy="Delete drives or scenes that are not needed any more, or ask the operator for a larger quota.",
     )
 
@@ -165,6 +177,8 @@ def unused() -> ColumnElement[bool]:
         | sql_exists().where(DriveFile.blob_id == Blob.id)
         | sql_exists().where(SceneFile.blob_id == Blob.id)
         | sql_exists().where(Checkpoint.blob_id == Blob.id)
+        | sql_exists().where(MapFile.blob_id == Blob.id)
+        | sql_exists().where(MapCheckpoint.blob_id == Blob.id)
     )
 
 

@@ -148,6 +148,8 @@ def _write_ahead(connection: sqlite3.Connection, patience_s: float) -> None:
 def migrate(settings: Settings) -> None:
     """Bring the database to the newest schema; safe to run by several processes at once and again."""
     database = Database.of(settings)
+    if database.engine.dialect.name == "sqlite":
+        event.listen(database.engine, "connect", _ignore_references)
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     options = {"mrasfm_begin": "IMMEDIATE"}  # the second process waits here until the first is done
@@ -160,6 +162,11 @@ def migrate(settings: Settings) -> None:
             command.upgrade(config, "head")
     finally:
         database.close()
+
+
+def _ignore_references(connection: sqlite3.Connection, record: Any) -> None:
+    """SQLite changes a table by copying it; dropping the old one would else delete all that refers to it."""
+    connection.execute("PRAGMA foreign_keys=OFF")
 
 
 def is_current(database: Database) -> bool:

@@ -17,6 +17,7 @@ from schemas.drive import DriveManifest
 from service.errors import ServiceError
 from service.persistence import blobs, durability, jobs, slots
 from service.persistence.drive_files import MANIFEST_NAME
+from service.persistence.maps import require_unused
 from service.persistence.owned import require
 from service.persistence.storing import StoredFile
 from service.persistence.tables import Blob, Drive, DriveFile, Job, Project, new_id, now_us
@@ -265,7 +266,7 @@ def remove(session: Session, drive: Drive) -> None:
     Raises
     ------
     ServiceError
-        409 where a job needs it.
+        409 where a job or a map needs it.
     """
     active = session.scalars(jobs.active_of_drive(drive.id)).all()
     needing = [job.id for job in active if job.kind != JobKind.PREFLIGHT]
@@ -277,6 +278,7 @@ def remove(session: Session, drive: Drive) -> None:
             f"drive {drive.id} is needed by {len(needing)} jobs: {', '.join(needing[:3])}",
             remedy="Wait for their end, or cancel them.",
         )
+    require_unused(session, what=f"drive {drive.id}", drive_id=drive.id)
     for job in active:
         jobs.request_cancel(session, job.id)
     session.execute(delete(Drive).where(Drive.id == drive.id))

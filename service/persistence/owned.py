@@ -8,12 +8,12 @@ from typing import TypeVar
 from sqlalchemy.orm import Session
 
 from service.errors import not_found
-from service.persistence.tables import Drive, Job, Scene
+from service.persistence.tables import Drive, Job, Map, Scene, Upload
 
-Row = TypeVar("Row", Drive, Job, Scene)
+Row = TypeVar("Row", Drive, Job, Map, Scene, Upload)
 
 _ID = re.compile(r"[a-z]{3}_[0-9a-f]{1,36}")
-_NAMES = {Drive: "drive", Job: "job", Scene: "scene"}
+_NAMES = {Drive: "drive", Job: "job", Map: "map", Scene: "scene", Upload: "upload"}
 
 
 def is_id(text: str) -> bool:

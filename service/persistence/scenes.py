@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 
 from schemas.api.scenes import SceneSummary
 from service.persistence import blobs, jobs
+from service.persistence.checkpoints import settings_sha256
 from service.persistence.storing import StoredFile
 from service.persistence.tables import Drive, Scene, SceneFile, new_id
 
@@ -53,16 +54,18 @@ def publish(
         Where the job is not this holder's any more; the caller's session must roll back.
     """
     scene_id = new_id("scn")
-    jobs.succeed(session, held, scene_id=scene_id, reused=reused)
-    drive = session.get(Drive, held.drive_id)
+    jobs.succeed(session, held, scene_id=scene_id, reused=reused)  # first: it sees whether the job is still held
+    drive_id = held.drive_id or ""
+    drive = session.get(Drive, drive_id)
     session.add(
         Scene(
             id=scene_id,
             project_id=held.project_id,
             job_id=held.job_id,
-            drive_id=held.drive_id,
-            name=held.drive_id if drive is None else drive.name,
+            drive_id=drive_id,
+            name=drive_id if drive is None else drive.name,
             fence=held.fence,
+            settings_sha256=settings_sha256(held.settings),
             summary=summary.model_dump(mode="json"),
             expires_us=expires_us,
         )

@@ -21,7 +21,11 @@ from service.persistence.tables import Job
 from service.settings import Settings
 
 TASK = "mrasfm.run_job"
-QUEUES = {JobKind.PREFLIGHT: "checks", JobKind.RECONSTRUCTION: "reconstructions"}
+QUEUES = {
+    JobKind.PREFLIGHT: "checks",
+    JobKind.RECONSTRUCTION: "reconstructions",
+    JobKind.AGGREGATION: "reconstructions",
+}
 _ANSWER_WITHIN_S = 2
 _SILENT_FOR_S = 3.0  # a broker that did not answer is not asked again for so long: it would hold up every request
 
@@ -100,7 +104,7 @@ class Wakeups:
         """
         try:
             with self._client() as client:
-                queued = [item for queue in QUEUES.values() for item in client.lrange(queue, 0, -1)]
+                queued = [item for queue in set(QUEUES.values()) for item in client.lrange(queue, 0, -1)]
                 delivered = client.hvals("unacked")
         except redis.RedisError as error:
             raise BrokerError(str(error)) from error

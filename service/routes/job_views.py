@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
 from schemas.api.jobs import JobAttempt as AttemptResource
-from schemas.api.jobs import JobProgress, JobResource
+from schemas.api.jobs import JobKind, JobProgress, JobResource
+from schemas.api.jobs import JobMember as MemberResource
 from schemas.api.jobs import JobState as ShownState
-from service.persistence.tables import Job, JobAttempt, JobState, now_us
+from service.persistence import jobs
+from service.persistence.tables import Job, JobAttempt, JobMember, JobState, now_us
 from service.routes.dependencies import moment
 from service.settings import Settings
 
@@ -27,8 +32,25 @@ def etag_of(job: Job, settings: Settings) -> str:
     return f'"{job.revision}-{shown_state(job, settings).lower()}"'
 
 
-def shown(job: Job, attempts: Sequence[JobAttempt], settings: Settings) -> JobResource:
-    """A job as the API shows it."""
+def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list[JobResource]:
+    """Jobs as the API shows them."""
+    attempts: dict[str, list[JobAttempt]] = {}
+    ids = [job.id for job in found]
+    for attempt in session.scalars(select(JobAttempt).where(JobAttempt.job_id.in_(ids)).order_by(JobAttempt.fence)):
+        attempts.setdefault(attempt.job_id, []).append(attempt)
+    trees = [job.id for job in found if job.kind == JobKind.AGGREGATION]
+    members = jobs.members_of(session, trees) if trees else {}
+    return [_shown(job, attempts.get(job.id, ()), members.get(job.id, ()), settings) for job in found]
+
+
+def view_of(session: Session, job: Job, settings: Settings) -> JobResource:
+    """One job as the API shows it."""
+    return views_of(session, [job], settings)[0]
+
+
+def _shown(
+    job: Job, attempts: Sequence[JobAttempt], members: Sequence[tuple[JobMember, Job | None]], settings: Settings
+) -> JobResource:
     return JobResource.model_validate(
         {
             "id": job.id,
@@ -51,6 +73,9 @@ def shown(job: Job, attempts: Sequence[JobAttempt], settings: Settings) -> JobRe
             "heartbeat_at": moment(job.heartbeat_us),
             "problem": job.problem,
             "scene_id": job.scene_id,
+            "map_id": job.map_id,
+            "map_version": job.map_version,
+            "members": [_shown_member(member, child, settings) for member, child in members],
             "retry_of": job.retry_of,
             "created_at": moment(job.created_us),
             "started_at": moment(job.started_us),
@@ -69,5 +94,20 @@ def _shown_attempt(attempt: JobAttempt) -> AttemptResource:
             "finished_at": moment(attempt.finished_us),
             "outcome": attempt.outcome,
             "problem": attempt.problem,
+        }
+    )
+
+
+def _shown_member(member: JobMember, child: Job | None, settings: Settings) -> MemberResource:
+    is_there = member.scene_id is not None
+    return MemberResource.model_validate(
+        {
+            "name": member.name,
+            "drive_id": member.drive_id,
+            "job_id": member.child_id,
+            "state": None if child is None else shown_state(child, settings),
+            "percent": 100.0 if is_there or child is None else child.percent,
+            "scene_id": member.scene_id,
+            "problem": member.problem,
         }
     )

@@ -6,21 +6,22 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select, tuple_
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.jobs import JobResource
+from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
 from service.context import Context
-from service.persistence import jobs
+from service.persistence import aggregations, jobs, trees
 from service.persistence.idempotency import Answer
 from service.persistence.owned import require
-from service.persistence.tables import TERMINAL, Job, JobAttempt, JobEvent, JobState, now_us
+from service.persistence.tables import TERMINAL, Job, JobEvent, JobState, now_us
+from service.routes.aggregations import accepted
 from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, expiry_us, problems
-from service.routes.job_views import RETRY_AFTER_S, etag_of, shown
+from service.routes.job_views import RETRY_AFTER_S, etag_of, view_of, views_of
 from service.routes.paging import cursor_of, position_of
 from service.routes.ranges import none_match
 
@@ -44,10 +45,10 @@ def list_jobs(
         statement = statement.where(tuple_(Job.created_us, Job.id) < after)
     with context.database.read() as session:
         found = session.scalars(statement.order_by(Job.created_us.desc(), Job.id.desc()).limit(limit)).all()
-        attempts = _attempts(session, [job.id for job in found])
+        items = views_of(session, found, context.settings)
     last = found[-1] if len(found) == limit else None
     return Page(
-        items=[shown(job, attempts.get(job.id, []), context.settings) for job in found],
+        items=items,
         next=None if last is None else cursor_of(last.created_us, last.id),
     )
 
@@ -67,7 +68,7 @@ def get_job(
     """One job: poll this every `Retry-After` seconds, with `If-None-Match`, or read its events."""
     with context.database.read() as session:
         job = require(session, Job, caller.project_id, job_id)
-        attempts = _attempts(session, [job_id]).get(job_id, [])
+        shown = view_of(session, job, context.settings)
     etag = etag_of(job, context.settings)
     headers = {"ETag": etag, "Cache-Control": "no-cache"}
     if job.state not in TERMINAL:
@@ -75,20 +76,25 @@ def get_job(
     if none_match(if_none_match, etag):
         return Response(status_code=304, headers=headers)
     response.headers.update(headers)
-    return shown(job, attempts, context.settings)
+    return shown
 
 
 @router.post("/{job_id}:cancel", status_code=202, response_model=JobResource, responses=problems(401, 404, 409, 422))
-def cancel_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
-    """Ask for a job's end. One that waits ends at once; one that runs is told to stop, and killed if it does not."""
+def cancel_job(
+    job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep, background: BackgroundTasks
+) -> Response:
+    """Ask for a job's end. One that waits ends at once; one that runs is told to stop, and killed if it does not.
+
+    With an aggregation, the reconstructions end that were made for it and that nobody else waits for.
+    """
 
     def effect(session: Session) -> Answer:
         require(session, Job, caller.project_id, job_id)
         jobs.request_cancel(session, job_id)
         job = session.get_one(Job, job_id, populate_existing=True)
-        attempts = _attempts(session, [job_id]).get(job_id, [])
-        return answer(202, shown(job, attempts, context.settings), Location=f"/v1/jobs/{job_id}")
+        return answer(202, view_of(session, job, context.settings), Location=f"/v1/jobs/{job_id}")
 
+    background.add_task(trees.end_orphans, context.database)
     return once(effect)
 
 
@@ -100,14 +106,11 @@ def retry_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep
 
     def effect(session: Session) -> Answer:
         expires_us = expiry_us(now_us(), context.settings.job_retention_days)
-        new = jobs.retry(session, require(session, Job, caller.project_id, job_id), expires_us=expires_us)
-        return answer(
-            202,
-            shown(new, [], context.settings),
-            waiting=(new,),
-            Location=f"/v1/jobs/{new.id}",
-            Retry_After=str(RETRY_AFTER_S),
-        )
+        job = require(session, Job, caller.project_id, job_id)
+        if job.kind == JobKind.AGGREGATION:
+            return accepted(session, context, *aggregations.retry(session, job, expires_us=expires_us))
+        new = jobs.retry(session, job, expires_us=expires_us)
+        return accepted(session, context, new, [new])
 
     return once(effect)
 
@@ -144,11 +147,3 @@ def _news(context: Context, job_id: str, last: int) -> tuple[bool, list[JobEvent
         state = session.scalar(select(Job.state).where(Job.id == job_id))
         ended = state is None or JobState(state) in TERMINAL
         return ended, jobs.events_after(session, job_id, last)
-
-
-def _attempts(session: Session, job_ids: list[str]) -> dict[str, list[JobAttempt]]:
-    found: dict[str, list[JobAttempt]] = {}
-    statement = select(JobAttempt).where(JobAttempt.job_id.in_(job_ids)).order_by(JobAttempt.fence)
-    for attempt in session.scalars(statement):
-        found.setdefault(attempt.job_id, []).append(attempt)
-    return found

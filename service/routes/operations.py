@@ -47,9 +47,10 @@ def status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
     with context.database.read() as session:
         workers, queue = _workers(session), _queue(session, context)
     served = {name for worker in workers if worker.online for name in worker.queues}
-    for kind, name in QUEUES.items():
+    for name in dict.fromkeys(QUEUES.values()):
         if name not in served:
-            reasons.append(f"no worker serves the queue {name!r}: jobs of kind {kind} are accepted and wait")
+            kinds = " and ".join(kind for kind, queue in QUEUES.items() if queue == name)
+            reasons.append(f"no worker serves the queue {name!r}: jobs of kind {kinds} are accepted and wait")
     disk = _disk(context)
     if not disk.accepts_uploads:
         reasons.append("the disk is full: uploads are refused with 507")

@@ -14,10 +14,10 @@ from service.errors import ServiceError
 from service.persistence import drives, jobs
 from service.persistence.idempotency import Answer
 from service.persistence.tables import now_us
+from service.routes.aggregations import accepted
 from service.routes.bodies import Body, describe, json_body
-from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us, problems
+from service.routes.dependencies import CallerDep, ContextDep, OnceDep, expiry_us, problems
 from service.routes.drives import rejected
-from service.routes.job_views import RETRY_AFTER_S, shown
 
 router = APIRouter(prefix="/v1/reconstructions", tags=["jobs"])
 
@@ -64,12 +64,6 @@ def create_reconstruction(
             settings=request.settings.model_dump(mode="json", exclude_none=True),
             expires_us=expiry_us(now_us(), context.settings.job_retention_days),
         )
-        return answer(
-            202,
-            shown(job, [], context.settings),
-            waiting=(job,),
-            Location=f"/v1/jobs/{job.id}",
-            Retry_After=str(RETRY_AFTER_S),
-        )
+        return accepted(session, context, job, [job])
 
     return once(effect, body.raw)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
-from fastapi.responses import StreamingResponse
 from sqlalchemy import delete, select, tuple_
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
@@ -15,23 +12,16 @@ from starlette.concurrency import run_in_threadpool
 from schemas.api.resource import Page
 from schemas.api.scenes import SceneFileResource, SceneResource
 from service.context import Context
-from service.errors import not_found, store_unavailable
+from service.errors import not_found
 from service.persistence.collecting import collect_unused
+from service.persistence.maps import require_unused
 from service.persistence.owned import require
 from service.persistence.tables import Blob, Scene, SceneFile
 from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment, problems
+from service.routes.downloads import DOWNLOADS, HEADS, download_name, send_file
 from service.routes.paging import cursor_of, position_of
-from service.routes.ranges import Part, content_disposition, none_match, requested_part
-from service.uploads.digests import format_digest
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
-
-_FILE = {"schema": {"type": "string", "format": "binary"}}
-_DOWNLOADS: dict[int | str, dict[str, Any]] = {
-    200: {"description": "The whole file", "content": {"application/octet-stream": _FILE}},
-    206: {"description": "The range that was asked for", "content": {"application/octet-stream": _FILE}},
-    304: {"description": "The client has this version"},
-}
 
 
 @router.get("", responses=problems(401, 422))
@@ -68,11 +58,12 @@ def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneRes
     return _shown(scene, [_shown_file(file, blob) for file, blob in rows])
 
 
-@router.delete("/{scene_id}", status_code=204, responses=problems(401, 404))
+@router.delete("/{scene_id}", status_code=204, responses=problems(401, 404, 409))
 def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
-    """Delete a scene and its files. Its drive stays."""
+    """Delete a scene and its files. Its drive stays; what a map is made of cannot be deleted."""
     with context.database.write() as session:
-        require(session, Scene, caller.project_id, scene_id)
+        require(session, Scene, caller.project_id, scene_id, lock=True)
+        require_unused(session, what=f"scene {scene_id}", scene_id=scene_id)
         session.execute(delete(Scene).where(Scene.id == scene_id))
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
@@ -81,66 +72,24 @@ def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, backgrou
     "/{scene_id}/files/{path:path}",
     response_class=Response,
     summary="Download's headers",
-    responses={200: {"description": "What a download would answer"}, 304: _DOWNLOADS[304], **problems(401, 404)},
+    responses={**HEADS, **problems(401, 404)},
 )
 @router.get(
     "/{scene_id}/files/{path:path}",
     response_class=Response,
-    responses={**_DOWNLOADS, **problems(401, 404, 416)},
+    responses={**DOWNLOADS, **problems(401, 404, 416)},
 )
 async def download(scene_id: str, path: str, request: Request, caller: CallerDep, context: ContextDep) -> Response:
     """One file of a scene. `Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
     scene, file, blob = await run_in_threadpool(_look_up, context, caller.project_id, scene_id, path)
-    etag = f'"{blob.sha256}"'
-    headers = {
-        "ETag": etag,
-        "Repr-Digest": format_digest(blob.sha256),
-        "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",
-        "Content-Disposition": content_disposition(_download_name(scene, path)),
-        "X-Content-Type-Options": "nosniff",
-    }
-    if none_match(request.headers.get("if-none-match"), etag):
-        return Response(status_code=304, headers=headers)
-    asked = None
-    if request.method == "GET":
-        asked = requested_part(request.headers, size_bytes=blob.size_bytes, etag=etag)
-    part = asked or Part(0, blob.size_bytes)
-    headers["Content-Length"] = str(part.stop - part.start)
-    if asked is not None:
-        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{blob.size_bytes}"
-    if request.method == "HEAD":
-        return Response(headers=headers, media_type=file.media_type)
-    pieces = await _begun(context.artifacts.stream(blob.key, start=part.start, stop=part.stop))
-    return StreamingResponse(
-        pieces, status_code=200 if asked is None else 206, headers=headers, media_type=file.media_type
-    )
-
-
-async def _begun(pieces: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    """The pieces, the first of which is there: once an answer has begun, it cannot become an error any more."""
-    try:
-        first = await anext(pieces, b"")
-    except FileNotFoundError:
-        raise store_unavailable() from None
-
-    async def all_pieces() -> AsyncIterator[bytes]:
-        yield first
-        async for piece in pieces:
-            yield piece
-
-    return all_pieces()
+    name = download_name(scene.name, path)
+    return await send_file(context, request, blob, media_type=file.media_type, name=name)
 
 
 def _look_up(context: Context, project_id: str, scene_id: str, path: str) -> tuple[Scene, SceneFile, Blob]:
     with context.database.read() as session:
         scene = require(session, Scene, project_id, scene_id)
         return scene, *_get_file(session, scene, path)
-
-
-def _download_name(scene: Scene, path: str) -> str:
-    """Says which drive the file is of: a folder of downloads holds many a points.ply."""
-    return f"{scene.name}-{re.sub('/+', '-', path)}"
 
 
 def _get_file(session: Session, scene: Scene, path: str) -> tuple[SceneFile, Blob]:

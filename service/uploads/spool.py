@@ -15,13 +15,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import anyio
 
 from service.errors import ServiceError
 
 Result = TypeVar("Result")
+Written = TypeVar("Written", covariant=True)
 Part = bytes | bytearray | memoryview
 DiskLimiter = asyncio.Semaphore | anyio.CapacityLimiter
 
@@ -87,14 +88,14 @@ class SpoolWriter:
         # whatever file is opened next under the same descriptor.
         self._lock = threading.Lock()
         self.path = folder / (secrets.token_hex(16) + _SUFFIX)
-        with _full_disk_is_507():
+        with full_disk_is_507():
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
             self._descriptor: int | None = os.open(self.path, flags, 0o600)
 
     def write(self, *parts: Part) -> None:
         """Append; nothing happens after `discard`."""
-        with self._lock, _full_disk_is_507():
+        with self._lock, full_disk_is_507():
             if self._descriptor is None:
                 return
             # In one piece: each call to write and hash hands Python's lock over and has to get it back.
@@ -109,7 +110,7 @@ class SpoolWriter:
     def finish(self, *parts: Part) -> Spooled:
         """Append the last bytes. Whoever keeps the file for good sees to it that it survives a power cut."""
         self.write(*parts)
-        with self._lock, _full_disk_is_507():
+        with self._lock, full_disk_is_507():
             self._close()
         return Spooled(self.path, self._size_bytes, self._hash.hexdigest())
 
@@ -186,7 +187,7 @@ async def receive_into(
             raise _too_large(f"{expected_bytes}", max_bytes)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         require_space(folder, expected_bytes, min_free_bytes=min_free_bytes)
-    writer = _BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
+    writer = BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
     try:
         received_bytes = batched_bytes = 0
         batch: list[bytes] = []
@@ -252,23 +253,39 @@ def require_space(folder: Path, size_bytes: int, *, min_free_bytes: int) -> None
         raise _disk_full(f"{free_bytes} bytes are free, {min_free_bytes} must stay free")
 
 
-class _BatchWriter:
+class Writer(Protocol[Written]):
+    """What takes batches, one after the other."""
+
+    def write(self, *parts: Part) -> None:
+        """Append."""
+
+    def finish(self, *parts: Part) -> Written:
+        """Append the last; what was written."""
+
+    def discard(self) -> None:
+        """End it without."""
+
+
+class BatchWriter(Generic[Written]):
     """Writes one batch in a thread while the next one is being received."""
 
-    def __init__(self, writer: SpoolWriter, on_disk: DiskLimiter) -> None:
+    def __init__(self, writer: Writer[Written], on_disk: DiskLimiter) -> None:
         self._writer = writer
         self._on_disk = on_disk
         self._writing: asyncio.Task[None] | None = None
 
     async def write(self, batch: list[bytes]) -> None:
+        """Begin to write a batch, once the one before is written."""
         await self._written()
         self._writing = asyncio.create_task(self._off_the_loop(self._writer.write, batch))
 
-    async def finish(self, batch: list[bytes], keep: Callable[[Spooled], Result]) -> Result:
+    async def finish(self, batch: list[bytes], keep: Callable[[Written], Result]) -> Result:
+        """Write the last batch, and do in the same thread what is to be done with all of it."""
         await self._written()
         return await self._off_the_loop(lambda *parts: keep(self._writer.finish(*parts)), batch)
 
     async def discard(self) -> None:
+        """Write nothing any more."""
         if self._writing is not None:
             self._writing.cancel()
             await asyncio.gather(self._writing, return_exceptions=True)
@@ -285,7 +302,8 @@ class _BatchWriter:
 
 
 @contextmanager
-def _full_disk_is_507() -> Iterator[None]:
+def full_disk_is_507() -> Iterator[None]:
+    """Make a full disk what the client is told."""
     try:
         yield
     except OSError as error:

@@ -5,6 +5,7 @@ Without these no drive would ever be created, and every later request would be a
 
 from __future__ import annotations
 
+import base64
 import zlib
 from typing import Any
 
@@ -19,6 +20,12 @@ _MANIFEST = manifest("fuzzed", frames=1)
 _PATHS = tuple(image["file"] for image in _MANIFEST["frames"][0]["images"].values())
 
 
+@schemathesis.serializer("application/offset+octet-stream")
+def as_it_is(context: Any, value: Any) -> bytes:
+    """The body of a tus client's PATCH."""
+    return value if isinstance(value, bytes) else str(value).encode()
+
+
 @schemathesis.hook
 def before_call(context: Any, case: Any, kwargs: dict[str, Any]) -> None:
     """Make every second valid request to some routes one that can succeed; the others stay as they are."""
@@ -28,6 +35,15 @@ def before_call(context: Any, case: Any, kwargs: dict[str, Any]) -> None:
     if chance % 2:
         return
     label = case.operation.label
+    if "/uploads" in label and "options" not in label.lower():
+        case.headers = {**(case.headers or {}), "Tus-Resumable": "1.0.0"}
+        if label == "POST /v1/drives/{drive_id}/uploads":
+            path = base64.b64encode(_PATHS[chance // 2 % len(_PATHS)].encode()).decode()
+            case.headers |= {"Upload-Length": str(chance // 2 % 1000), "Upload-Metadata": f"path {path}"}
+            case.headers.pop(KEY, None)
+        elif label.startswith("PATCH"):
+            case.headers |= {"Upload-Offset": "0"}
+            case.headers.pop("Upload-Checksum", None)
     if label == "POST /v1/drives" and not isinstance(case.body, NotSet):
         case.body = _MANIFEST
         # A replayed answer may name a drive that was deleted since.

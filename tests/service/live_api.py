@@ -12,18 +12,21 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import httpx
 import uvicorn
 
+from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
 from service.app import create_app
-from service.persistence import blobs, jobs, scenes
+from service.persistence import blobs, drives, jobs, maps, scenes
 from service.persistence.database import Database, migrate
+from service.persistence.durability import secure_drive
 from service.persistence.keys import create_key, create_project
-from service.persistence.storing import store_file
+from service.persistence.storing import StoredFile, store_file
 from service.persistence.tables import Project, new_id
 from service.settings import Settings
 from tests.service.tiny_drive import TinyDrive, tiny_drive
@@ -39,8 +42,9 @@ SUMMARY = SceneSummary(
     points=7,
     georeferenced=False,
     warnings=0,
-    engine_version="0",
+    engine_version=version("mrasfm"),
 )
+MAP_SUMMARY = MapSummary(**SUMMARY.model_dump(), scenes=2, connected=2, seams=1)
 
 
 def settings_of(data_dir: Path, **changed: Any) -> Settings:
@@ -145,6 +149,14 @@ class Client(httpx.Client):
         assert answer.status_code == 200, answer.text
         return drive_id
 
+    def frozen(self, drive: TinyDrive) -> str:
+        """A drive as after its commit, without the check of its manifest: that takes a process."""
+        drive_id, database = self.filled(drive), self.api.database
+        secure_drive(database, self.api.context.artifacts, drive_id)
+        with database.write() as session:
+            drives.commit(session, drives.get(session, self.project_id, drive_id, lock=True), [])
+        return drive_id
+
     def reconstruct(self, drive_id: str, **headers: str) -> dict[str, Any]:
         """Ask for a reconstruction; its job."""
         answer = self.post("/v1/reconstructions", json={"drive_id": drive_id}, headers=headers)
@@ -160,6 +172,25 @@ class Client(httpx.Client):
 
     def publish(self, held: jobs.Claim, files: dict[str, bytes]) -> str:
         """Publish a scene as a worker would; its id."""
+        stored = self._store(files)
+        with self.api.database.write() as session:
+            return scenes.publish(session, held, files=stored, summary=SUMMARY, expires_us=None)
+
+    def aggregate(self, **asked: Any) -> dict[str, Any]:
+        """Ask for a map; its job."""
+        answer = self.post("/v1/aggregations", json=asked)
+        assert answer.status_code == 202, answer.text
+        return dict(answer.json())
+
+    def publish_map(self, held: jobs.Claim, files: dict[str, bytes], *, unconnected: tuple[str, ...] = ()) -> int:
+        """Publish a map's version as a worker would; its number."""
+        stored = self._store(files)
+        with self.api.database.write() as session:
+            return maps.publish(
+                session, held, files=stored, summary=MAP_SUMMARY, unconnected=unconnected, expires_us=None
+            )
+
+    def _store(self, files: dict[str, bytes]) -> dict[str, StoredFile]:
         folder = self.api.settings.spool_dir
         folder.mkdir(parents=True, exist_ok=True)
         artifacts = self.api.context.artifacts
@@ -175,8 +206,7 @@ class Client(httpx.Client):
                 sha256=sha256_of(data),
                 size_bytes=len(data),
             )
-        with self.api.database.write() as session:
-            return scenes.publish(session, held, files=stored, summary=SUMMARY, expires_us=None)
+        return stored
 
     def scene(self, files: dict[str, bytes], drive: TinyDrive | None = None) -> str:
         """Go the whole way to a scene with these files; its id."""

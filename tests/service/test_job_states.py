@@ -27,6 +27,7 @@ from tests.service.live_api import SUMMARY, settings_of
 LEASE_US = 60_000_000
 EXPIRED_US = -1_000_000  # a lease that ends before it begins
 MAX_ATTEMPTS = 3
+_WITH_CLOCKS = ("_ending", "_queue", "_rows")  # of their own, besides the database's
 
 
 def problem(*, retryable: bool) -> Problem:
@@ -299,7 +300,8 @@ def test_machines_whose_clocks_differ(database: Database, job_id: str, monkeypat
         pytest.skip("its users share a machine")
     held = claimed(database, job_id)
     for off_us in (3_600_000_000, -3_600_000_000):
-        monkeypatch.setattr("service.persistence.jobs.now_us", lambda off_us=off_us: now_us() + off_us)
+        for module in _WITH_CLOCKS:
+            monkeypatch.setattr(f"service.persistence.jobs.{module}.now_us", lambda off_us=off_us: now_us() + off_us)
         monkeypatch.setattr("service.persistence.database.now_us", lambda off_us=off_us: now_us() + off_us)
         assert expire(database) == []
         with database.write() as session:
@@ -315,7 +317,8 @@ def test_a_retry_is_due_by_the_database_s_clock(
     if database.engine.dialect.name == "sqlite":
         pytest.skip("its users share a machine")
     held = claimed(database, job_id)
-    monkeypatch.setattr("service.persistence.jobs.now_us", lambda: now_us() + 3_600_000_000)
+    for module in _WITH_CLOCKS:
+        monkeypatch.setattr(f"service.persistence.jobs.{module}.now_us", lambda: now_us() + 3_600_000_000)
     fail(database, held, retryable=True)
     monkeypatch.undo()
     assert claim(database, job_id) is not None

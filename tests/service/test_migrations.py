@@ -8,10 +8,10 @@ from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
-from sqlalchemy import inspect
+from sqlalchemy import inspect, text
 
 from service.persistence.database import MIGRATIONS, Database, is_current, migrate
-from service.persistence.tables import Base
+from service.persistence.tables import Base, Job, JobAttempt, JobEvent, Scene
 from service.settings import Settings
 
 
@@ -45,6 +45,45 @@ def test_migrating_again_and_at_once_changes_nothing(database_settings: Settings
     database = Database.of(database_settings)
     assert differences(database) == []
     database.close()
+
+
+def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
+    """SQLite copies a table to change it: what refers to the old one must not go with it."""
+    database = Database.of(database_settings)
+    _upgrade(database, "0001")
+    with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
+        for statement in _FIRST_RECORDS:
+            connection.execute(text(statement))
+    migrate(database_settings)
+    assert differences(database) == []
+    with database.read() as session:
+        job = session.get_one(Job, "job_1")
+        assert (job.drive_id, job.map_id, job.is_child, job.waiting_for, job.children_percent) == (
+            "drv_1", None, False, 0, 0.0,
+        )  # fmt: skip
+        assert session.query(JobAttempt).count() == 1
+        assert session.query(JobEvent).count() == 1
+        assert session.query(Scene).count() == 0
+    database.close()
+
+
+_FIRST_RECORDS = (
+    "INSERT INTO projects (id, name, used_bytes, max_bytes, max_active_jobs, max_drives, created_us) "
+    "VALUES ('prj_1', 'p', 0, 1, 1, 1, 1)",
+    "INSERT INTO jobs (id, project_id, kind, drive_id, settings, state, revision, attempt, fence, not_before_us, "
+    "percent, reused, created_us) VALUES "
+    "('job_1', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'SUCCEEDED', 1, 1, 1, 0, 100, '[]', 1)",
+    "INSERT INTO job_attempts (job_id, fence, attempt, owner, started_us) VALUES ('job_1', 1, 1, 'w', 1)",
+    "INSERT INTO job_events (job_id, kind, data, created_us) VALUES ('job_1', 'state', '{}', 1)",
+)
+
+
+def _upgrade(database: Database, revision: str) -> None:
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
+        config.attributes["connection"] = connection
+        command.upgrade(config, revision)
 
 
 def test_down_and_up_again(database: Database, database_settings: Settings) -> None:

@@ -21,6 +21,11 @@ RESOURCES = (
     "Problem",
     "ReconstructionRequest",
     "DeclareFiles",
+    "AggregationRequest",
+    "MapResource",
+    "MapVersionResource",
+    "CurrentVersion",
+    "UploadResource",
 )
 
 
@@ -37,7 +42,7 @@ def operations(page: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def test_every_route_is_described(page: dict[str, Any]) -> None:
     names = [operation["operationId"] for _, operation in operations(page)]
-    assert len(names) == len(set(names)) >= 26
+    assert len(names) == len(set(names)) >= 40
     for name, operation in operations(page):
         assert operation["summary"], name
         assert operation["description"], name
@@ -96,6 +101,9 @@ def test_the_example_of_a_manifest_is_accepted(client: Client, page: dict[str, A
         ("/v1/jobs/x:cancel", "POST"),
         ("/v1/drives/x/files/a/b", "PUT, DELETE"),
         ("/v1/scenes/x/files/a/b", "GET, HEAD"),
+        ("/v1/maps/x/versions/1/files/a/b", "GET, HEAD"),
+        ("/v1/maps/x/current-version", "PUT"),
+        ("/v1/drives/x/uploads", "POST, OPTIONS"),
         ("/livez", "GET"),
         ("/docs", "GET, HEAD"),
     ],
@@ -115,6 +123,7 @@ def test_made_up_requests_are_answered_as_documented(api: Api, tmp_path: Path) -
     assert result.passed, result.output
     assert result.requests > 100
     assert result.statuses.get("POST /v1/drives 201"), "the requests get somewhere"
+    assert {case.split()[1] for case in result.statuses} >= {"/v1/aggregations", "/v1/maps/{map_id}"}
 
 
 @pytest.mark.slow

@@ -31,8 +31,8 @@ from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io import (
     export_pictures,
     export_ply,
-    export_scene,
     feature_database,
+    publishing,
 )
 from mrasfm_engine.io.export_calibration import calibration_document
 from mrasfm_engine.io.export_check import check_features
@@ -376,7 +376,7 @@ def test_a_run_that_dies_while_files_move_leaves_no_complete_scene(
 
 def test_leftovers_of_killed_runs_are_cleared(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / ".scene.partial-1-00").mkdir()
-    monkeypatch.setattr(export_scene, "LEFTOVER_AGE_S", -1.0)
+    monkeypatch.setattr(publishing, "LEFTOVER_AGE_S", -1.0)
     write_scene(scene, tmp_path / "scene", {})
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
@@ -385,7 +385,7 @@ def test_too_little_disk_is_said_before_anything_is_written(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(export_scene.shutil, "disk_usage", lambda _: usage(1, 1, 1000))
+    monkeypatch.setattr(publishing.shutil, "disk_usage", lambda _: usage(1, 1, 1000))
     with pytest.raises(StorageError, match=r"scene needs about .* MB free\n  Free space"):
         write_scene(scene, tmp_path / "scene", {})
     assert_nothing_published(tmp_path / "scene")

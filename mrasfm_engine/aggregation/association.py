@@ -1,0 +1,75 @@
+"""Which scenes may see one another: everything by positions, before any image is compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, common_view, nearest_distance_m
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.config import AggregationConfig
+from mrasfm_engine.geometry import se3
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Association:
+    """Scenes as their positions place them."""
+
+    reference: int  # whose frame is the map's
+    map_from_scene: Floats  # (scenes, 4, 4)
+    pairs: tuple[tuple[int, int], ...]  # of scenes that are to be compared, the smaller index first
+
+
+def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Association:
+    """Put scenes into one frame by their positions, and say which are to be compared.
+
+    The reference is the scene whose midpoint is nearest to the geometric centre of all (ties: more units, then the
+    smaller name). Frames of different origins are combined through earth-centred coordinates.
+    """
+    middle = np.stack([se3.apply(s.ecef_from_local, s.midpoint_m[None])[0] for s in scenes])
+    away = np.linalg.norm(middle - middle.mean(0), axis=1)
+    reference = min(
+        range(len(scenes)),
+        key=lambda k: (round(float(away[k]), 2), -int(scenes[k].unit_registered.sum()), scenes[k].name),
+    )
+    map_from_ecef = se3.inverse(scenes[reference].ecef_from_local)
+    map_from_scene = np.stack([_composed(map_from_ecef, s.ecef_from_local) for s in scenes])
+    return Association(
+        reference=reference,
+        map_from_scene=map_from_scene,
+        pairs=tuple(_pairs(scenes, map_from_scene, config)),
+    )
+
+
+def coarse_transform(a: SourceScene, b: SourceScene) -> Floats:
+    """How b lies in a (4, 4) by the positions of both."""
+    return _composed(se3.inverse(a.ecef_from_local), b.ecef_from_local)
+
+
+def _composed(local_from_ecef: Floats, ecef_from_other: Floats) -> Floats:
+    # The difference of the origins first: products with 6.4e6 m would cost precision.
+    rotation = local_from_ecef[:3, :3]
+    origin = -rotation.T @ local_from_ecef[:3, 3]
+    return se3.transform(rotation @ ecef_from_other[:3, :3], rotation @ (ecef_from_other[:3, 3] - origin))
+
+
+def _pairs(scenes: Sequence[SourceScene], map_from_scene: Floats, config: AggregationConfig) -> list[tuple[int, int]]:
+    """Pairs of scenes of which one is among the other's candidates: those whose footprints overlap most."""
+    reach = config.position_error_m + SIGHT_SHIFT_M
+    scores: dict[tuple[int, int], tuple[float, float]] = {}
+    for i, j in combinations(range(len(scenes)), 2):
+        a_from_b = coarse_transform(scenes[i], scenes[j])
+        apart = nearest_distance_m(scenes[i], scenes[j], a_from_b)
+        if apart <= reach:
+            scores[i, j] = (common_view(scenes[i], scenes[j], a_from_b, config), -apart)
+    chosen: set[tuple[int, int]] = set()
+    for k in range(len(scenes)):
+        own = sorted((pair for pair in scores if k in pair), key=lambda pair: scores[pair], reverse=True)
+        chosen.update(own[: config.candidates])
+    return sorted(chosen)

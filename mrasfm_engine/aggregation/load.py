@@ -1,0 +1,307 @@
+"""Reads scenes' folders for aggregation, and refuses what cannot take part before any work."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from mrasfm_engine.aggregation.source import SourceScene, unit_from_images
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.read_model import ModelImage, read_images, read_points
+from mrasfm_engine.scene.drive import matrix_from_pose
+from schemas import Camera, DriveManifest, Pose
+
+Floats = NDArray[np.float64]
+
+SCHEMA_VERSION = 1
+MIN_UNITS = 2
+NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")
+NEEDED = (
+    "report.json", "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply", "features.db",
+    "model/images.bin", "model/points3D.bin",
+)  # fmt: skip
+AGAIN = "Reconstruct the drive again with this version."
+
+
+def name_scenes(scenes: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
+    """Scenes by name: as given, or by their folders' names.
+
+    Raises
+    ------
+    InputError
+        Where a name repeats or is not one that a file can have.
+    """
+    if isinstance(scenes, Mapping):
+        named = [(str(name), Path(folder)) for name, folder in scenes.items()]
+    else:
+        named = [(Path(folder).resolve().name, Path(folder)) for folder in scenes]
+    result: dict[str, Path] = {}
+    for name, folder in named:
+        if not NAME.match(name):
+            raise InputError(
+                f"{name!r} cannot be the name of a scene",
+                remedy="Use letters, digits, '_', '.' and '-': NAME=FOLDER gives a scene another name.",
+                code="bad-scene-name",
+            )
+        if name in result:
+            raise InputError(
+                f"two scenes are called {name!r}: {result[name]} and {folder}",
+                remedy="Give each scene once, or names of their own: NAME=FOLDER.",
+                code="duplicate-scene",
+            )
+        result[name] = folder
+    return result
+
+
+def read_scene(folder: Path, name: str) -> SourceScene:
+    """Read what aggregation needs of a scene's folder.
+
+    Raises
+    ------
+    InputError
+        Where it is no scene, not placed on the earth, of another schema, damaged, or too small.
+    """
+    folder = Path(folder)
+    _require_files(folder, name)
+    manifest = _manifest(folder, name)
+    frame, poses, calibration, report = (
+        _document(folder / f"{part}.json", name) for part in ("frame", "poses", "calibration", "report")
+    )
+    for part, document in (("frame", frame), ("poses", poses), ("calibration", calibration)):
+        if document.get("version") != SCHEMA_VERSION:
+            raise InputError(
+                f"scene {name}: {part}.json is of version {document.get('version')!r}, not of {SCHEMA_VERSION}",
+                remedy=AGAIN,
+                code="scene-version",
+            )
+    ecef_from_local, common_world = _place(frame, manifest, name)
+    with _damaged(folder, name):
+        scene = _arrays(
+            folder,
+            name=name,
+            manifest=_with_refined(manifest, calibration),
+            documents=(frame, poses, calibration, report),
+            place=(ecef_from_local, common_world),
+        )
+    if scene.unit_registered.sum() < MIN_UNITS or not len(scene.points_m):
+        raise InputError(
+            f"scene {name} has {int(scene.unit_registered.sum())} registered units and {len(scene.points_m)} points",
+            remedy="Leave it out, or reconstruct it from more images.",
+            code="empty-scene",
+        )
+    return scene
+
+
+def _require_files(folder: Path, name: str) -> None:
+    if not folder.is_dir():
+        state = "is not a folder" if folder.exists() else "does not exist"
+        raise InputError(
+            f"scene {name}: {folder} {state}",
+            remedy="Give the folder that `mrasfm reconstruct --out` wrote.",
+            code="not-a-scene",
+        )
+    if (folder / "map.json").exists():
+        raise InputError(
+            f"scene {name}: {folder} is a map",
+            remedy="Give the scenes themselves, or add scenes to the map with --into.",
+            code="not-a-scene",
+        )
+    missing = [file for file in NEEDED if not (folder / file).is_file()]
+    if missing == ["manifest.json"]:
+        raise InputError(
+            f"scene {name}: {folder} has no manifest.json, an earlier version of the engine wrote it",
+            remedy=AGAIN,
+            code="scene-version",
+        )
+    if missing:
+        raise InputError(
+            f"scene {name}: {folder} is no complete scene, it has no {missing[0]}",
+            remedy="Give the folder that `mrasfm reconstruct --out` wrote, with all its files.",
+            code="not-a-scene",
+        )
+
+
+@contextmanager
+def _damaged(path: Path, name: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError:
+        raise
+    except (
+        OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, sqlite3.Error, StopIteration
+    ) as error:  # fmt: skip
+        raise InputError(
+            f"scene {name}: {path} is damaged: {type(error).__name__}: {error}",
+            remedy="Copy or download the scene again, or reconstruct the drive again.",
+            code="damaged-scene",
+        ) from error
+
+
+def _document(path: Path, name: str) -> dict[str, Any]:
+    with _damaged(path, name):
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(document, dict):
+            raise ValueError("it holds no JSON object")
+        return document
+
+
+def _manifest(folder: Path, name: str) -> DriveManifest:
+    path = folder / "manifest.json"
+    with _damaged(path, name):
+        try:
+            return DriveManifest.model_validate_json(path.read_bytes())
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def _place(frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[Floats, str | None]:
+    """ecef_from_local and None, or rough_world_from_local and the common world's name."""
+    if frame.get("georeferenced") is True:
+        matrix = frame.get("ecef_from_local")
+    else:
+        rough = manifest.rough_poses
+        world = None if rough is None else rough.common_world
+        if world is None or "rough_world_from_local" not in frame:
+            raise InputError(
+                f"scene {name} is not georeferenced",
+                remedy="Reconstruct the drive with GNSS, or give it rough_poses with a common_world that all drives "
+                "declare.",
+                code="not-georeferenced",
+            )
+        matrix = frame["rough_world_from_local"]
+    with _damaged(Path("frame.json"), name):
+        result = np.array(matrix, dtype=np.float64)
+        rotation = result[:3, :3]
+        if result.shape != (4, 4) or not np.isfinite(result).all() or not np.allclose(rotation @ rotation.T, np.eye(3)):
+            raise ValueError("the frame's transform is not a rigid one")
+    return result, None if frame.get("georeferenced") is True else world
+
+
+def _with_refined(manifest: DriveManifest, calibration: dict[str, Any]) -> DriveManifest:
+    """The manifest with the scene's refined calibration in the place of the given one."""
+
+    def refined(camera: Camera) -> Camera:
+        found = calibration["cameras"][camera.name]["refined"]
+        return camera.model_copy(
+            update={"rig_from_cam": Pose(**found["rig_from_cam"]), "params": [float(v) for v in found["params"]]}
+        )
+
+    with _damaged(Path("calibration.json"), manifest.name):
+        cameras = [refined(camera) for camera in manifest.rig.cameras]
+    return manifest.model_copy(update={"rig": manifest.rig.model_copy(update={"cameras": cameras})})
+
+
+def _arrays(
+    folder: Path,
+    *,
+    name: str,
+    manifest: DriveManifest,
+    documents: tuple[dict[str, Any], ...],
+    place: tuple[Floats, str | None],
+) -> SourceScene:
+    frame, poses, calibration, report = documents
+    units, images = poses["units"], poses["images"]
+    unit_registered = np.array([bool(unit["registered"]) for unit in units])
+    image_registered = np.array([bool(image["registered"]) for image in images])
+    world_from_rig = _poses(units, "world_from_rig")
+    listed = [image.file for frame in manifest.frames for image in frame.images.values()]
+    if len(units) != len(manifest.frames) or sorted(listed) != sorted(image["file"] for image in images):
+        raise ValueError("manifest.json and poses.json speak of different images")
+    sigma = [unit.get("sigma_position_m", [np.nan] * 3) for unit in units]
+    rig_from_cam = {c.name: matrix_from_pose(c.rig_from_cam) for c in manifest.rig.cameras}
+    model = read_images(folder / "model" / "images.bin")
+    points = read_points(folder / "model" / "points3D.bin")
+    first, xy, point, descriptors = _keypoints(folder, model, len(images), len(points.xyz_m))
+    kind = features_kind(report)
+    return SourceScene(
+        name=name,
+        manifest=manifest,
+        calibration=calibration,
+        report={key: report[key] for key in ("engine_version", "drive", "summary") if key in report},
+        features_kind=kind,
+        height_datum=str(frame.get("height_datum", "")),
+        common_world=place[1],
+        ecef_from_local=place[0],
+        unit_registered=unit_registered,
+        world_from_rig=world_from_rig,
+        sigma_position_m=np.array(sigma, dtype=np.float64).reshape(-1, 3),
+        image_registered=image_registered,
+        unit_from_image=unit_from_images(
+            world_from_rig[[image["unit"] for image in images]],
+            _poses(images, "world_from_cam"),
+            np.stack([rig_from_cam[image["camera"]] for image in images]),
+            image_registered,
+        ),
+        points_m=points.xyz_m,
+        point_colors=points.color,
+        point_errors_px=points.error_px,
+        point_classes=_point_classes(folder / "points.ply", len(points.xyz_m)),
+        keypoint_first=first,
+        keypoint_xy_px=xy,
+        keypoint_point=point,
+        descriptors=descriptors if kind.startswith("sift") else descriptors.view(np.float32),
+    )
+
+
+def features_kind(report: dict[str, Any]) -> str:
+    """Which extractor, and which model of it, made a scene's descriptors: others cannot be compared with them."""
+    extractor = report.get("settings", {}).get("features", {}).get("extractor", "sift")
+    model = report.get("models", {}).get("extractor", {}).get("sha256", "")
+    return f"{extractor} {model}".strip()
+
+
+def _poses(entries: Sequence[dict[str, Any]], key: str) -> Floats:
+    result = np.full((len(entries), 4, 4), np.nan)
+    for i, entry in enumerate(entries):
+        if entry["registered"]:
+            result[i] = matrix_from_pose(Pose(**entry[key]))
+    return result
+
+
+def _point_classes(path: Path, count: int) -> NDArray[np.uint8]:
+    types = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii").splitlines()]
+    rows = np.frombuffer(body, dtype=[(line[2], types[line[1]]) for line in lines if line[0] == "property"])
+    if len(rows) != count:
+        raise ValueError(f"points.ply has {len(rows)} points, model/points3D.bin {count}")
+    return np.ascontiguousarray(rows["class"])
+
+
+def _keypoints(
+    folder: Path, model: Mapping[int, ModelImage], images: int, points: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], NDArray[np.uint8]]:
+    """First keypoint of every image, positions, points, and the descriptors of keypoints with a point, as bytes."""
+    counts, xy, point, descriptors = np.zeros(images, dtype=np.int64), [], [], []
+    with closing(sqlite3.connect(f"file:{folder / 'features.db'}?mode=ro&immutable=1", uri=True)) as db:
+        for i in range(images):
+            found = model.get(i)
+            if found is None:
+                continue
+            counts[i] = len(found.xy_px)
+            xy.append(found.xy_px)
+            point.append(found.point)
+            rows, columns, data = db.execute(
+                "SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (i + 1,)
+            ).fetchone()
+            if rows != counts[i]:
+                raise ValueError(
+                    f"features.db has {rows} descriptors of image {i + 1}, the model {counts[i]} keypoints"
+                )
+            table = np.frombuffer(data or b"", np.uint8).reshape(rows, columns)
+            descriptors.append(table[found.point >= 0])
+    flat = np.concatenate(point) if point else np.zeros(0, dtype=np.int64)
+    if len(flat) and (flat.max() >= points or not (flat >= 0).any()):
+        raise ValueError("the model's images and points do not belong together")
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return first, np.concatenate(xy), flat.astype(np.int64), np.concatenate(descriptors)

@@ -1,0 +1,226 @@
+"""What is said and written of a map: `map.json`, pictures of its seams, and findings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.solver import Report
+from mrasfm_engine.aggregation import stages
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.association import Association
+from mrasfm_engine.aggregation.final import FinalResult
+from mrasfm_engine.aggregation.graph import Chain
+from mrasfm_engine.aggregation.map_scene import map_scene
+from mrasfm_engine.aggregation.seam import Seam
+from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.correspondence.plugins import load_plugins
+from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.export_map import MapContent
+from mrasfm_engine.io.export_pictures import png_of
+from mrasfm_engine.io.findings import warning
+
+Floats = NDArray[np.float64]
+
+CONNECTED, BY_POSITIONS = "connected", "placed by positions"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapResult:
+    """All that a map is made of."""
+
+    scenes: Sequence[SourceScene]
+    association: Association
+    found_seams: Sequence[Seam]  # as every pair of scenes by itself says
+    seams: Sequence[Seam]  # without those that contradict others
+    chains: Sequence[Chain]  # of components; the first is the map's
+    map_from_scene: Floats  # (scenes, 4, 4) before units varied on their own
+    chained: Floats  # the same, one scene after the other
+    joint_reports: Sequence[Report]
+    assembly: Assembly
+    final: FinalResult
+
+    @property
+    def unconnected(self) -> list[str]:
+        """Scenes that share nothing with the map's other ones."""
+        connected = set(self.chains[0].scenes) if len(self.chains[0].scenes) > 1 else set()
+        return [scene.name for k, scene in enumerate(self.scenes) if k not in connected]
+
+    def units_of(self, k: int) -> Floats:
+        """Poses (u, 4, 4) of a scene's units in the map; NaN where not registered."""
+        first, stop = self.assembly.first_unit[k : k + 2]
+        poses = self.final.model.state.world_from_rig[first:stop].copy()
+        poses[~self.assembly.registered[first:stop]] = np.nan
+        return poses
+
+
+def say_findings(run: stages.Run, result: MapResult) -> None:
+    """Note scenes that are not connected, and seams that were refused for what they contradict."""
+    names = result.unconnected
+    if len(names) == len(result.scenes):
+        run.found(
+            warning(
+                "nothing-connected",
+                "no two of the scenes see the same: all are placed by positions only",
+                "Give drives whose ways meet, in similar light, or check their positions.",
+            )
+        )
+    elif names:
+        run.found(
+            warning(
+                "unconnected",
+                f"placed by positions only, which may be off by metres: {', '.join(names)}",
+                "Give drives whose ways meet theirs.",
+            )
+        )
+
+
+def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
+    """Everything that is written."""
+    reference = result.scenes[result.association.reference]
+    scene = map_scene(result.assembly, result.final.model, reference)
+    plugins = load_plugins(run.config, None)
+    by_name = {s.name: s for s in result.scenes}
+    return MapContent(
+        scene=scene,
+        scene_of_unit=[result.scenes[k].name for k in result.assembly.scene_of_unit],
+        document=map_document(result),
+        calibrations={s.name: s.calibration for s in result.scenes},
+        pictures=pictures,
+        scenes={s.name: (s.fingerprint, *s.pack()) for s in result.scenes},
+        seams={
+            stages.seam_name(seam.a, seam.b): (
+                stages.seam_key(run.config, plugins, by_name[seam.a], by_name[seam.b]),
+                *seam.pack(),
+            )
+            for seam in result.found_seams
+        },
+    )
+
+
+def map_document(result: MapResult) -> dict[str, Any]:
+    """`map.json`."""
+    scenes = result.scenes
+    return {
+        "version": 1,
+        "reference": scenes[result.association.reference].name,
+        "order": [scenes[k].name for chain in result.chains[:1] for k in chain.scenes],
+        "scenes": [_scene(result, k) for k in range(len(scenes))],
+        "seams": [_seam(result, number) for number in range(len(result.seams))],
+        "unconnected": result.unconnected,
+        "joint": [
+            {"iterations": r.iterations, "observations": r.observations, "termination": str(r.termination)}
+            for r in result.joint_reports
+        ],
+    }
+
+
+def _scene(result: MapResult, k: int) -> dict[str, Any]:
+    scene = result.scenes[k]
+    component = next(n for n, chain in enumerate(result.chains) if k in chain.scenes)
+    positions = result.final.positions.get(k)
+    connected = scene.name not in result.unconnected
+    moved = se3.apply(result.map_from_scene[k], scene.midpoint_m[None])[0]
+    coarse = se3.apply(result.association.map_from_scene[k], scene.midpoint_m[None])[0]
+    return {
+        "name": scene.name,
+        "fingerprint": scene.fingerprint,
+        "drive": scene.manifest.name,
+        "verdict": CONNECTED if connected else BY_POSITIONS,
+        "component": component,
+        "map_from_scene": result.map_from_scene[k],
+        "moved_from_positions_m": float(np.linalg.norm(moved - coarse)),
+        **({} if positions is None else {"positions_bias_m": positions.bias_m}),
+        "registered_units": int(scene.unit_registered.sum()),
+        "total_units": len(scene.unit_registered),
+        "registered_images": int(scene.image_registered.sum()),
+        "total_images": len(scene.image_registered),
+        "points": len(scene.points_m),
+        "height_datum": scene.height_datum,
+        "calibration": f"calibration/{scene.name}.json",
+    }
+
+
+def _seam(result: MapResult, number: int) -> dict[str, Any]:
+    seam = result.seams[number]
+    closing = next((c for chain in result.chains for c in chain.closings if c.seam == number), None)
+    a, b = (next(k for k, s in enumerate(result.scenes) if s.name == name) for name in (seam.a, seam.b))
+    document: dict[str, Any] = {"a": seam.a, "b": seam.b, "accepted": seam.accepted}
+    if seam.reason:
+        document["reason"] = seam.reason
+    document |= {key: value for key, value in seam.quality.items() if np.isfinite(value)}
+    document["coarse_a_from_b"] = seam.coarse_a_from_b
+    if seam.accepted:
+        document |= {
+            "a_from_b": seam.a_from_b,
+            "units_of_a": seam.units_a,
+            "units_of_b": seam.units_b,
+            "in_chain": any(number in chain.seams for chain in result.chains),
+            "adjusted_by_m": _moved(result, seam, a, b, result.map_from_scene),
+        }
+    if closing is not None:
+        document["closes_loop"] = {"shift_m": closing.shift_m, "turn_deg": closing.turn_deg, "seams": closing.length}
+    return document
+
+
+def _moved(result: MapResult, seam: Seam, a: int, b: int, poses: Floats) -> float:
+    """How far, at the seam, the map is from what the seam alone says."""
+    at = seam.place_b_m[None]
+    lies = se3.apply(se3.inverse(poses[a]) @ poses[b], at)
+    return float(np.linalg.norm(lies - se3.apply(seam.a_from_b, at)))
+
+
+def map_pictures(run: stages.Run, result: MapResult) -> dict[str, bytes]:
+    """Pictures of every accepted seam, as positions put its scenes and in the map, as PNG files by name."""
+    started = time.perf_counter()
+    pictures: dict[str, bytes] = {}
+    shown = [seam for seam in result.seams if seam.accepted]
+    for done, seam in enumerate(shown, 1):
+        if run.cancel():
+            raise CancelledError
+        for when, picture in _seam_pictures(result, seam).items():
+            pictures[f"seam-{seam.a}-{seam.b}-{when}.png"] = png_of(picture)
+        run.progress("pictures", done, len(shown))
+    run.ended("pictures", started, pictures=len(pictures))
+    return pictures
+
+
+def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
+    a, b = (next(k for k, s in enumerate(result.scenes) if s.name == name) for name in (seam.a, seam.b))
+    way_a, way_b = (result.units_of(k)[result.scenes[k].unit_registered, :3, 3] for k in (a, b))
+    at_seam = np.concatenate([result.units_of(a)[seam.units_a, :3, 3], result.units_of(b)[seam.units_b, :3, 3]])
+    centre, side = shown_square(at_seam)
+    points_a, points_b = (_points_of(result, k) for k in (a, b))
+    coarse = result.map_from_scene[a] @ seam.coarse_a_from_b
+    scene_b = result.scenes[b]
+    quality = seam.quality
+    before = seam_picture(
+        [f"{seam.a} (orange) and {seam.b} (blue), as their positions put them", "before aggregation: "
+         f"{quality['positions_off_m']:.2f} m off, residual {quality['residual_before_px']:.1f} px"],
+        (points_a, se3.apply(coarse, scene_b.points_m)),
+        (way_a, se3.apply(coarse, scene_b.way_m)),
+        centre,
+        side,
+    )  # fmt: skip
+    after = seam_picture(
+        [f"{seam.a} (orange) and {seam.b} (blue), in the map", f"after: {quality['inliers']} shared points, residual "
+         f"{quality['residual_after_px']:.2f} px"],
+        (points_a, points_b),
+        (way_a, way_b),
+        centre,
+        side,
+    )  # fmt: skip
+    return {"before": before, "after": after}
+
+
+def _points_of(result: MapResult, k: int) -> Floats:
+    first, stop = result.assembly.first_point[k : k + 2]
+    owner = result.final.model.owner[first:stop]
+    return result.final.model.state.points_m[owner[owner >= 0]]

@@ -1,0 +1,112 @@
+"""The map as a scene: one drive of all drives, with a vehicle of its own for each, so that it is written as scenes are.
+
+Cameras and files are called SCENE/NAME; units and images are numbered through, scene by scene.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.final import MapModel
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.geometry import geodesy
+from mrasfm_engine.scene.drive import Drive, matrix_from_pose
+from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
+from mrasfm_engine.scene.semantics import majority_class
+from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
+
+Floats = NDArray[np.float64]
+
+
+def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Scene:
+    """The map's poses, points and observations as a scene, in the frame of the reference."""
+    rows, point, count = model.rows, model.point, len(model.state.points_m)
+    image = assembly.keypoint_image[rows]
+    counts = np.bincount(point, minlength=count).clip(1)
+    source = assembly.keypoint_point[rows]
+    colors = np.concatenate([s.point_colors for s in assembly.scenes]).astype(np.float64)[source]
+    mean_color = np.stack([np.bincount(point, colors[:, k], minlength=count) for k in range(3)], 1)
+    classes = np.concatenate([s.point_classes for s in assembly.scenes])[source]
+    poses = model.state.world_from_rig.copy()
+    poses[~assembly.registered] = np.nan
+    first = np.concatenate(
+        [s.keypoint_first[:-1] + f for s, f in zip(assembly.scenes, assembly.first_keypoint, strict=False)]
+    )
+    return Scene(
+        drive=_joined_drive(assembly),
+        unit_registered=assembly.registered,
+        image_registered=np.concatenate([s.image_registered for s in assembly.scenes]),
+        world_from_rig=poses,
+        sigma_position_m=np.concatenate([s.sigma_position_m for s in assembly.scenes]),
+        calibration=[_calibration(camera) for s in assembly.scenes for camera in s.drive.cameras],
+        points_m=model.state.points_m,
+        point_colors=np.round(mean_color / counts[:, None]).astype(np.uint8),
+        point_error_px=np.bincount(point, model.errors_px, minlength=count) / counts,
+        point_classes=majority_class(classes, point, count),
+        observation_point=point,
+        observation_image=image,
+        observation_keypoint=rows - first[image],
+        features=_features(assembly),
+        pairs=[],
+        georeference=_georeference(assembly, reference) if reference.common_world is None else None,
+        rough_world_from_local=reference.ecef_from_local if reference.common_world is not None else None,
+        unit_from_image=None if assembly.simultaneous else model.state.unit_from_shot,
+        rig_of_camera=np.repeat(np.arange(len(assembly.scenes)), np.diff(assembly.first_camera)),
+    )
+
+
+def _joined_drive(assembly: Assembly) -> Drive:
+    """Not validated: frames of different drives need not be in order of time."""
+    cameras: list[Camera] = []
+    frames: list[Frame] = []
+    for scene in assembly.scenes:
+        cameras += [c.model_copy(update={"name": f"{scene.name}/{c.name}"}) for c in scene.drive.cameras]
+        for frame in scene.manifest.frames:
+            images = {
+                f"{scene.name}/{name}": FrameImage.model_construct(
+                    file=f"{scene.name}/{image.file}", timestamp_us=image.timestamp_us, mask=None
+                )
+                for name, image in frame.images.items()
+            }
+            frames.append(frame.model_copy(update={"images": images}))
+    manifest = DriveManifest.model_construct(
+        name="map", rig=Rig.model_construct(cameras=cameras), frames=frames, notes=[]
+    )
+    return Drive(assembly.scenes[0].drive.root, manifest)
+
+
+def _calibration(camera: Camera) -> CameraCalibration:
+    """As refined in its scene; how well is told by the scene's own document."""
+    unknown = np.full(3, np.nan)
+    return CameraCalibration(
+        rig_from_cam=matrix_from_pose(camera.rig_from_cam),
+        params=np.array(camera.params),
+        sigma_rotation_deg=unknown,
+        sigma_translation_m=unknown,
+        sigma_focal_px=float("nan"),
+        observed=np.zeros(6, dtype=np.bool_),
+    )
+
+
+def _features(assembly: Assembly) -> list[ImageFeatures]:
+    result = []
+    for scene in assembly.scenes:
+        for xy in np.split(scene.keypoint_xy_px, scene.keypoint_first[1:-1]):
+            result.append(
+                ImageFeatures(xy_px=xy, descriptors=np.zeros((0, 128), np.uint8), colors=np.zeros((0, 3), np.uint8))
+            )
+    return result
+
+
+def _georeference(assembly: Assembly, reference: SourceScene) -> Georeference:
+    latitude, longitude, height = geodesy.geodetic_from_ecef(reference.ecef_from_local[:3, 3]).tolist()
+    datums = sorted({scene.height_datum for scene in assembly.scenes})
+    return Georeference(
+        origin_latitude_deg=latitude,
+        origin_longitude_deg=longitude,
+        origin_ellipsoidal_height_m=height,
+        height_datum=", ".join(datums),
+        ecef_from_local=reference.ecef_from_local,
+    )

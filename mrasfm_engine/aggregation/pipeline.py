@@ -1,0 +1,178 @@
+"""From scenes on disk to a map on disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.aggregation import stages
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.association import Association
+from mrasfm_engine.aggregation.final import FinalResult, adjust_map
+from mrasfm_engine.aggregation.graph import Chain, SeamGraph
+from mrasfm_engine.aggregation.joint import adjust_jointly, joined_owner, placed
+from mrasfm_engine.aggregation.load import name_scenes
+from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
+from mrasfm_engine.aggregation.positions import drive_positions
+from mrasfm_engine.aggregation.seam import Seam
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.io.export_map import write_map
+from mrasfm_engine.io.stage_store import StageStore
+
+Floats = NDArray[np.float64]
+
+
+def aggregate(
+    scenes: Mapping[str, Path] | Sequence[Path],
+    out: Path,
+    config: EngineConfig,
+    *,
+    into: Path | None = None,
+    remove: Sequence[str] = (),
+    progress: stages.Progress = lambda stage, done, total: None,
+    cancel: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Put scenes together to a map, and write it into the folder `out`.
+
+    Seams between scenes that have been compared before, by an earlier run in `out` or in the map `into`, are not looked
+    for again.
+
+    Parameters
+    ----------
+    scenes
+        Folders that `mrasfm reconstruct` wrote, by the names that they have in the map; without names by their own.
+    into
+        A map that these scenes are added to. It is only read, and may be `out` itself.
+    remove
+        Names of scenes that the new map does not take over from `into`.
+    progress
+        Called as progress(stage, done, total).
+    cancel
+        Asked now and then; where it answers True the run ends with CancelledError.
+
+    Returns
+    -------
+    dict
+        What `report.json` says.
+
+    Raises
+    ------
+    InputError, StorageError, CancelledError
+        See `errors`. A map that was there is untouched then.
+    """
+    if into is None and remove:
+        raise InputError("--remove needs the map to remove from", remedy="Give --into MAP.", code="no-such-scene")
+    named = name_scenes(scenes)
+    run = stages.Run(config, StageStore(out / ".stages"), into, progress, cancel)
+    run.report["settings"] = config.model_dump(mode="json")
+    found = stages.scenes(run, named, remove)
+    known = stages.association(run, found)
+    seams = stages.seams(run, found, known)
+    graph, chains = _graph(found, known, seams)
+    result = _adjusted(run, found, known, seams, graph, chains)
+    say_findings(run, result)
+    pictures = map_pictures(run, result) if config.output.pictures else {}
+    if cancel():
+        raise CancelledError
+    return write_map(map_content(run, result, pictures), out, run.report)
+
+
+def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Seam]) -> tuple[SeamGraph, list[Chain]]:
+    """Seams without contradictions, and the chain of every component; that of the reference comes first."""
+    graph = SeamGraph([scene.name for scene in found], seams)
+    done: set[int] = set()
+    chains: list[Chain] = []
+    # The reference's component first, then the larger ones.
+    starts = [known.reference, *(c[0] for c in graph.components())]
+    for start in [*starts, *range(len(found))]:
+        if start in done:
+            continue
+        graph, chain = graph.without_contradictions(start)
+        chains.append(chain)
+        done.update(chain.scenes)
+    return graph, chains
+
+
+def _adjusted(
+    run: stages.Run,
+    found: Sequence[SourceScene],
+    known: Association,
+    seams: Sequence[Seam],
+    graph: SeamGraph,
+    chains: Sequence[Chain],
+) -> MapResult:
+    started = time.perf_counter()
+    poses, chained = known.map_from_scene.copy(), known.map_from_scene.copy()
+    middle = np.stack([scene.midpoint_m for scene in found])
+    reports = []
+    for chain in chains:
+        if len(chain.scenes) < 2:
+            continue
+        members = sorted(chain.scenes)
+        balanced = graph.balanced(chain) if run.config.aggregation.joint else chain.first_from_scene
+        assembly = Assembly(scenes=[found[k] for k in members])
+        joint = adjust_jointly(
+            assembly,
+            np.stack([balanced[k] for k in members]),
+            _seams_among(graph, found, members),
+            members.index(chain.scenes[0]),
+            run.config,
+            cancel=run.cancel,
+        )
+        own = dict(zip(members, joint.first_from_scene, strict=True))
+        map_from_first = placed(own, known.map_from_scene, middle)
+        poses[members] = map_from_first @ joint.first_from_scene
+        chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
+        reports.append(joint.report)
+    run.ended("joint", started, loops=sum(len(chain.closings) for chain in chains))
+    final = _final(run, found, known, graph, poses)
+    return MapResult(
+        scenes=found,
+        association=known,
+        found_seams=seams,
+        seams=graph.seams,
+        chains=chains,
+        map_from_scene=poses,
+        chained=chained,
+        joint_reports=[r for r in reports if r is not None],
+        assembly=Assembly(scenes=found),
+        final=final,
+    )
+
+
+def _seams_among(graph: SeamGraph, found: Sequence[SourceScene], members: Sequence[int]) -> list[Seam]:
+    names = {found[k].name for k in members}
+    return [seam for seam in graph.seams if seam.accepted and {seam.a, seam.b} <= names]
+
+
+def _final(
+    run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
+) -> FinalResult:
+    started = time.perf_counter()
+    assembly = Assembly(scenes=found)
+    positions = {
+        k: p
+        for k, scene in enumerate(found)
+        if (p := drive_positions(scene, known.map_from_scene[k], int(assembly.first_unit[k]), run.config.gnss))
+        is not None
+    }
+    owner = joined_owner(assembly, _seams_among(graph, found, range(len(found))))
+    final = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
+    run.ended(
+        "adjustment",
+        started,
+        free_units=final.free_units,
+        iterations=[r.iterations for r in final.reports],
+        points=len(final.model.state.points_m),
+        joined_points=int(final.model.joined.sum()),
+        observations_dropped=final.dropped_observations,
+        points_dropped=final.dropped_points,
+    )
+    return final

@@ -1,0 +1,79 @@
+"""What a drive's receiver says in the map's frame, and by how much all of it is off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.priors import PositionPrior
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.config import GnssConfig
+from mrasfm_engine.correspondence.prior_trajectory import prior_trajectory
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.averaging import geometric_median
+from mrasfm_engine.scene.state import State
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MIN_POSITIONS = 3
+USUAL_LENGTH = 1.54  # median length of a standard normal 3-vector
+ROUGH_CORRELATION = 4.0  # neighbouring rough poses share most of their error
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrivePositions:
+    """Measured positions of one drive in the map's frame, with the constant error that is taken from them."""
+
+    prior: PositionPrior  # units as the assembly numbers them; positions with the bias taken off
+    bias_m: Floats  # (3,) measured minus adjusted
+
+
+def drive_positions(
+    scene: SourceScene, map_from_scene: Floats, first_unit: int, config: GnssConfig
+) -> DrivePositions | None:
+    """The positions of a drive as a prior of its units; None where there are too few.
+
+    Parameters
+    ----------
+    map_from_scene
+        By positions alone (4, 4): the scene's frame is the one in which its receiver's positions are.
+    """
+    known = prior_trajectory(scene.drive, config, use_gnss=scene.common_world is None)
+    if known.gnss is not None and known.antenna_in_rig_m is not None and known.georeference is not None:
+        # The prior's frame is the scene's: both have their origin in the middle of the track.
+        scene_from_track = se3.inverse(scene.ecef_from_local) @ known.georeference.ecef_from_local
+        measured, sigma = known.gnss.at(scene.drive.timestamps_us, max_gap_us=round(config.max_time_gap_s * 1e6))
+        lever = np.asarray(known.antenna_in_rig_m)
+        measured = se3.apply(map_from_scene @ scene_from_track, measured)
+        step_s = float(np.median(np.diff(scene.drive.timestamps_us))) / 1e6 if len(measured) > 1 else np.inf
+        correlated = max(1.0, config.correlation_time_s / max(step_s, 1e-6))
+    elif known.rough_world_from_rig is not None and scene.manifest.rough_poses is not None:
+        measured = se3.apply(map_from_scene, known.rough_world_from_rig[:, :3, 3])
+        sigma = np.full(measured.shape, scene.manifest.rough_poses.sigma_translation_m)
+        lever, correlated = np.zeros(3), ROUGH_CORRELATION
+    else:
+        return None
+    units = np.flatnonzero(scene.unit_registered & np.isfinite(measured).all(axis=1))
+    if len(units) < MIN_POSITIONS:
+        return None
+    prior = PositionPrior(
+        unit=units + first_unit,
+        position_m=measured[units],
+        sigma_m=sigma[units] * np.sqrt(correlated),
+        lever_arm_m=lever,
+    )
+    return DrivePositions(prior=prior, bias_m=np.zeros(3))
+
+
+def with_bias(positions: DrivePositions, state: State) -> DrivePositions:
+    """The positions with their constant error estimated anew from where the drive's units are."""
+    prior = positions.prior
+    measured = prior.position_m + positions.bias_m
+    antenna = state.unit_position_m[prior.unit] + state.unit_rotation[prior.unit] @ prior.lever_arm_m
+    bias = geometric_median(measured - antenna)
+    whitened = np.linalg.norm((measured - bias - antenna) / prior.sigma_m, axis=1)
+    factor = max(1.0, float(np.median(whitened)) / USUAL_LENGTH)
+    return DrivePositions(prior=replace(prior, position_m=measured - bias, sigma_m=prior.sigma_m * factor), bias_m=bias)

@@ -1,0 +1,305 @@
+"""A seam: two scenes that see the same, how they lie to one another, and how good that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.consensus import Consensus, Relocaliser, Sightings, sightings
+from mrasfm_engine.aggregation.fine import (
+    FineResult,
+    Shared,
+    adjust_transform,
+    errors_focal,
+    matches_fit,
+    merge_points,
+    scale_ratio,
+)
+from mrasfm_engine.aggregation.matching import CrossMatcher, CrossMatches
+from mrasfm_engine.aggregation.pairs import guided_pairs, probes
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.correspondence.matching import Matcher
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.stage_store import Arrays
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+BATCH_UNITS = 4  # that are looked for before it is asked whether they agree
+ENOUGH_AGREEING = 4  # units, after which no more are looked for
+ROUNDS = ((0.012, 0.006), (0.005, 0.004))  # how far matches and merges may be off, shares of the focal length
+MAX_SHIFT_M, MAX_TURN_DEG = 0.5, 1.0  # by which the fine assembly may correct the consensus
+MIN_POINTS_OF_UNIT = 5  # shared points that a unit sees, for it to be part of the seam
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seam:
+    """Two scenes a and b, by their names; without `accepted` they are not connected, and the reason says why."""
+
+    a: str
+    b: str
+    accepted: bool
+    reason: str
+    coarse_a_from_b: Floats  # (4, 4) by positions
+    a_from_b: Floats  # (4, 4); the coarse one where nothing better is known
+    covariance: Floats  # (6, 6) of [omega, v] about the middle of b's units at the seam, in a's axes
+    shared: Ints  # (n, 2) points of a and of b that are one
+    units_a: Ints  # that see shared points
+    units_b: Ints
+    place_b_m: Floats  # (3,) the middle of b's units there, in b's frame
+    quality: dict[str, Any] = field(default_factory=dict)
+
+    def pack(self) -> tuple[Arrays, dict[str, Any]]:
+        """As a finished stage keeps it; names are not part of it."""
+        arrays = {
+            name: getattr(self, name)
+            for name in ("coarse_a_from_b", "a_from_b", "covariance", "shared", "units_a", "units_b", "place_b_m")
+        }
+        return arrays, {"accepted": self.accepted, "reason": self.reason, "quality": self.quality}
+
+    @staticmethod
+    def unpack(a: str, b: str, arrays: Arrays, documents: dict[str, Any]) -> Seam:
+        """What `pack` packed, of scenes with these names."""
+        return Seam(
+            a=a, b=b, accepted=documents["accepted"], reason=documents["reason"], quality=documents["quality"], **arrays
+        )
+
+
+def find_seam(
+    a: SourceScene,
+    b: SourceScene,
+    coarse_a_from_b: Floats,
+    matcher: Matcher,
+    config: EngineConfig,
+    *,
+    cancel: Callable[[], bool],
+    progress: Callable[[int, int], None],
+) -> Seam:
+    """Look for how two scenes lie to one another, from where their positions put them.
+
+    Returns
+    -------
+    Seam
+        Not accepted where they share too little, or what they share does not agree.
+    """
+    cross = CrossMatcher(a, b, matcher, config.matching, threads=config.threads)
+    found, asked = _relocalise(a, b, coarse_a_from_b, cross, config, cancel=cancel, progress=progress)
+    quality: dict[str, Any] = {
+        "units_asked": found.units_asked,
+        "units_agreeing": len(found.units_agreeing),
+        "units_elsewhere": found.runner_up,
+        "units_looked_for": asked,
+    }
+    if found.a_from_b is None:
+        quality["pairs_compared"] = cross.compared
+        return _unconnected(a, b, coarse_a_from_b, found.reason, quality)
+    assembly = Assembly(scenes=(a, b))
+    fine = _assemble(assembly, found.a_from_b, cross, config, cancel=cancel, progress=progress)
+    quality["pairs_compared"] = cross.compared
+    if fine is None:
+        return _unconnected(a, b, coarse_a_from_b, "too few points of both scenes fit together", quality)
+    return _judged(assembly, coarse_a_from_b, found, fine, quality, config)
+
+
+def _relocalise(
+    a: SourceScene,
+    b: SourceScene,
+    coarse: Floats,
+    cross: CrossMatcher,
+    config: EngineConfig,
+    *,
+    cancel: Callable[[], bool],
+    progress: Callable[[int, int], None],
+) -> tuple[Consensus, int]:
+    """Look for units of b in a, a few at a time, until enough agree; and how many were looked for."""
+    wanted = probes(a, b, coarse, config.aggregation)
+    relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
+    image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
+    parts: list[CrossMatches] = []
+    found = Consensus(
+        a_from_b=None, reason="their views do not overlap", units_asked=0, units_agreeing=(), runner_up=0, inliers=0
+    )
+    # From the start and from the middle at once, so that the first units are not all at one place.
+    order = [wanted[i] for k in range(BATCH_UNITS) for i in range(k, len(wanted), BATCH_UNITS)]
+    for start in range(0, len(order), BATCH_UNITS):
+        batch = order[start : start + BATCH_UNITS]
+        pairs = np.concatenate([probe.pairs for probe in batch])
+        parts += cross.match(pairs, verified=True, cancel=cancel)
+        progress(min(start + BATCH_UNITS, len(order)), len(order))
+        matches = CrossMatches.joined(parts)
+        seen: Sightings = sightings(a, b, matches.a, matches.b, image_of_b)
+        found = relocaliser.consensus(seen)
+        if found.a_from_b is not None and len(found.units_agreeing) >= ENOUGH_AGREEING and not found.runner_up:
+            return found, start + len(batch)
+    return found, len(order)
+
+
+def _assemble(
+    assembly: Assembly,
+    a_from_b: Floats,
+    cross: CrossMatcher,
+    config: EngineConfig,
+    *,
+    cancel: Callable[[], bool],
+    progress: Callable[[int, int], None],
+) -> FineResult | None:
+    """Match, merge and adjust in turns, each time from the better transform."""
+    a, b = assembly.scenes
+    fine: FineResult | None = None
+    for match_error, _ in ROUNDS:
+        pairs = guided_pairs(a, b, a_from_b, config.aggregation)
+        if not len(pairs):
+            return None
+        matches = CrossMatches.joined(cross.match(pairs, verified=False, cancel=cancel, progress=progress))
+        state = assembly.state(np.stack([np.eye(4), a_from_b]))
+        shared = merge_points(assembly, matches, matches_fit(assembly, state, matches, match_error))
+        if len(shared) < 3:
+            return None
+        fine = adjust_transform(assembly, a_from_b, shared, config, cancel=cancel)
+        if len(fine.shared) < 3:
+            return None
+        a_from_b = fine.a_from_b
+    return fine
+
+
+def _judged(
+    assembly: Assembly,
+    coarse: Floats,
+    found: Consensus,
+    fine: FineResult,
+    quality: dict[str, Any],
+    config: EngineConfig,
+) -> Seam:
+    a, b = assembly.scenes
+    settings = config.aggregation
+    units_a, units_b = (_units_at(assembly, fine.shared, side) for side in (0, 1))
+    scale, sigma_scale = scale_ratio(assembly, fine.a_from_b, fine.shared)
+    at = b.world_from_rig[units_b if len(units_b) else np.flatnonzero(b.unit_registered)].mean(0)[:3, 3]
+    covariance = _about(fine.covariance, b, fine.a_from_b, at)
+    shift = float(np.linalg.norm(se3.apply(fine.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
+    turn = float(se3.rotation_angle_deg(fine.a_from_b[:3, :3] @ coarse[:3, :3].T))
+    before = _residual_px(assembly, coarse, fine.shared)
+    quality |= {
+        "units_a": len(units_a),
+        "units_b": len(units_b),
+        "inliers": len(fine.shared),
+        "observations": len(fine.errors_px),
+        "residual_before_px": before,
+        "residual_after_px": float(np.median(fine.errors_px)),
+        "sigma_translation_m": float(np.sqrt(np.trace(covariance[3:, 3:]))),
+        "sigma_rotation_deg": float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
+        "scale": scale,
+        "sigma_scale": sigma_scale,
+        "positions_off_m": shift,
+        "positions_off_deg": turn,
+    }
+    assert found.a_from_b is not None
+    reason = _why_not(found, fine, at, quality, settings.consensus, config)
+    return Seam(
+        a=a.name,
+        b=b.name,
+        accepted=not reason,
+        reason=reason,
+        coarse_a_from_b=coarse,
+        a_from_b=fine.a_from_b,
+        covariance=covariance,
+        shared=fine.shared.pairs - [0, assembly.first_point[1]],
+        units_a=units_a,
+        units_b=units_b,
+        place_b_m=at,
+        quality=quality,
+    )
+
+
+def _why_not(
+    found: Consensus,
+    fine: FineResult,
+    at: Floats,
+    quality: dict[str, Any],
+    strict: bool,
+    config: EngineConfig,
+) -> str:
+    """Why a seam cannot be trusted; empty where it can."""
+    settings = config.aggregation
+    if quality["inliers"] < settings.min_inliers:
+        return f"only {quality['inliers']} points are shared, {settings.min_inliers} are needed"
+    if not strict:
+        return ""
+    assert found.a_from_b is not None
+    least = min(quality["units_a"], quality["units_b"])
+    if least < settings.min_units:
+        return f"only {least} units of a scene see what is shared, {settings.min_units} are needed"
+    shift = float(np.linalg.norm(se3.apply(fine.a_from_b, at[None])[0] - se3.apply(found.a_from_b, at[None])[0]))
+    turn = float(se3.rotation_angle_deg(fine.a_from_b[:3, :3] @ found.a_from_b[:3, :3].T))
+    if shift > MAX_SHIFT_M or turn > MAX_TURN_DEG:
+        return f"what is shared contradicts the units that agree, by {shift:.2f} m and {turn:.2f} deg"
+    off, unsure = abs(quality["scale"] - 1.0), 3.0 * quality["sigma_scale"]
+    if off > settings.max_scale_error + unsure:
+        return f"lengths of the scenes differ by {100 * off:.1f} %"
+    if quality["positions_off_m"] > settings.position_error_m:
+        return (
+            f"the scenes' positions contradict it by {quality['positions_off_m']:.1f} m, more than "
+            f"aggregation.position_error_m"
+        )
+    return ""
+
+
+def _units_at(assembly: Assembly, shared: Shared, side: int) -> Ints:
+    """Units of one scene that see enough of what is shared."""
+    scene = assembly.scenes[side]
+    points = shared.pairs[:, side] - assembly.first_point[side]
+    is_shared = np.zeros(len(scene.points_m) + 1, dtype=np.bool_)
+    is_shared[points] = True
+    rows = np.flatnonzero(is_shared[scene.keypoint_point])
+    image = np.searchsorted(scene.keypoint_first, rows, side="right") - 1
+    counts = np.bincount(scene.image_unit[image], minlength=len(scene.unit_registered))
+    return np.flatnonzero(counts >= MIN_POINTS_OF_UNIT)
+
+
+def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -> Floats:
+    """The covariance of a step about b's mean place as one about another place of b."""
+    pivot = se3.apply(a_from_b, b.way_m.mean(0)[None])[0]
+    arm = se3.apply(a_from_b, at_b[None])[0] - pivot
+    change = np.eye(6)
+    change[3:, :3] = -se3.skew(arm)
+    result: Floats = change @ covariance @ change.T
+    return result
+
+
+def _residual_px(assembly: Assembly, a_from_b: Floats, shared: Shared) -> float:
+    """Median reprojection error of scene b's shared points in scene a's images if the scenes lie so."""
+    a = assembly.scenes[0]
+    state = assembly.state(np.stack([np.eye(4), a_from_b]))
+    partner = np.full(len(a.points_m), -1, dtype=np.int64)
+    partner[shared.pairs[:, 0]] = shared.pairs[:, 1]
+    rows = np.flatnonzero(a.keypoint_point >= 0)
+    rows = rows[partner[a.keypoint_point[rows]] >= 0]
+    off = errors_focal(assembly, state, rows, state.points_m[partner[a.keypoint_point[rows]]])
+    camera = assembly.image_camera[assembly.keypoint_image[rows]]
+    off_px = off * state.camera_params[camera, :2].mean(1)
+    finite = off_px[np.isfinite(off_px)]
+    return float(np.median(finite)) if len(finite) else float(max(a.drive.cameras[0].width, a.drive.cameras[0].height))
+
+
+def _unconnected(a: SourceScene, b: SourceScene, coarse: Floats, reason: str, quality: dict[str, Any]) -> Seam:
+    none = np.zeros(0, dtype=np.int64)
+    return Seam(
+        a=a.name,
+        b=b.name,
+        accepted=False,
+        reason=reason,
+        coarse_a_from_b=coarse,
+        a_from_b=coarse,
+        covariance=np.full((6, 6), np.inf),
+        shared=np.zeros((0, 2), dtype=np.int64),
+        units_a=none,
+        units_b=none,
+        place_b_m=b.midpoint_m,
+        quality=quality,
+    )

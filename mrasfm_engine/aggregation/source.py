@@ -1,0 +1,148 @@
+"""A scene as aggregation needs it: poses, calibration, points, keypoints and descriptors, in a few arrays.
+
+Everything comes from the folder that `mrasfm reconstruct` wrote, without its images and its finished stages.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.stage_store import Arrays
+from mrasfm_engine.scene.drive import Drive
+from schemas import DriveManifest
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+ARRAYS = (
+    "unit_registered", "world_from_rig", "sigma_position_m", "image_registered", "unit_from_image",
+    "points_m", "point_colors", "point_errors_px", "point_classes",
+    "keypoint_first", "keypoint_xy_px", "keypoint_point", "descriptors", "ecef_from_local",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceScene:
+    """One scene in its own local frame. Its drive's manifest has the refined calibration."""
+
+    name: str
+    manifest: DriveManifest
+    calibration: dict[str, Any]  # calibration.json
+    report: dict[str, Any]  # what the scene's report says that a map repeats
+    features_kind: str  # which extractor, and model, made the descriptors
+    height_datum: str  # as declared; heights here are ellipsoidal
+    common_world: str | None  # of rough poses, where the scene is not georeferenced
+    ecef_from_local: Floats  # (4, 4); where not georeferenced, rough_world_from_local
+    unit_registered: Bools  # (u,)
+    world_from_rig: Floats  # (u, 4, 4), NaN where not registered
+    sigma_position_m: Floats  # (u, 3), NaN where not known
+    image_registered: Bools  # (i,)
+    unit_from_image: Floats  # (i, 4, 4), or (0, 4, 4) where all images are at their unit's time
+    points_m: Floats  # (p, 3)
+    point_colors: NDArray[np.uint8]  # (p, 3)
+    point_errors_px: Floats  # (p,)
+    point_classes: NDArray[np.uint8]  # (p,)
+    keypoint_first: Ints  # (i + 1,)
+    keypoint_xy_px: NDArray[np.float32]  # (n, 2)
+    keypoint_point: Ints  # (n,) -1 for none
+    descriptors: NDArray[Any]  # (m, D) of the keypoints that observe a point, in their order
+    footprints: dict[float, Floats] = field(default_factory=dict, repr=False, compare=False)  # by depth; see footprint
+
+    @cached_property
+    def drive(self) -> Drive:
+        """The drive, with the refined calibration. Its images need not exist."""
+        return Drive(Path(), self.manifest)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 over all that aggregation sees of the scene; the name is not part of it."""
+        digest = hashlib.sha256(json.dumps(self._documents(), sort_keys=True).encode())
+        for name in ARRAYS:
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        return digest.hexdigest()
+
+    @cached_property
+    def image_unit(self) -> Ints:
+        """(i,)."""
+        return np.array([image.unit for image in self.drive.images], dtype=np.int64)
+
+    @cached_property
+    def image_camera(self) -> Ints:
+        """(i,)."""
+        return np.array([image.camera for image in self.drive.images], dtype=np.int64)
+
+    @cached_property
+    def world_from_cam(self) -> Floats:
+        """Poses (i, 4, 4) of all images in the scene's frame; NaN where not registered."""
+        poses = self.world_from_rig[self.image_unit]
+        if len(self.unit_from_image):
+            poses = poses @ self.unit_from_image
+        result: Floats = poses @ self.drive.rig_from_cam[self.image_camera]
+        result[~self.image_registered] = np.nan
+        return result
+
+    @cached_property
+    def descriptor_row(self) -> Ints:
+        """Where the descriptor of a keypoint (n,) is, -1 for none."""
+        known = self.keypoint_point >= 0
+        return np.where(known, np.cumsum(known) - 1, -1)
+
+    @cached_property
+    def way_m(self) -> Floats:
+        """Positions (r, 3) of the registered units in the scene's frame."""
+        return self.world_from_rig[self.unit_registered, :3, 3]
+
+    @property
+    def midpoint_m(self) -> Floats:
+        """The middle of the trajectory (3,): half of the way along it."""
+        way = self.way_m
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        half = 0.5 * length[-1]
+        return np.array([np.interp(half, length, way[:, k]) for k in range(3)])
+
+    def keypoints_with_points(self, image: int) -> Ints:
+        """Keypoints (rows of the whole scene) of an image that observe a point."""
+        rows = np.arange(self.keypoint_first[image], self.keypoint_first[image + 1])
+        return rows[self.keypoint_point[rows] >= 0]
+
+    def _documents(self) -> dict[str, Any]:
+        return {
+            "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
+            "calibration": self.calibration,
+            "report": self.report,
+            "features_kind": self.features_kind,
+            "height_datum": self.height_datum,
+            "common_world": self.common_world,
+        }
+
+    def pack(self) -> tuple[Arrays, dict[str, Any]]:
+        """As a finished stage keeps it; see `unpack`."""
+        return {name: getattr(self, name) for name in ARRAYS}, self._documents()
+
+    @staticmethod
+    def unpack(name: str, arrays: Arrays, documents: dict[str, Any]) -> SourceScene:
+        """What `pack` packed, under a name."""
+        known = {field.name for field in fields(SourceScene)}
+        rest = {key: value for key, value in documents.items() if key in known and key != "manifest"}
+        manifest = DriveManifest.model_validate(documents["manifest"])
+        everything: dict[str, Any] = {**rest, **arrays}
+        return SourceScene(name=name, manifest=manifest, **everything)
+
+
+def unit_from_images(world_from_rig: Floats, world_from_cam: Floats, rig_from_cam: Floats, registered: Bools) -> Floats:
+    """Poses (i, 4, 4) of the rig at the images' times relative to their units'; (0, 4, 4) where they are the same."""
+    result = np.tile(np.eye(4), (len(world_from_cam), 1, 1))
+    rows = np.flatnonzero(registered)
+    result[rows] = se3.inverse(world_from_rig[rows]) @ world_from_cam[rows] @ se3.inverse(rig_from_cam[rows])
+    apart = np.abs(result - np.eye(4)).max(initial=0.0)
+    return result if apart > 1e-6 else np.zeros((0, 4, 4))

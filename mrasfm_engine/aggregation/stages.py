@@ -1,0 +1,261 @@
+"""The stages of an aggregation. What takes long, seams, is kept by what it depends on and not done again."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine import __version__
+from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
+from mrasfm_engine.aggregation.load import read_scene
+from mrasfm_engine.aggregation.seam import Seam, find_seam
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.correspondence.plugins import Plugins, load_plugins
+from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.io.export_map import SCENES_FOLDER, SEAMS_FOLDER
+from mrasfm_engine.io.findings import Finding, as_json, warning
+from mrasfm_engine.io.read_map import MAP_FILE
+from mrasfm_engine.io.stage_store import StageStore, code_version, fingerprint
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+FAR_APART_M = 50_000.0
+MIN_SCENES = 2
+
+
+@dataclass
+class Run:
+    """One aggregation under way."""
+
+    config: EngineConfig
+    store: StageStore  # finished stages of this folder
+    into: Path | None  # the map that is extended
+    progress: Progress
+    cancel: Callable[[], bool]
+    report: dict[str, Any] = field(
+        default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": []}
+    )
+
+    def step(self, stage: str) -> Callable[[int, int], None]:
+        """The progress callback of a stage."""
+        return lambda done, total: self.progress(stage, done, total)
+
+    def ended(self, stage: str, started_s: float, **figures: Any) -> None:
+        """Note a stage in the report."""
+        seconds = round(time.perf_counter() - started_s, 3)
+        self.report["stages"].append({"stage": stage, "seconds": seconds, "reused": False, **figures})
+        self.progress(stage, 1, 1)
+        if self.cancel():
+            raise CancelledError
+
+    def found(self, finding: Finding) -> None:
+        """Note a finding."""
+        self.report["findings"].append(as_json(finding))
+
+
+def scenes(run: Run, folders: Mapping[str, Path], remove: Sequence[str]) -> list[SourceScene]:
+    """All scenes of the map, those that it has already first; checked against one another."""
+    started = time.perf_counter()
+    kept = {} if run.into is None else _scenes_of_map(run.into)
+    for number, name in enumerate(remove):
+        if name not in kept or name in remove[:number]:
+            what = "given to --remove twice" if name in remove[:number] else f"not in the map {run.into}"
+            raise InputError(
+                f"scene {name} is {what}",
+                remedy=f"The map has {', '.join(sorted(kept)) or 'no scenes'}." if kept else "Give --into MAP.",
+                code="no-such-scene",
+            )
+        del kept[name]
+    result = list(kept.values())
+    for done, (name, folder) in enumerate(folders.items(), 1):
+        if name in kept:
+            raise InputError(
+                f"the map {run.into} has a scene called {name} already",
+                remedy="Remove it first (--remove), or give the new one another name: NAME=FOLDER.",
+                code="duplicate-scene",
+            )
+        result.append(read_scene(folder, name))
+        run.progress("scenes", done, len(folders))
+    result.sort(key=lambda scene: scene.name)
+    _check_together(run, result)
+    run.ended("scenes", started, scenes=len(result), taken_from_the_map=len(kept))
+    return result
+
+
+def _scenes_of_map(folder: Path) -> dict[str, SourceScene]:
+    document = map_document(folder)
+    store, result = StageStore(folder / SCENES_FOLDER), {}
+    for entry in document["scenes"]:
+        found = store.load(entry["name"], entry["fingerprint"])
+        if found is None:
+            raise InputError(
+                f"map {folder} has no usable {SCENES_FOLDER}/{entry['name']}.npz",
+                remedy="Copy or download the map again, or make it anew from its scenes.",
+                code="damaged-map",
+            )
+        result[entry["name"]] = SourceScene.unpack(entry["name"], *found)
+    return result
+
+
+def map_document(folder: Path) -> dict[str, Any]:
+    """A map's `map.json`.
+
+    Raises
+    ------
+    InputError
+        Where the folder is no complete map of this version.
+    """
+    try:
+        if not (folder / "report.json").is_file():
+            raise FileNotFoundError("it has no report.json")
+        document = json.loads((folder / MAP_FILE).read_text(encoding="utf-8"))
+        if document["version"] != 1:
+            raise ValueError(f"version {document['version']!r}")
+        names = [scene["name"] for scene in document["scenes"]]
+        if len(set(names)) != len(names):
+            raise ValueError("a scene is in it twice")
+        return dict(document)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder} is no map: {error}",
+            remedy="Give the folder that `mrasfm aggregate --out` wrote.",
+            code="not-a-map",
+        ) from error
+
+
+def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
+    """Refuse scenes that cannot be in one map; say what is unusual."""
+    if len(found) < MIN_SCENES:
+        raise InputError(
+            f"a map needs {MIN_SCENES} scenes, this would have {len(found)}",
+            remedy="Give more scenes; a scene by itself needs no map.",
+            code="one-scene",
+        )
+    for k, scene in enumerate(found):
+        for other in found[:k]:
+            same_frames = scene.manifest.frames == other.manifest.frames and scene.manifest.gnss == other.manifest.gnss
+            if scene.fingerprint == other.fingerprint or same_frames:
+                raise InputError(
+                    f"scenes {other.name} and {scene.name} are of the same drive",
+                    remedy="Give each drive once.",
+                    code="same-drive",
+                )
+    _require_one(
+        found, "features_kind", "different-features", "keypoints", "Reconstruct all drives with one extractor."
+    )
+    _require_one(
+        found,
+        "common_world",
+        "different-worlds",
+        "a world",
+        "Give all drives GNSS, or rough_poses in one common_world.",
+    )
+    datums = sorted({scene.height_datum for scene in found})
+    if len(datums) > 1:
+        run.found(
+            warning(
+                "height-datums",
+                f"heights of the drives count from different datums: {', '.join(datums)}",
+                "They were converted to ellipsoidal heights; check that each drive declares its own rightly.",
+            )
+        )
+    versions = {scene.name: scene.report.get("engine_version") for scene in found}
+    others = sorted(name for name, version in versions.items() if version != __version__)
+    if others:
+        run.found(
+            warning(
+                "engine-versions",
+                f"other versions of the engine made the scenes {', '.join(others)}",
+                f"Reconstruct them with {__version__} if the map is worse than expected.",
+            )
+        )
+
+
+def _require_one(found: Sequence[SourceScene], name: str, code: str, what: str, remedy: str) -> None:
+    values: dict[Any, str] = {}
+    for scene in found:
+        values.setdefault(getattr(scene, name), scene.name)
+    if len(values) > 1:
+        (a, first), (b, second) = list(values.items())[:2]
+        raise InputError(
+            f"scenes {first} and {second} have different {what}: {a or 'of positions'} and {b or 'of positions'}",
+            remedy=remedy,
+            code=code,
+        )
+
+
+def association(run: Run, found: Sequence[SourceScene]) -> Association:
+    """Where positions put the scenes, and which are to be compared."""
+    started = time.perf_counter()
+    result = associate(found, run.config.aggregation)
+    middle = np.array([m[:3, 3] for m in result.map_from_scene])
+    if np.abs(middle - middle[result.reference]).max() > FAR_APART_M:
+        run.found(
+            warning(
+                "far-apart",
+                "some scenes are over 50 km apart",
+                "They are in one map, in the frame of the reference; check that this is meant.",
+            )
+        )
+    run.ended("association", started, reference=found[result.reference].name, pairs=len(result.pairs))
+    return result
+
+
+def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Seam]:
+    """The seam of every pair of scenes that is to be compared; those found before are taken from the store or map."""
+    started = time.perf_counter()
+    plugins = load_plugins(run.config, None)
+    result, reused = [], 0
+    older = None if run.into is None else StageStore(run.into / SEAMS_FOLDER)
+    total = len(known.pairs)
+    for number, (i, j) in enumerate(known.pairs):
+        if run.cancel():
+            raise CancelledError
+        a, b = found[i], found[j]
+        key, name = seam_key(run.config, plugins, a, b), seam_name(a.name, b.name)
+        kept = run.store.load(f"seam-{name}", key)
+        if kept is None and older is not None:
+            kept = older.load(name, key)
+        if kept is None:
+            seam = find_seam(
+                a,
+                b,
+                coarse_transform(a, b),
+                plugins.matcher,
+                run.config,
+                cancel=run.cancel,
+                progress=lambda done, of, number=number: run.progress(  # type: ignore[misc]
+                    "seams", 100 * number + min(99, 100 * done // max(of, 1)), 100 * total
+                ),
+            )
+            run.store.save(f"seam-{name}", key, *seam.pack())
+        else:
+            seam = Seam.unpack(a.name, b.name, *kept)
+            reused += 1
+        result.append(seam)
+        run.progress("seams", 100 * (number + 1), 100 * total)
+    run.ended("seams", started, pairs=total, pairs_reused=reused, accepted=sum(s.accepted for s in result))
+    run.report["stages"][-1]["reused"] = reused == total
+    return result
+
+
+def seam_name(a: str, b: str) -> str:
+    """Of a seam's files."""
+    return f"{a}--{b}"
+
+
+def seam_key(config: EngineConfig, plugins: Plugins, a: SourceScene, b: SourceScene) -> str:
+    """What a seam depends on: both scenes' content, in this order, settings, models and code; not their names."""
+    settings = [config.matching.model_dump(), config.mapping.max_error_px, config.adjustment.loss_scale, config.seed]
+    aggregation = config.aggregation.model_dump(exclude={"candidates", "joint", "final_adjustment"})
+    models = plugins.fingerprint_of("matcher")
+    return fingerprint(a.fingerprint, b.fingerprint, settings, aggregation, models, code_version())

@@ -1,0 +1,88 @@
+"""`mrasfm aggregate`: several scenes to one map."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, progress_bars
+from mrasfm_engine.config import read_config
+from mrasfm_engine.errors import InputError
+
+
+def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "aggregate",
+        help="put scenes together to a map",
+        description="Find how scenes of several drives lie to one another, and make one map of them.",
+    )
+    parser.add_argument(
+        "scenes", nargs="*", metavar="SCENE", help="folders that `mrasfm reconstruct` wrote, or NAME=FOLDER"
+    )
+    parser.add_argument("--out", type=Path, metavar="MAP", help="folder for the map; with --into by default that one")
+    parser.add_argument("--into", type=Path, metavar="MAP", help="add the scenes to this map")
+    parser.add_argument("--remove", action="append", default=[], metavar="NAME", help="take a scene out of the map")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML)")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Aggregate, show progress, and say what is connected and how well."""
+    out = arguments.out or arguments.into
+    if out is None:
+        raise InputError("no folder for the map is given", remedy="Give --out MAP, or --into MAP to extend one.")
+    config = read_config(arguments.config)
+    scenes = _named(arguments.scenes)
+    # The engine takes a second to load; help and argument errors should not wait for it.
+    from mrasfm_engine.aggregation import aggregate
+    from mrasfm_engine.aggregation.stages import map_document
+
+    console = Console(stderr=True)
+    with cancel_on_interrupt(console) as cancelled, progress_bars(console) as progress:
+        report = aggregate(
+            scenes, out, config, into=arguments.into, remove=arguments.remove, progress=progress, cancel=cancelled
+        )
+    _say(report, map_document(out), out)
+    return 0
+
+
+def _named(words: list[str]) -> dict[str, Path]:
+    """Scenes by name; a folder without one has its own."""
+    result: dict[str, Path] = {}
+    for word in words:
+        name, equals, folder = word.partition("=")
+        path = Path(folder if equals else word)
+        name = name if equals else path.resolve().name
+        if name in result:
+            raise InputError(
+                f"two scenes are called {name!r}: {result[name]} and {path}",
+                remedy="Give each scene once, or names of their own: NAME=FOLDER.",
+                code="duplicate-scene",
+            )
+        result[name] = path
+    return result
+
+
+def _say(report: dict[str, Any], document: dict[str, Any], out: Path) -> None:
+    summary, scenes = report["summary"], document["scenes"]
+    connected = [scene["name"] for scene in scenes if scene["name"] not in document["unconnected"]]
+    print(f"Map: {out}")
+    print(f"  scenes connected: {len(connected)} of {len(scenes)}")
+    print(f"  units registered: {summary['registered_units']} of {summary['total_units']}")
+    print(f"  points:           {summary['points']} in {out / 'points.ply'}")
+    for seam in document["seams"]:
+        if seam["accepted"]:
+            print(
+                f"  seam {seam['a']} - {seam['b']}: {seam['inliers']} shared points, "
+                f"residual {seam['residual_before_px']:.1f} -> {seam['residual_after_px']:.2f} px, "
+                f"sigma {100 * seam['sigma_translation_m']:.1f} cm {seam['sigma_rotation_deg']:.3f} deg, "
+                f"positions were {seam['positions_off_m']:.2f} m off"
+            )
+        else:
+            print(f"  no seam {seam['a']} - {seam['b']}: {seam['reason']}")
+    for finding in report["findings"]:
+        print(f"  {finding['severity']}: {finding['what']}")

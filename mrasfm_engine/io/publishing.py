@@ -1,0 +1,87 @@
+"""Puts a folder of results in place whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from mrasfm_engine.errors import StorageError
+
+COMPLETE_MARK = "report.json"
+LEFTOVER_AGE_S = 3600.0
+
+
+@contextmanager
+def publishing(out: Path, needed_bytes: int, *, replaced: Sequence[str] = ()) -> Iterator[Path]:
+    """A temporary folder whose content replaces that of `out` when the `with` block ends well.
+
+    A new folder appears at once; into an existing one the files move one by one, its old `report.json` goes first and
+    the new one comes last. Other files in it are kept.
+
+    Parameters
+    ----------
+    replaced
+        Names that an older result may have left in `out`: they go where the new one does not have them.
+
+    Raises
+    ------
+    StorageError
+        Where the disk is full or cannot be written.
+    """
+    out = out.resolve()
+    try:
+        # Inside an existing folder, because that may be another file system than its parent.
+        home = out if out.is_dir() else out.parent
+        _prepare(needed_bytes, out, home)
+        work = home / f".{out.name}.partial-{os.getpid()}-{secrets.token_hex(4)}"
+        work.mkdir()
+        try:
+            yield work
+            _put_in_place(work, out, replaced)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        remedy = "Free space on this disk, or choose a folder that can be written."
+        raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
+
+
+def _prepare(needed: int, out: Path, home: Path) -> None:
+    """Make the folder to work in, clear what killed runs left there, and see that the files will fit."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
+    home.mkdir(parents=True, exist_ok=True)
+    for leftover in home.glob(f".{out.name}.partial-*"):
+        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
+            shutil.rmtree(leftover, ignore_errors=True)
+    free = shutil.disk_usage(home).free
+    if free < needed:
+        raise StorageError(
+            f"{out} needs about {needed / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
+            remedy="Free space on this disk, or choose another folder.",
+        )
+
+
+def _put_in_place(work: Path, out: Path, replaced: Sequence[str]) -> None:
+    if not out.exists():
+        work.rename(out)
+        return
+    (out / COMPLETE_MARK).unlink(missing_ok=True)
+    # An older result's that this one does not have: it would be taken for this one's.
+    for name in replaced:
+        if (out / name).exists() and not (work / name).exists():
+            (out / name).rename(work / f"old-{name}")
+    items = sorted(
+        (item for item in work.iterdir() if not item.name.startswith("old-")),
+        key=lambda item: item.name == COMPLETE_MARK,
+    )
+    for item in items:
+        target = out / item.name
+        if item.is_dir() and target.is_dir():
+            target.rename(work / f"old-{item.name}")
+        item.rename(target)

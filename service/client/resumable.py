@@ -1,0 +1,86 @@
+"""Large files in pieces, after tus 1.0.0: a connection that breaks, and a command that is stopped, lose no bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from http import HTTPStatus
+
+from service.client.api import Client
+from service.client.drive_folder import LocalFile
+from service.client.errors import ApiError, ClientError
+from service.client.parallel import Meter
+from service.client.transport import TroubleError
+
+# Smaller ones are sent again from their beginning: the questions where to go on would take as long.
+FROM_BYTES = 8 << 20
+
+_ENDED = (HTTPStatus.NOT_FOUND, HTTPStatus.GONE)
+
+
+class ResumableUpload:
+    """One file of a drive.
+
+    Parameters
+    ----------
+    url
+        Of the upload that an earlier run began; None: begin.
+    """
+
+    def __init__(self, client: Client, drive_id: str, file: LocalFile, meter: Meter, *, url: str | None = None) -> None:
+        self._client = client
+        self._drive_id = drive_id
+        self._file = file
+        self._meter = meter
+        self._counted_bytes = 0
+        self.url = url
+
+    def begin(self) -> str:
+        """Where the bytes go: as before, where the service still knows it; else anew."""
+        if self.url is not None:
+            try:
+                self._client.upload_offset(self.url)
+                return self.url
+            except ApiError as error:
+                if error.status not in _ENDED:
+                    raise
+        file = self._file
+        metadata = {"path": file.path, "sha256": file.sha256, "replace": "true"}
+        self.url = self._client.create_upload(self._drive_id, file.size_bytes, metadata)
+        return self.url
+
+    def send(self) -> None:
+        """All that is missing, from wherever the service is; again and again while trouble may pass.
+
+        Raises
+        ------
+        ApiError
+            The service refuses the file.
+        UnreachableError
+            It does not answer.
+        """
+        url, patience = self.begin(), self._client.patience()
+        while (offset := self._client.upload_offset(url)) < self._file.size_bytes:
+            if offset > self._counted_bytes:
+                patience.renew()
+            self._count(offset)
+            try:
+                self._client.append_to_upload(url, offset, lambda at=offset: self._pieces(at))  # type: ignore[misc]
+            except TroubleError as trouble:
+                patience.pause(trouble)
+            except ApiError as error:
+                # Another request, perhaps an earlier one of ours, is still being served, or has just been.
+                if error.status not in (HTTPStatus.CONFLICT, HTTPStatus.LOCKED) or error.code == "file-exists":
+                    raise
+                patience.pause(TroubleError(error, 1.0))
+        self._count(self._file.size_bytes)
+
+    def _pieces(self, offset: int) -> Iterator[bytes]:
+        for piece in self._file.pieces(offset):
+            if self._client.stopped:
+                raise ClientError("the upload was interrupted")
+            yield piece
+            self._count(self._counted_bytes + len(piece))
+
+    def _count(self, size_bytes: int) -> None:
+        self._meter.add(size_bytes - self._counted_bytes)
+        self._counted_bytes = size_bytes

@@ -1,0 +1,136 @@
+"""Finished stages, so that another attempt or another job does not repeat them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.persistence import blobs
+from service.persistence.artifacts import ArtifactStore
+from service.persistence.database import Database
+from service.persistence.storing import StoredFile
+from service.persistence.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
+
+
+def settings_sha256(settings: Mapping[str, Any]) -> str:
+    """Tells apart the settings under which stages were finished, and scenes made."""
+    return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class DriveShelf:
+    """Stages of one drive under certain settings."""
+
+    drive_id: str
+    settings_sha256: str
+
+
+@dataclass(frozen=True)
+class MapShelf:
+    """Stages of an aggregation: each of a pair of scenes, wherever in the project the two were put together before.
+
+    Attributes
+    ----------
+    slots
+        By the name of a stage's file, the digest of all that it is made of.
+    """
+
+    map_id: str
+    project_id: str
+    slots: Mapping[str, str]
+
+    @staticmethod
+    def of(map_id: str, project_id: str, *, scenes: Mapping[str, str], settings: Mapping[str, Any]) -> MapShelf:
+        """Of the scenes of a map, ids by name, under some settings."""
+        under = settings_sha256(settings)
+        slots = {
+            f"seam-{a}--{b}.npz": hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
+            for a, first in scenes.items()
+            for b, second in scenes.items()
+            if a != b
+        }
+        return MapShelf(map_id, project_id, slots)
+
+
+Shelf = DriveShelf | MapShelf
+_SEAM = "seam"
+
+
+def restore(database: Database, artifacts: ArtifactStore, shelf: Shelf, folder: Path) -> list[str]:
+    """Bring finished stages into a folder; the names of the files brought."""
+    with database.read() as session:
+        found = _shelved(session, shelf)
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    for name, (key, sha256) in found.items():
+        artifacts.fetch(key, folder / name, sha256)
+    return list(found)
+
+
+def _shelved(session: Session, shelf: Shelf) -> dict[str, tuple[str, str]]:
+    """Key and digest of the finished stages, by name."""
+    if isinstance(shelf, DriveShelf):
+        mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
+        of_drive = select(Checkpoint.name, Blob.key, Blob.sha256).join(Blob, Checkpoint.blob_id == Blob.id)
+        return {name: (key, sha256) for name, key, sha256 in session.execute(of_drive.where(mine))}
+    of_maps = select(MapCheckpoint.inputs_sha256, Blob.key, Blob.sha256).join(Blob, MapCheckpoint.blob_id == Blob.id)
+    rows = session.execute(
+        of_maps.where(MapCheckpoint.project_id == shelf.project_id).order_by(MapCheckpoint.created_us)
+    )
+    known = {inputs: (key, sha256) for inputs, key, sha256 in rows}  # the newest
+    return {name: known[inputs] for name, inputs in shelf.slots.items() if inputs in known}
+
+
+def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> None:
+    """Note checkpoints, by name, that were put into the artifact store; older ones of the same names are replaced.
+
+    Nothing is kept where the drive or the map has been deleted.
+    """
+    owner: Drive | Map | None
+    match shelf:
+        case DriveShelf():
+            owner = session.get(Drive, shelf.drive_id)
+        case MapShelf():
+            owner = session.get(Map, shelf.map_id)
+    if owner is None:
+        return
+    for name, file in stored.items():
+        if isinstance(shelf, MapShelf) and name not in shelf.slots:
+            continue
+        blob = blobs.record(session, project_id=owner.project_id, within_quota=False, **file.identity)
+        checkpoint = _find(session, shelf, name)
+        if checkpoint is None:
+            session.add(_new(shelf, name, blob.id))
+        else:
+            checkpoint.blob_id = blob.id
+            checkpoint.created_us = now_us()
+
+
+def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoint | None:
+    match shelf:
+        case DriveShelf():
+            return session.get(Checkpoint, (shelf.drive_id, shelf.settings_sha256, name))
+        case MapShelf():
+            return session.get(MapCheckpoint, (shelf.map_id, shelf.slots[name], _SEAM))
+
+
+def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
+    match shelf:
+        case DriveShelf():
+            return Checkpoint(
+                drive_id=shelf.drive_id, settings_sha256=shelf.settings_sha256, name=name, blob_id=blob_id
+            )
+        case MapShelf():
+            return MapCheckpoint(
+                map_id=shelf.map_id,
+                project_id=shelf.project_id,
+                inputs_sha256=shelf.slots[name],
+                name=_SEAM,
+                blob_id=blob_id,
+            )

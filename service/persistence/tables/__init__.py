@@ -1,0 +1,42 @@
+"""The database's tables.
+
+Times are integer microseconds since 1970 (UTC), as everywhere in the product: SQLite has no type for them, and
+comparing integers is the same in every database. Ids are random; foreign ids cannot be guessed.
+"""
+
+from __future__ import annotations
+
+from service.persistence.tables._base import Base, new_id, now_us
+from service.persistence.tables._drives import Checkpoint, Drive, DriveFile, Upload
+from service.persistence.tables._jobs import TERMINAL, Job, JobAttempt, JobEvent, JobMember, JobState
+from service.persistence.tables._projects import ApiKey, Blob, Project
+from service.persistence.tables._results import Map, MapCheckpoint, MapFile, MapScene, MapVersion, Scene, SceneFile
+from service.persistence.tables._service import IdempotencyKey, WorkerSeen
+
+__all__ = [
+    "TERMINAL",
+    "ApiKey",
+    "Base",
+    "Blob",
+    "Checkpoint",
+    "Drive",
+    "DriveFile",
+    "IdempotencyKey",
+    "Job",
+    "JobAttempt",
+    "JobEvent",
+    "JobMember",
+    "JobState",
+    "Map",
+    "MapCheckpoint",
+    "MapFile",
+    "MapScene",
+    "MapVersion",
+    "Project",
+    "Scene",
+    "SceneFile",
+    "Upload",
+    "WorkerSeen",
+    "new_id",
+    "now_us",
+]

@@ -1,0 +1,65 @@
+"""Aggregations: drives or scenes to a map, as a tree of jobs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Response
+from sqlalchemy.orm import Session
+
+from schemas.api.aggregations import AggregationRequest
+from schemas.api.jobs import JobResource
+from service.context import Context
+from service.persistence import aggregations
+from service.persistence.idempotency import Answer
+from service.persistence.tables import Job, now_us
+from service.routes.bodies import Body, describe, json_body
+from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us, problems
+from service.routes.job_views import RETRY_AFTER_S, view_of
+
+router = APIRouter(prefix="/v1/aggregations", tags=["jobs"])
+
+read_request = json_body(AggregationRequest, lambda settings: settings.max_json_bytes)
+
+
+@router.post(
+    "",
+    status_code=202,
+    response_model=JobResource,
+    responses=problems(401, 404, 408, 409, 413, 422, 429),
+    openapi_extra=describe(AggregationRequest),
+)
+def create_aggregation(
+    once: OnceDep,
+    caller: CallerDep,
+    context: ContextDep,
+    body: Annotated[Body[AggregationRequest], Depends(read_request)],
+) -> Response:
+    """Ask for a map of drives or scenes, or for a new version of one.
+
+    What is not reconstructed yet with these settings is reconstructed first, in parallel over all workers; the job's
+    `members` say how far each is. A drive that fails does not take the others with it, unless `require_all` is set.
+    The job's `map_id` is the map's from now on, and `map_version` tells what came of it.
+    """
+
+    def effect(session: Session) -> Answer:
+        job, due = aggregations.create(
+            session,
+            project_id=caller.project_id,
+            asked=body.value,
+            job_expires_us=expiry_us(now_us(), context.settings.job_retention_days),
+        )
+        return accepted(session, context, job, due)
+
+    return once(effect, body.raw)
+
+
+def accepted(session: Session, context: Context, job: Job, due: list[Job]) -> Answer:
+    """202 for a job, and which jobs may begin now."""
+    return answer(
+        202,
+        view_of(session, job, context.settings),
+        waiting=tuple(due),
+        Location=f"/v1/jobs/{job.id}",
+        Retry_After=str(RETRY_AFTER_S),
+    )

@@ -1,0 +1,131 @@
+"""From bytes in the spool to files of a drive, however they came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+import anyio.from_thread
+from sqlalchemy import select
+
+from schemas.api.drives import DriveFileResource, StoredFiles
+from schemas.parsing import DocumentError, parse_json
+from service.context import Context
+from service.errors import ServiceError
+from service.persistence import drives, slots
+from service.persistence.storing import storing
+from service.persistence.tables import Blob, DriveFile
+from service.routes.bodies import LARGE_BYTES
+from service.uploads.archive import unpack
+from service.uploads.archive_limits import ArchiveLimits
+from service.uploads.images import check_image
+from service.uploads.spool import Spooled
+
+
+def require_wanted(context: Context, project_id: str, drive_id: str, path: str) -> None:
+    """Refuse a file that would not be taken, before its bytes are."""
+    with context.database.read() as session:
+        slots.find(session, project_id, drive_id, path)
+
+
+def keep_file(
+    context: Context, project_id: str, drive_id: str, path: str, spooled: Spooled, replace: bool
+) -> tuple[bool, DriveFileResource]:
+    """Make spooled bytes a file of an open drive.
+
+    Returns
+    -------
+    new, file
+        Whether they were not there before.
+
+    Raises
+    ------
+    ServiceError
+        415 or 422 where they are no image, 404, 409, 413 as `slots`.
+    """
+    try:
+        check_image(spooled.path, path)
+    except ServiceError:
+        require_wanted(context, project_id, drive_id, path)  # that there is no such drive matters more
+        raise
+    with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
+        stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
+        with context.database.write(durable=False) as session:  # the drive's commit makes it so
+            slot = slots.find(session, project_id, drive_id, path, lock=True)
+            blob = slots.fill(session, slot, stored, replace=replace)
+        if blob is not None:
+            store.recorded(blob.key)
+    return blob is not None, DriveFileResource.model_validate(
+        {"path": path, "role": slot.role, "stored": True, "size_bytes": stored.size_bytes, "sha256": stored.sha256}
+    )
+
+
+def keep_archive(context: Context, project_id: str, drive_id: str, archive: Spooled, replace: bool) -> StoredFiles:
+    """Store all files of an archive in an open drive, or none of them."""
+    with context.database.read() as session:
+        drive = drives.get(session, project_id, drive_id)
+        expected = set(session.scalars(select(DriveFile.path).where(DriveFile.drive_id == drive.id)))
+        manifest_key = session.get_one(Blob, drive.manifest_blob_id).key
+    settings = context.settings
+    unpacked = unpack(
+        archive.path,
+        expected,
+        same_manifest=lambda raw: _same_manifest(context, raw, context.artifacts.read(manifest_key)),
+        folder=settings.spool_dir,
+        limits=ArchiveLimits(
+            max_entries=3 * len(expected) + 1000,
+            max_bytes=settings.max_archive_bytes,
+            max_ratio=settings.max_compression_ratio,
+            max_file_bytes=settings.max_file_bytes,
+            min_free_bytes=settings.min_free_disk_bytes,
+        ),
+    )
+    try:
+        return _keep_all(context, project_id, drive_id, unpacked, replace)
+    finally:
+        for _, spooled in unpacked:
+            spooled.discard()
+
+
+def _keep_all(
+    context: Context, project_id: str, drive_id: str, unpacked: list[tuple[str, Spooled]], replace: bool
+) -> StoredFiles:
+    with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
+        stored = [
+            (name, store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes))
+            for name, spooled in unpacked
+        ]
+        with context.database.write() as session:
+            drive = drives.get(session, project_id, drive_id, lock=True)
+            for name, file in stored:
+                slot = slots.find(session, project_id, drive_id, name)
+                slots.fill(session, slot, file, replace=replace)
+            count = drives.stored_of(session, [drive_id])[drive_id].files
+            return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
+
+
+def _same_manifest(context: Context, raw: bytes, stored: bytes) -> bool:
+    """Whether a file is the drive's manifest, perhaps written in another way.
+
+    A large one takes ten times its size while it is parsed, and here there are two: beyond a bound they have to be the
+    same bytes.
+    """
+    if raw == stored:
+        return True
+    bound = context.settings.max_json_bytes
+    try:
+        with _in_turn(context) if max(len(raw), len(stored)) > LARGE_BYTES else nullcontext():
+            return bool(parse_json(raw, max_bytes=bound) == parse_json(stored, max_bytes=bound))
+    except (DocumentError, RecursionError):
+        return False
+
+
+@contextmanager
+def _in_turn(context: Context) -> Iterator[None]:
+    """Take turns with large bodies, from a thread of `anyio.to_thread`."""
+    borrower = object()
+    anyio.from_thread.run(context.large_documents.acquire_on_behalf_of, borrower)
+    try:
+        yield
+    finally:
+        anyio.from_thread.run_sync(context.large_documents.release_on_behalf_of, borrower)

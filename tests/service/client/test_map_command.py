@@ -1,0 +1,114 @@
+"""`mrasfm map`: several drives go in, a map comes out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.api.problems import PROBLEM_TYPE, Problem
+from service.client import SceneFolderError, download_map
+from service.commands import map as map_command
+from service.persistence import jobs
+from service.persistence.tables import Job
+from tests.service.client.conftest import Connect, written
+from tests.service.live_api import Client
+from tests.service.tiny_drive import tiny_drive
+
+FILES = {"points.ply": b"ply" * 1000, "calibration/a.json": b"{}", "map.json": b"{}", "report.json": b"{}"}
+BROKEN = Problem(type=PROBLEM_TYPE + "no-overlap", title="T", detail="it broke", remedy="Look.", retryable=False)
+
+
+@pytest.fixture
+def drives(tmp_path: Path) -> list[Path]:
+    return [written(tiny_drive(f"d{i}", seed=f"{tmp_path}{i}"), tmp_path / f"d{i}") for i in range(3)]
+
+
+@pytest.fixture
+def worker(client: Client) -> Iterator[Callable[[set[str]], None]]:
+    """Does jobs of the client's project as they become due; drives of the names given to it fail."""
+    ended, broken = threading.Event(), set[str]()
+
+    def work() -> None:
+        while not ended.wait(0.05):
+            with client.api.database.read() as session:
+                due = [job.id for job in jobs.all_due(session)]
+                mine = [j for j in session.query(Job).filter(Job.id.in_(due)) if j.project_id == client.project_id]
+            for job in mine:
+                held = client.claim(job.id)
+                if job.kind == "AGGREGATION":
+                    client.publish_map(held, FILES, unconnected=("d2",))
+                elif job.kind == "PREFLIGHT":
+                    with client.api.database.write() as session:
+                        jobs.record_findings(session, held, [], sound=True)
+                elif client.get(f"/v1/drives/{job.drive_id}").json()["name"] in broken:
+                    with client.api.database.write() as session:
+                        jobs.fail(session, held, BROKEN, max_attempts=1, retry_delay_us=0)
+                else:
+                    client.publish(held, {"points.ply": job.id.encode()})
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield broken.update
+    ended.set()
+    thread.join()
+
+
+def run(client: Client, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object) -> Any:
+    monkeypatch.setenv("MRASFM_API_KEY", client.key)
+    parser = argparse.ArgumentParser()
+    map_command.register(parser.add_subparsers())
+    arguments = parser.parse_args(["map", *map(str, words), "--url", client.api.url, "--json"])
+    code = arguments.run(arguments)
+    printed = capsys.readouterr()
+    return code, json.loads(printed.out), printed.err
+
+
+def test_a_map_and_its_next_version(
+    client: Client,
+    drives: list[Path],
+    worker: Callable[[set[str]], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    worker({"d1"})
+    out = tmp_path / "map"
+    code, summary, said = run(client, monkeypatch, capsys, *drives, "--out", out, "--name", "Kreuzung")
+    assert code == 0, said
+    assert {path: (out / path).read_bytes() for path in FILES} == FILES
+    assert summary["version"] == 1
+    assert summary["failed"] == [summary["drive_ids"][1]]
+    assert summary["unconnected"] == ["d2"]
+    assert "d1" in said
+    assert "it broke" in said
+    # The same command again asks for nothing new.
+    _, again, _ = run(client, monkeypatch, capsys, *drives, "--out", out, "--name", "Kreuzung")
+    assert (again["job_id"], again["version"]) == (summary["job_id"], 1)
+    # A version without the last drive, which has no third scene to keep: refused in the service's words.
+    refused = run(client, monkeypatch, capsys, "--into", summary["map_id"], "--remove", summary["drive_ids"][2])
+    assert refused[0] == 2
+    assert refused[1]["problem"]["type"].endswith("too-few-scenes")
+    failing = run(client, monkeypatch, capsys, drives[0], drives[1], "--require-all")
+    assert failing[0] == 3
+    assert "it broke" in failing[2]
+
+
+def test_a_folder_of_another_version(client: Client, connect: Connect, tmp_path: Path) -> None:
+    ids = [client.frozen(tiny_drive(f"v{i}", seed=f"{tmp_path}v{i}")) for i in range(2)]
+    job = client.aggregate(drives=ids)
+    for member in job["members"]:
+        client.publish(client.claim(member["job_id"]), {"a": b"a"})
+    client.publish_map(client.claim(job["id"]), FILES)
+    library = connect(client)
+    version = library.map_version(job["map_id"], 1)
+    done = download_map(library, version, tmp_path / "out")
+    assert (done.files_received, done.files_skipped) == (len(FILES), 0)
+    other = version.model_copy(update={"number": 2})
+    with pytest.raises(SceneFolderError, match="holds the map"):
+        download_map(library, other, tmp_path / "out")

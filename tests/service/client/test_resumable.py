@@ -1,0 +1,79 @@
+"""Large files go in pieces: what has arrived is not sent again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from service.client import ClientError, DriveFolder, UploadState, resumable, upload_drive
+from service.client.upload_state import STATE_NAME
+from tests.service.client.bad_network import Cut, bad_network
+from tests.service.client.conftest import Connect, written
+from tests.service.live_api import Api, Client
+from tests.service.test_uploads import image
+from tests.service.tiny_drive import TinyDrive, tiny_drive
+
+SIZE_BYTES = 6_000_000
+
+
+@pytest.fixture(autouse=True)
+def _small_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resumable, "FROM_BYTES", 100_000)
+
+
+@pytest.fixture
+def large_drive(tmp_path: Path) -> Path:
+    """A drive with one large image among small ones."""
+    tiny = tiny_drive(seed=tmp_path.name)
+    files = {**tiny.files, "front/000001.png": image(SIZE_BYTES, seed=hash(tmp_path.name))}
+    return written(TinyDrive(tiny.manifest, files), tmp_path / "drive")
+
+
+def state_of(drive: Path) -> dict[str, dict[str, str]]:
+    (upload,) = json.loads((drive / STATE_NAME).read_text())["uploads"].values()
+    return dict(upload)
+
+
+def test_a_connection_that_breaks_again_and_again(client: Client, connect: Connect, large_drive: Path) -> None:
+    cuts = [Cut(part, answer_bytes=20, times=2) for part in (b"/uploads HTTP", b"HEAD ", b"PATCH ")]
+    with bad_network(client.api.url, *cuts) as network:
+        sent = upload_drive(connect(client, url=network.url), DriveFolder.read(large_drive), parallel=1)
+    assert [len(cut.seen) for cut in cuts[:2]] == [2, 2]
+    assert cuts[2].seen
+    assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
+    assert sent.bytes_sent == sum(path.stat().st_size for path in large_drive.rglob("*.png"))
+    assert state_of(large_drive)["resumable"] == {}
+
+
+def test_another_run_goes_on_in_the_middle_of_a_file(
+    api: Api, client: Client, connect: Connect, large_drive: Path
+) -> None:
+    library, folder = connect(client), DriveFolder.read(large_drive)
+
+    def stop(stage: str, done_bytes: int, total_bytes: int) -> None:
+        if stage == "send" and done_bytes > SIZE_BYTES // 2:
+            library.stop()
+
+    with pytest.raises(ClientError):
+        upload_drive(library, folder, parallel=1, report=stop)
+    (path,) = state_of(large_drive)["resumable"].values()
+    kept = connect(client).upload_offset(path)
+    assert 0 < kept < SIZE_BYTES
+    again, done = connect(client), list[int]()
+    upload_drive(again, folder, parallel=1, report=lambda stage, at, of: done.append(at) if stage == "send" else None)
+    assert any(at >= kept for at in done[:3]), "the first that is counted is what was there"
+    assert UploadState(folder, again.url).uploads == {}
+
+
+def test_an_upload_that_is_gone_begins_anew(client: Client, connect: Connect, large_drive: Path) -> None:
+    library, folder = connect(client), DriveFolder.read(large_drive)
+    state = UploadState(folder, library.url)
+    (large,) = [path for path in folder.paths if (large_drive / path).stat().st_size > SIZE_BYTES]
+    from service.client.drive_folder import identify
+
+    file = identify(folder.root, large)
+    state.note_upload(f"{file.path} {file.sha256}", "/v1/drives/drv_0/uploads/upl_0")
+    sent = upload_drive(library, folder, state=state)
+    assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"

@@ -1,0 +1,396 @@
+"""Resumable uploads, as tus clients make them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+from sqlalchemy import update
+
+from service.app import sweep_uploads
+from service.persistence import durability
+from service.persistence.tables import Upload, now_us
+from service.uploads.resumable import PartialFile
+from tests.service.conftest import StartApi
+from tests.service.live_api import Api, Client, problem_of, wait_until
+from tests.service.tiny_drive import TinyDrive, png_of, tiny_drive
+from tests.service.tus_client import VERSION, begin, checksum, create, head, offset_of, patch
+
+PATH = "front/000000.png"
+
+
+def image(size_bytes: int, seed: int = 0) -> bytes:
+    """Bytes that pass for an image."""
+    noise = hashlib.shake_128(str(seed).encode()).digest(size_bytes)
+    return png_of(64, 48, noise)
+
+
+def stored(client: httpx.Client, drive_id: str, path: str = PATH) -> str | None:
+    files = client.get(f"/v1/drives/{drive_id}/files").json()["items"]
+    return next(file["sha256"] for file in files if file["path"] == path)
+
+
+def sha256_of(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+@pytest.fixture
+def drive() -> TinyDrive:
+    return tiny_drive(seed=str(time.monotonic_ns()))
+
+
+def bytes_left(api: Api) -> list[str]:
+    folder = api.settings.uploads_dir
+    return sorted(os.listdir(folder)) if folder.is_dir() else []
+
+
+def test_a_file_in_pieces(api: Api, client: Client) -> None:
+    drive_id, data = client.create(), image(300_000)
+    url = begin(client, drive_id, PATH, data, sha256=sha256_of(data))
+    assert offset_of(client, url) == 0
+    for start in range(0, len(data), 100_000):
+        assert stored(client, drive_id) is None
+        answer = patch(client, url, start, data[start : start + 100_000])
+        assert (answer.status_code, answer.content) == (204, b"")
+        assert int(answer.headers["upload-offset"]) == min(start + 100_000, len(data))
+        assert answer.headers["tus-resumable"] == "1.0.0"
+        assert answer.headers["upload-expires"].endswith("GMT")
+    assert stored(client, drive_id) == sha256_of(data)
+    done = head(client, url)
+    assert (done.headers["upload-offset"], done.headers["upload-length"]) == (str(len(data)),) * 2
+    assert done.headers["cache-control"] == "no-store"
+    assert done.headers["upload-metadata"].startswith("path ")
+    assert not [name for name in bytes_left(api) if name.startswith(url.rsplit("/", 1)[1])]
+    assert patch(client, url, len(data), b"").status_code == 204
+    problem_of(patch(client, url, 0, data), 409, "wrong-offset")
+
+
+def test_what_the_service_speaks(client: Client) -> None:
+    answer = client.options(f"/v1/drives/{client.create()}/uploads")
+    assert answer.status_code == 204
+    assert answer.headers["tus-version"] == "1.0.0"
+    assert set(answer.headers["tus-extension"].split(",")) == {"creation", "checksum", "expiration", "termination"}
+    assert "sha1" in answer.headers["tus-checksum-algorithm"].split(",")
+    assert int(answer.headers["tus-max-size"]) > 0
+
+
+def test_a_wrong_offset(client: Client) -> None:
+    data = image(1000)
+    url = begin(client, client.create(), PATH, data)
+    assert patch(client, url, 0, data[:500]).status_code == 204
+    for offset in (0, 499, 501, 10**17):
+        refused = patch(client, url, offset, data[500:])
+        problem_of(refused, 409, "wrong-offset")
+        assert refused.headers["upload-offset"] == "500"
+        assert refused.headers["tus-resumable"] == "1.0.0"
+    assert offset_of(client, url) == 500
+    assert patch(client, url, 500, data[500:]).status_code == 204
+
+
+@pytest.mark.parametrize("algorithm", ["sha1", "sha256"])
+def test_checksums(client: Client, algorithm: str) -> None:
+    drive_id, data = client.create(), image(5000)
+    url = begin(client, drive_id, PATH, data)
+    assert patch(client, url, 0, data[:2000], Upload_Checksum=checksum(data[:2000], algorithm)).status_code == 204
+    wrong = patch(client, url, 2000, data[2000:], Upload_Checksum=checksum(data[2001:], algorithm))
+    problem_of(wrong, 460, "checksum-mismatch")
+    assert offset_of(client, url) == 2000, "the bytes were dropped"
+    assert patch(client, url, 2000, data[2000:], Upload_Checksum=checksum(data[2000:], algorithm)).status_code == 204
+    assert stored(client, drive_id) == sha256_of(data)
+
+
+def test_bytes_that_were_not_compared_do_not_count(api: Api, client: Client) -> None:
+    """Not where the connection breaks, and not where the process is killed: then the file is longer than the record."""
+    data = image(3_000_000)
+    url = begin(client, client.create(), PATH, data)
+    assert patch(client, url, 0, data[:10]).status_code == 204
+
+    def broken() -> Iterator[bytes]:
+        yield data[10:2_500_000]
+        raise ConnectionError
+
+    with pytest.raises(ConnectionError):
+        patch(client, url, 10, broken(), Upload_Checksum=checksum(data[10:]))
+    wait_until(lambda: head(client, url).status_code == 200, "the end of the request")
+    assert offset_of(client, url) == 10
+    with pytest.raises(ConnectionError):
+        patch(client, url, 10, broken())
+    wait_until(lambda: head(client, url).status_code == 200, "the end of the request")
+    kept = offset_of(client, url)
+    assert 10 < kept <= 2_500_000, "what came without a checksum is kept"
+    assert patch(client, url, kept, data[kept:]).status_code == 204
+
+
+def test_after_another_start_of_the_machine_only_what_was_synced_counts(
+    api: Api, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = image(1000)
+    url = begin(client, client.create(), PATH, data)
+    upload_id = url.rsplit("/", 1)[1]
+    assert patch(client, url, 0, data[:400]).status_code == 204
+    file = PartialFile(api.settings.uploads_dir, upload_id)
+    file.append_at(400, data[400:700], min_free_bytes=0)  # as a process that was killed leaves it
+    file.close()
+    with monkeypatch.context() as patched:
+        patched.setattr("service.routes.upload_writing.boot_id", lambda: "another start")
+        assert offset_of(client, url) == 400
+    assert offset_of(client, url) == 700
+    with api.database.read() as session:
+        assert session.get_one(Upload, upload_id).kept_bytes == 700, "what is told was synced"
+    assert durability.boot_id() is not None
+
+
+def test_one_writer_at_a_time(client: Client, api: Api) -> None:
+    data = image(100_000)
+    drive_id = client.create()
+    url = begin(client, drive_id, PATH, data)
+    go_on = threading.Event()
+
+    def slow() -> Iterator[bytes]:
+        yield data[:50_000]
+        assert go_on.wait(30)
+        yield data[50_000:]
+
+    answers: list[httpx.Response] = []
+    other = api.client_of(client.project_id, client.key)
+    first = threading.Thread(target=lambda: answers.append(patch(other, url, 0, slow())))
+    first.start()
+    wait_until(lambda: head(client, url).status_code == 423, "the first writer")
+    problem_of(patch(client, url, 0, data), 423, "upload-locked")
+    problem_of(client.delete(url, headers=VERSION), 423, "upload-locked")
+    go_on.set()
+    first.join()
+    assert [answer.status_code for answer in answers] == [204]
+    assert stored(client, drive_id) == sha256_of(data)
+
+
+def test_a_writer_that_is_silent_makes_room(start_api: StartApi) -> None:
+    api = start_api(upload_idle_seconds=0.3)
+    client, data = api.client(), image(100_000)
+    url = begin(client, client.create(), PATH, data)
+    host = urlsplit(api.url)
+    with socket.create_connection((host.hostname, host.port)) as connection:
+        lines = [
+            f"PATCH {url} HTTP/1.1", f"Host: {host.netloc}", f"Authorization: Bearer {client.key}",
+            "Tus-Resumable: 1.0.0", "Upload-Offset: 0", "Content-Type: application/offset+octet-stream",
+            f"Content-Length: {len(data)}", "", "",
+        ]  # fmt: skip
+        connection.sendall("\r\n".join(lines).encode() + data[:1000])
+        assert b" 408 " in connection.recv(100)
+    assert offset_of(client, url) == 1000
+
+
+def test_expiry(api: Api, client: Client) -> None:
+    data = image(1000)
+    drive_id = client.create()
+    url = begin(client, drive_id, PATH, data)
+    upload_id = url.rsplit("/", 1)[1]
+    assert patch(client, url, 0, data[:500]).status_code == 204
+    with api.database.write() as session:
+        session.execute(update(Upload).where(Upload.id == upload_id).values(expires_us=now_us() - 1))
+    assert head(client, url).status_code == 410
+    problem_of(patch(client, url, 500, data[500:]), 410, "upload-expired")
+    assert any(name.startswith(upload_id) for name in bytes_left(api))
+    sweep_uploads(api.context)
+    assert not any(name.startswith(upload_id) for name in bytes_left(api))
+    assert head(client, url).status_code == 410
+    with api.database.write() as session:
+        long_ago = now_us() - 8 * 86_400 * 1_000_000
+        session.execute(update(Upload).where(Upload.id == upload_id).values(expires_us=long_ago))
+    sweep_uploads(api.context)
+    assert head(client, url).status_code == 404
+    url = begin(client, drive_id, PATH, data)
+    assert patch(client, url, 0, data).status_code == 204
+    assert stored(client, drive_id) == sha256_of(data)
+
+
+def test_termination(api: Api, client: Client) -> None:
+    data = image(1000)
+    url = begin(client, client.create(), PATH, data)
+    assert patch(client, url, 0, data[:500]).status_code == 204
+    ended = client.delete(url, headers=VERSION)
+    assert (ended.status_code, ended.headers["tus-resumable"]) == (204, "1.0.0")
+    assert head(client, url).status_code == 404
+    problem_of(patch(client, url, 500, data[500:]), 404, "not-found")
+    problem_of(client.delete(url, headers=VERSION), 404, "not-found")
+
+
+def test_what_is_there_is_not_sent_again(client: Client, drive: TinyDrive) -> None:
+    client.filled(drive)
+    other_id, data = client.create(drive), drive.files[PATH]
+    answer = create(client, other_id, len(data), path=PATH, sha256=sha256_of(data))
+    assert (answer.status_code, answer.headers["upload-offset"], answer.json()["done"]) == (201, str(len(data)), True)
+    assert stored(client, other_id) == sha256_of(data)
+    assert offset_of(client, answer.headers["location"]) == len(data)
+    # Of another project nothing is known.
+    stranger = client.api.client()
+    answer = create(stranger, stranger.create(drive), len(data), path=PATH, sha256=sha256_of(data))
+    assert answer.headers["upload-offset"] == "0"
+
+
+def test_an_archive(client: Client, drive: TinyDrive) -> None:
+    drive_id, zipped = client.create(drive), drive.zipped()
+    answer = create(client, drive_id, len(zipped), archive="", sha256=sha256_of(zipped))
+    url = answer.headers["location"]
+    assert patch(client, url, 0, zipped[:100]).status_code == 204
+    assert patch(client, url, 100, zipped[100:]).status_code == 204
+    assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+
+
+def test_bytes_that_are_not_what_was_announced(api: Api, client: Client) -> None:
+    drive_id, data = client.create(), image(1000)
+    url = begin(client, drive_id, PATH, data, sha256=sha256_of(b"other"))
+    problem_of(patch(client, url, 0, data), 422, "wrong-digest")
+    assert head(client, url).status_code == 404, "there is nothing to go on with"
+    text = b"no image" * 100
+    url = begin(client, drive_id, PATH, text)
+    answer = patch(client, url, 0, text)
+    assert 415 <= answer.status_code <= 422, answer.text
+    assert head(client, url).status_code == 404
+    assert stored(client, drive_id) is None
+    archive = begin_archive(client, drive_id, text)
+    assert patch(client, archive, 0, text).status_code == 415
+
+
+def begin_archive(client: Client, drive_id: str, data: bytes) -> str:
+    answer = create(client, drive_id, len(data), archive="")
+    assert answer.status_code == 201
+    return answer.headers["location"]
+
+
+def test_other_bytes_are_stored_under_the_name(client: Client) -> None:
+    drive = tiny_drive()
+    drive_id, data = client.filled(drive), image(1000)
+    url = begin(client, drive_id, PATH, data)
+    problem_of(patch(client, url, 0, data), 409, "file-exists")
+    url = begin(client, drive_id, PATH, data, replace="true")
+    assert patch(client, url, 0, data).status_code == 204
+    assert stored(client, drive_id) == sha256_of(data)
+
+
+def test_refused_creations(start_api: StartApi) -> None:
+    api = start_api(max_file_bytes=10_000, max_archive_bytes=50_000)
+    client = api.client(max_bytes=20_000)
+    drive_id = client.create()
+    too_large = create(client, drive_id, 10_001, path=PATH)
+    problem_of(too_large, 413, "too-large")
+    assert too_large.headers["tus-max-size"] == "10000"
+    problem_of(create(client, drive_id, 50_001, archive=""), 413, "too-large")
+    problem_of(create(client, drive_id, 5, path="no.png"), 422, "not-in-manifest")
+    problem_of(create(client, drive_id, 5), 400, "malformed-upload")
+    problem_of(create(client, "drv_0", 5, path=PATH), 404, "not-found")
+    assert create(client, drive_id, 9_000, path=PATH).status_code == 201
+    assert create(client, drive_id, 9_000, path="rear/000000.png").status_code == 201
+    problem_of(create(client, drive_id, 9_000, path="rear/000001.png"), 413, "quota-full")
+    other = client.post(f"/v1/drives/{drive_id}/uploads", headers={"Tus-Resumable": "0.2.2", "Upload-Length": "5"})
+    problem_of(other, 412, "tus-version")
+    assert other.headers["tus-version"] == other.headers["tus-resumable"] == "1.0.0"
+
+
+def test_a_committed_drive_takes_none(client: Client) -> None:
+    problem_of(create(client, client.committed(), 5, path=PATH), 409, "drive-committed")
+
+
+def test_refused_requests(client: Client, api: Api) -> None:
+    data = image(1000)
+    url = begin(client, client.create(), PATH, data)
+    wrong_type = client.patch(url, content=b"x", headers={**VERSION, "Upload-Offset": "0"})
+    problem_of(wrong_type, 415, "wrong-media-type")
+    problem_of(patch(client, url, 0, data + b"x"), 413, "too-large")
+    problem_of(patch(client, url, 0, iter((data, b"x"))), 413, "too-large")
+    assert offset_of(client, url) == 0
+    problem_of(patch(client, url, 0, b"x", Upload_Checksum="md5 AAAA"), 400, "malformed-upload")
+    problem_of(patch(client, url, 0, b"x", Upload_Offset="x"), 400, "malformed-upload")
+    stranger = api.client()
+    assert head(stranger, url).status_code == 404
+    problem_of(patch(stranger, url, 0, data), 404, "not-found")
+    problem_of(stranger.delete(url, headers=VERSION), 404, "not-found")
+    assert api.anonymous().head(url, headers=VERSION).status_code == 401
+    assert patch(client, url, 0, data).status_code == 204
+
+
+def test_a_full_disk(start_api: StartApi) -> None:
+    client = start_api().client()
+    drive_id = client.create()
+    full = start_api(min_free_disk_bytes=2**60).client_of(client.project_id, client.key)  # of the same folder
+    problem_of(create(full, drive_id, 10, path=PATH), 507, "disk-full")
+
+
+def test_the_disk_fills_up(client: Client, api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = image(3_000_000)
+    url = begin(client, client.create(), PATH, data)
+    with monkeypatch.context() as full:
+        asked: list[int] = []
+
+        def require_space(folder: object, size_bytes: int, *, min_free_bytes: int) -> None:
+            asked.append(size_bytes)
+            if len(asked) > 2:
+                raise OSError(28, "No space left on device")
+
+        full.setattr("service.uploads.resumable.require_space", require_space)
+        problem_of(patch(client, url, 0, data), 507, "disk-full")
+    kept = offset_of(client, url)
+    assert 0 < kept < len(data)
+    assert patch(client, url, kept, data[kept:]).status_code == 204
+
+
+def test_killed_between_the_last_byte_and_the_end(client: Client, api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All bytes are there, and the drive does not have them yet: whoever asks for the offset brings it to its end."""
+    data, drive_id = image(1000), client.create()
+    url = begin(client, drive_id, PATH, data, sha256=sha256_of(data))
+    with monkeypatch.context() as killed:
+        killed.setattr("service.routes.upload_writing._Held._hand_over", _die)
+        assert patch(client, url, 0, data).status_code == 500
+    assert stored(client, drive_id) is None
+    assert offset_of(client, url) == len(data)
+    assert stored(client, drive_id) == sha256_of(data)
+    # And where the record alone is missing.
+    upload_id = url.rsplit("/", 1)[1]
+    with api.database.write() as session:
+        session.execute(update(Upload).where(Upload.id == upload_id).values(is_done=False))
+    file = PartialFile(api.settings.uploads_dir, upload_id)
+    file.append_at(0, data, min_free_bytes=0)
+    file.close()
+    assert offset_of(client, url) == len(data)
+    assert stored(client, drive_id) == sha256_of(data)
+
+
+def _die(*_: object) -> None:
+    raise RuntimeError("killed")
+
+
+def test_methods_in_a_header(client: Client) -> None:
+    data, drive_id = image(1000), client.create()
+    url = begin(client, drive_id, PATH, data)
+    headers = {**VERSION, "Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    answer = client.post(url, content=data, headers={**headers, "X-HTTP-Method-Override": "PATCH"})
+    assert answer.status_code == 204
+    assert client.post(url, headers={**VERSION, "X-HTTP-Method-Override": "DELETE"}).status_code == 204
+    problem_of(client.post(url, headers=VERSION), 405, "method-not-allowed")
+
+
+def test_repeated_creation(client: Client) -> None:
+    drive_id, key = client.create(), {"Idempotency-Key": "tus-1"}
+    headers = {**VERSION, "Upload-Length": "10", "Upload-Metadata": "path " + "ZnJvbnQvMDAwMDAwLnBuZw=="}
+    first = client.post(f"/v1/drives/{drive_id}/uploads", headers={**headers, **key})
+    again = client.post(f"/v1/drives/{drive_id}/uploads", headers={**headers, **key})
+    assert (first.status_code, first.headers["location"]) == (again.status_code, again.headers["location"])
+    other = client.post(f"/v1/drives/{drive_id}/uploads", headers={**headers, **key, "Upload-Length": "11"})
+    problem_of(other, 422, "idempotency-key-reused")
+
+
+def test_a_deleted_drive_takes_its_uploads_along(client: Client, api: Api) -> None:
+    drive_id, data = client.create(), image(1000)
+    url = begin(client, drive_id, PATH, data)
+    assert patch(client, url, 0, data[:500]).status_code == 204
+    assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
+    assert head(client, url).status_code == 404
+    sweep_uploads(api.context)
+    assert not any(name.startswith(url.rsplit("/", 1)[1]) for name in bytes_left(api))

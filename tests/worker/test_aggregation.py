@@ -1,0 +1,157 @@
+"""Aggregations from the question to the map, with the real engine; only messages are left out, or sent for real."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from mrasfm_engine.synthetic.drive_writer import render_drives
+from mrasfm_engine.synthetic.options import SynthOptions
+from schemas.api.aggregations import AggregationRequest
+from service.persistence import aggregations, jobs
+from service.persistence.tables import Blob, Job, MapFile, MapScene, MapVersion
+from service.persistence.wakeups import Wakeups
+from tests.worker.service_world import World, is_gone, kill, wait_until
+from worker.execution import Runner
+
+
+@pytest.fixture(scope="session")
+def two_drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two rendered drives of one street. Tests only read them."""
+    out = tmp_path_factory.mktemp("rendered") / "drives"
+    options = SynthOptions(cameras=4, units=14, seed=1, drives=2, width=480, height=270, texture_px=256)
+    return render_drives(options, out)
+
+
+@pytest.fixture
+def unpowered(tmp_path: Path) -> World:
+    """Records and files alone."""
+    return World(tmp_path)
+
+
+def ask(world: World, **asked: Any) -> tuple[Job, list[Job]]:
+    with world.database.write() as session:
+        return aggregations.create(
+            session,
+            project_id=world.project_id,
+            asked=AggregationRequest.model_validate(asked),
+            job_expires_us=None,
+        )
+
+
+def run(world: World, *found: Job) -> None:
+    for job in found:
+        Runner(world.settings).run(job.id)
+
+
+def versions(world: World) -> list[MapVersion]:
+    with world.database.read() as session:
+        return list(session.scalars(select(MapVersion).order_by(MapVersion.number)))
+
+
+def document(world: World, number: int, path: str) -> dict[str, Any]:
+    with world.database.read() as session:
+        mine = (MapFile.number == number) & (MapFile.path == path)
+        key = session.scalars(select(Blob.key).join(MapFile, MapFile.blob_id == Blob.id).where(mine)).one()
+    found: dict[str, Any] = json.loads(world.artifacts.read(key))
+    return found
+
+
+def paths(world: World, number: int) -> set[str]:
+    with world.database.read() as session:
+        return set(session.scalars(select(MapFile.path).where(MapFile.number == number)))
+
+
+@pytest.mark.slow
+def test_two_drives_become_a_map(unpowered: World, two_drives: list[Path]) -> None:
+    """And a drive that is broken is named; what was finished is reused; a version is made from another."""
+    world = unpowered
+    ids = [world.add_drive(folder) for folder in two_drives]
+    broken = world.add_drive(two_drives[0])  # the same images: the engine refuses the drive twice
+    job, due = ask(world, drives=ids)
+    assert len(due) == 2
+    run(world, *due)
+    run(world, job)
+    ended = world.job(job.id)
+    assert (ended.state, ended.map_version) == ("SUCCEEDED", 1), ended.problem
+    percents = [event.data["percent"] for event in world.events(job.id) if event.kind == "progress"]
+    assert percents == sorted(percents)
+    (version,) = versions(world)
+    assert version.summary["registered_units"] == 28
+    assert (version.summary["connected"], version.summary["seams"]) == (2, 1)
+    assert {"points.ply", "poses.json", "poses.tum", "frame.json", "map.json", "report.json"} <= paths(world, 1)
+    assert document(world, 1, "report.json")["failed_drives"] == []
+    names = {scene["name"] for scene in document(world, 1, "map.json")["scenes"]}
+    with world.database.read() as session:
+        assert names == set(session.scalars(select(MapScene.name)))
+
+    # The same drive under two ids: the service cannot know, the engine sees it, and the map stays as it is.
+    job, due = ask(world, drives=[broken], map_id=ended.map_id)
+    run(world, *due, job)
+    refused = world.job(job.id)
+    assert (refused.state, refused.attempt) == ("FAILED", 1)
+    assert refused.problem is not None
+    assert refused.problem["type"].endswith("same-drive")
+    assert str(world.settings.data_dir) not in json.dumps(refused.problem)
+    assert len(versions(world)) == 1
+
+    # Another map of the same scenes: nothing that takes long is done again.
+    job, due = ask(world, drives=ids, name="again")
+    assert [each.id for each in due] == [job.id]
+    run(world, job)
+    assert "seams" in world.job(job.id).reused
+    assert list(world.settings.scratch_dir.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_worker_is_killed_in_the_middle(world: World, two_drives: list[Path]) -> None:
+    """Two workers, one of them killed while the map is made, with a drive that fails: one version all the same."""
+    world.start_reconciler()
+    workers = [world.start_worker(), world.start_worker()]
+    ids = [world.add_drive(folder) for folder in two_drives]
+    damaged = Path(world.settings.data_dir) / "damaged"
+    damaged.mkdir()
+    ids.append(world.add_drive(_damaged(two_drives[0], damaged)))
+    job, due = ask(world, drives=ids)
+    Wakeups(world.settings).send(due)
+    with world.database.read() as session:
+        children = {m.drive_id: m.child_id for m, _ in jobs.members_of(session, [job.id])[job.id]}
+    assert world.wait_for_end(str(children[ids[2]])).state == "FAILED"
+    for drive_id in ids[:2]:
+        assert world.wait_for_end(str(children[drive_id])).state == "SUCCEEDED"
+    stage = world.hold(job.id)
+    holder = world.job(job.id).owner
+    assert holder is not None
+    victim = next(worker for worker in workers if _started(worker.pid, int(holder.rpartition(":")[2])))
+    for process in (victim.pid, int(holder.rpartition(":")[2])):
+        kill(process)
+    wait_until(lambda: is_gone(stage), "the stage's end")
+    ended = world.wait_for_end(job.id)
+    assert (ended.state, ended.attempt) == ("SUCCEEDED", 2), ended.problem
+    (version,) = versions(world)
+    assert [failed["drive_id"] for failed in version.failed] == [ids[2]]
+    (named,) = document(world, 1, "report.json")["failed_drives"]
+    assert named["drive_id"] == ids[2]
+    assert named["problem"]["detail"]
+    assert len(world.scenes()) == 2
+
+
+def _damaged(drive: Path, out: Path) -> Path:
+    """A drive whose images end early."""
+    for file in drive.rglob("*"):
+        if file.is_file():
+            target = out / file.relative_to(drive)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            data = file.read_bytes()
+            target.write_bytes(data[:-2000] if file.suffix == ".jpg" else data)
+    return out
+
+
+def _started(pid: int, child: int) -> bool:
+    import psutil
+
+    return pid in {parent.pid for parent in psutil.Process(child).parents()} | {child}
