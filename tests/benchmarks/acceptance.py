@@ -18,6 +18,7 @@
 | 14 | time of mapping a rendered drive of six cameras beside COLMAP's mappers on the same matches |
 | 15 | how time, memory and error grow with the length of simulated routes |
 | 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
+| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -43,6 +44,7 @@ from rich.console import Console
 from mrasfm_engine import __version__
 from tests.benchmarks.ablation import ablation
 from tests.benchmarks.adjustment import adjustment
+from tests.benchmarks.aggregation import crossing, kitti, loop, repeated, speed_of_aggregation
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.correspondence import correspondence
@@ -89,6 +91,7 @@ LINES = {
     "14": Line(repeated=(surround_speed,)),
     "15": Line(timed=(long_routes,)),
     "16": Line(repeated=(correspondence,)),
+    "20": Line(timed=(kitti, speed_of_aggregation), by_seed=(crossing, repeated, loop)),
 }
 
 
