@@ -15,6 +15,7 @@
 | 11 | the road from above, before and after recalibration |
 | 12 | learned keypoints and matches: accuracy on a real drive, and light that changes |
 | 13 | camera set bundle adjustment beside Ceres, on one problem |
+| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -40,6 +41,7 @@ from rich.console import Console
 from mrasfm_engine import __version__
 from tests.benchmarks.ablation import ablation
 from tests.benchmarks.adjustment import adjustment
+from tests.benchmarks.aggregation import crossing, kitti, loop, repeated, speed_of_aggregation
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.fresh_clone import fresh_clone
@@ -79,6 +81,7 @@ LINES = {
     "11": Line(untimed=(birds_eye,)),
     "12": Line(untimed=(learned,)),
     "13": Line(timed=(adjustment,)),
+    "20": Line(timed=(kitti, speed_of_aggregation), by_seed=(crossing, repeated, loop)),
 }
 
 
