@@ -85,12 +85,17 @@ def aggregate(
 
 
 def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Seam]) -> tuple[SeamGraph, list[Chain]]:
-    """Seams without contradictions, and the chain of every component; that of the reference comes first."""
+    """Seams without contradictions, and the chain of every component; the map's, which is the largest, comes first.
+
+    It begins with the reference, or where that is not in the largest component with this one's first scene.
+    """
     graph = SeamGraph([scene.name for scene in found], seams)
     done: set[int] = set()
     chains: list[Chain] = []
-    # The reference's component first, then the larger ones.
-    starts = [known.reference, *(c[0] for c in graph.components())]
+    components = graph.components()
+    own = next(c for c in components if known.reference in c)
+    starts = [known.reference] if len(own) == len(components[0]) else []
+    starts += [c[0] for c in components]
     for start in [*starts, *range(len(found))]:
         if start in done:
             continue

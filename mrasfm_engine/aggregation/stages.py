@@ -237,6 +237,8 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
                     "seams", 100 * number + min(99, 100 * done // max(of, 1)), 100 * total
                 ),
             )
+            if run.cancel():
+                raise CancelledError  # else a seam that is half adjusted would pass for a finished one
             run.store.save(f"seam-{name}", key, *seam.pack())
         else:
             seam = Seam.unpack(a.name, b.name, *kept)

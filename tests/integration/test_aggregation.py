@@ -1,4 +1,4 @@
-"""Two rendered drives of one street become a map; one is taken out and put in again; what cannot be in a map is refused."""
+"""Rendered drives of one street become a map; one is added and taken out; what cannot be in a map is refused."""
 
 from __future__ import annotations
 

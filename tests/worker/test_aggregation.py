@@ -15,7 +15,7 @@ from schemas.api.aggregations import AggregationRequest
 from service.persistence import aggregations, jobs
 from service.persistence.tables import Blob, Job, MapFile, MapScene, MapVersion
 from service.persistence.wakeups import Wakeups
-from tests.worker.service_world import World, is_gone, kill, wait_until
+from tests.worker.service_world import TERMINAL, World, is_gone, kill, wait_until
 from worker.execution import Runner
 
 
@@ -120,9 +120,8 @@ def test_a_worker_is_killed_in_the_middle(world: World, two_drives: list[Path]) 
     Wakeups(world.settings).send(due)
     with world.database.read() as session:
         children = {m.drive_id: m.child_id for m, _ in jobs.members_of(session, [job.id])[job.id]}
-    assert world.wait_for_end(str(children[ids[2]])).state == "FAILED"
-    for drive_id in ids[:2]:
-        assert world.wait_for_end(str(children[drive_id])).state == "SUCCEEDED"
+    ends = {drive_id: ended_in_time(world, str(children[drive_id])).state for drive_id in ids}
+    assert list(ends.values()) == ["SUCCEEDED", "SUCCEEDED", "FAILED"]
     stage = world.hold(job.id)
     holder = world.job(job.id).owner
     assert holder is not None
@@ -130,7 +129,7 @@ def test_a_worker_is_killed_in_the_middle(world: World, two_drives: list[Path]) 
     for process in (victim.pid, int(holder.rpartition(":")[2])):
         kill(process)
     wait_until(lambda: is_gone(stage), "the stage's end")
-    ended = world.wait_for_end(job.id)
+    ended = ended_in_time(world, job.id)
     assert (ended.state, ended.attempt) == ("SUCCEEDED", 2), ended.problem
     (version,) = versions(world)
     assert [failed["drive_id"] for failed in version.failed] == [ids[2]]
@@ -138,6 +137,12 @@ def test_a_worker_is_killed_in_the_middle(world: World, two_drives: list[Path]) 
     assert named["drive_id"] == ids[2]
     assert named["problem"]["detail"]
     assert len(world.scenes()) == 2
+
+
+def ended_in_time(world: World, job_id: str) -> Job:
+    """Two reconstructions at one time, and what they wait for, take their time on a busy machine."""
+    wait_until(lambda: world.job(job_id).state in TERMINAL, lambda: world.log()[-3000:], within_s=900)
+    return world.job(job_id)
 
 
 def _damaged(drive: Path, out: Path) -> Path:
