@@ -95,9 +95,9 @@ def test_components_and_scenes_alone(rng: np.random.Generator) -> None:
     assert graph.chain(4).scenes == (4,)
 
 
-@pytest.mark.parametrize("wrong", [0, 1, 4])
+@pytest.mark.parametrize("wrong", [1, 4])
 def test_the_seam_that_contradicts_the_others_goes(rng: np.random.Generator, wrong: int) -> None:
-    """With two loops it is clear which one it is."""
+    """Seams 0 and 1 are the only ones of scene 1, so that the loops say "one of these": the weaker one goes."""
     world = poses(rng)
     seams = ring(world, rng)
     seams.append(seam(0, 2, noisy(se3.inverse(world[0]) @ world[2], rng), inliers=300))

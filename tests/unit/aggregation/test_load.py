@@ -1,0 +1,71 @@
+"""A written scene read back for aggregation, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export_example import make_scene
+
+from mrasfm_engine.aggregation.load import name_scenes, read_scene
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.export_scene import write_scene
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_scene(make_scene(), tmp_path / "scene", {"settings": {"features": {"extractor": "sift"}}})
+    return tmp_path / "scene"
+
+
+def test_everything_comes_back(folder: Path) -> None:
+    written, read = make_scene(), read_scene(folder, "one")
+    assert np.array_equal(read.unit_registered, written.unit_registered)
+    kept = written.unit_registered
+    assert np.abs(read.world_from_rig[kept] - written.world_from_rig[kept]).max() < 1e-9
+    assert np.array_equal(read.points_m, written.points_m)
+    assert np.array_equal(read.point_colors, written.point_colors)
+    assert np.array_equal(read.point_classes, written.point_classes)
+    seen = np.isfinite(written.world_from_cam[:, 0, 0])
+    assert np.abs(read.world_from_cam[seen] - written.world_from_cam[seen]).max() < 1e-8
+    rows = read.keypoint_first[written.observation_image] + written.observation_keypoint
+    assert np.array_equal(read.keypoint_point[rows], written.observation_point)
+    assert (read.keypoint_point >= 0).sum() == len(rows)
+    for row, image, keypoint in zip(rows, written.observation_image, written.observation_keypoint, strict=True):
+        descriptor = read.descriptors[read.descriptor_row[row]]
+        assert np.array_equal(descriptor, written.features[image].descriptors[keypoint])
+
+
+def test_packing_changes_nothing(folder: Path) -> None:
+    read = read_scene(folder, "one")
+    again = SourceScene.unpack("two", *read.pack())
+    assert again.fingerprint == read.fingerprint
+    assert again.name == "two"
+
+
+def test_damage_is_said_by_name(folder: Path) -> None:
+    data = (folder / "model" / "points3D.bin").read_bytes()
+    (folder / "model" / "points3D.bin").write_bytes(data[:-9])
+    with pytest.raises(InputError, match="scene one: .* is damaged"):
+        read_scene(folder, "one")
+    (folder / "model" / "points3D.bin").write_bytes(data)
+    frame = json.loads((folder / "frame.json").read_text())
+    (folder / "frame.json").write_text(json.dumps({**frame, "version": 9}))
+    with pytest.raises(InputError, match="is of version 9") as raised:
+        read_scene(folder, "one")
+    assert raised.value.code == "scene-version"
+    (folder / "frame.json").write_text(json.dumps({**frame, "georeferenced": False}))
+    with pytest.raises(InputError, match="is not georeferenced") as raised:
+        read_scene(folder, "one")
+    assert raised.value.code == "not-georeferenced"
+
+
+def test_names() -> None:
+    assert name_scenes([Path("/a/x"), Path("/b/y")]) == {"x": Path("/a/x"), "y": Path("/b/y")}
+    with pytest.raises(InputError, match="called 'x'"):
+        name_scenes([Path("/a/x"), Path("/b/x")])
+    with pytest.raises(InputError, match="cannot be the name"):
+        name_scenes({"../x": Path("/a/x")})
