@@ -26,7 +26,7 @@ HOUR_US = 3_600_000_000
 def queued(world: World) -> int:
     """Messages that wait for a worker."""
     with redis.Redis.from_url(world.broker.url) as client:
-        return sum(int(client.llen(queue)) for queue in QUEUES.values())
+        return sum(int(client.llen(queue)) for queue in set(QUEUES.values()))
 
 
 def flush(world: World) -> None:
