@@ -23,6 +23,7 @@ Ints = NDArray[np.int64]
 
 SIGHT_SHIFT_M = 12.0  # cameras this far apart along their views still match
 MIN_OVERLAP = 0.15
+LEAST_PROBES = 10  # units of a short way that are looked for, or looked at
 PROBE_PAIRS = 14  # of an image, while it is not known how the scenes lie
 SIMILAR_DISTANCE_M = 10.0  # cameras this far apart count half
 
@@ -47,6 +48,10 @@ def thinned(scene: SourceScene, spacing_m: float) -> Ints:
     return np.array(chosen, dtype=np.int64)
 
 
+def _length_m(scene: SourceScene) -> float:
+    return float(np.linalg.norm(np.diff(scene.way_m, axis=0), axis=1).sum())
+
+
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
     """How near the ways of two scenes come to one another, horizontally, as they lie."""
     way = b.way_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
@@ -62,7 +67,9 @@ def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggregation
         How the scenes lie by their positions (4, 4).
     """
     reach = config.position_error_m + SIGHT_SHIFT_M
-    units_a, units_b = thinned(a, config.probe_spacing_m * 0.75), thinned(b, config.probe_spacing_m)
+    units_a, units_b = (
+        thinned(s, min(config.probe_spacing_m * f, _length_m(s) / LEAST_PROBES)) for s, f in ((a, 0.75), (b, 1))
+    )
     images_a, images_b = _images_of(a, units_a), _images_of(b, units_b)
     if not len(images_a) or not len(images_b):
         return []

@@ -49,7 +49,7 @@ def test_packing_changes_nothing(folder: Path) -> None:
 def test_damage_is_said_by_name(folder: Path) -> None:
     data = (folder / "model" / "points3D.bin").read_bytes()
     (folder / "model" / "points3D.bin").write_bytes(data[:-9])
-    with pytest.raises(InputError, match="scene one: .* is damaged"):
+    with pytest.raises(InputError, match=r"scene one: .* is damaged"):
         read_scene(folder, "one")
     (folder / "model" / "points3D.bin").write_bytes(data)
     frame = json.loads((folder / "frame.json").read_text())
