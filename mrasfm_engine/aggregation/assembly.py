@@ -71,6 +71,12 @@ class Assembly:
         return np.concatenate([s.unit_registered for s in self.scenes])
 
     @cached_property
+    def image_size_px(self) -> Floats:
+        """Width and height of every camera's images (cameras, 2)."""
+        sizes = [(camera.width, camera.height) for scene in self.scenes for camera in scene.drive.cameras]
+        return np.array(sizes, dtype=np.float64)
+
+    @cached_property
     def image_unit(self) -> Ints:
         """(i,)."""
         return np.concatenate([s.image_unit + f for s, f in zip(self.scenes, self.first_unit, strict=False)])

@@ -99,7 +99,6 @@ def adjust_map(
     free = _free_units(assembly, problem, joined, config)
     reports: list[Report] = []
     positions = {k: with_bias(p, state) for k, p in positions.items()}
-    sizes = np.array([(c.width, c.height) for s in assembly.scenes for c in s.drive.cameras], dtype=np.float64)
     for _ in range(ROUNDS if free.any() else 0):
         seen = np.zeros(tracks.count, dtype=np.bool_)
         seen[problem.observations.point[free[problem.observations.unit]]] = True
@@ -108,7 +107,9 @@ def adjust_map(
             layout=Layout.of(free, _no_cameras(assembly)),
             terms=_terms(assembly, positions, free),
         )
-        solution, report = solve_with_chosen_points(part, sizes, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel)
+        solution, report = solve_with_chosen_points(
+            part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
+        )
         reports.append(report)
         points = problem.state.points_m.copy()
         points[seen] = solution.points_m

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.adjustment.point_choice import solve_with_chosen_points
 from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import Layout
-from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions, solve
+from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.adjustment.unit_sets import UnitSets
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.matching import CrossMatches
@@ -29,7 +30,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-DECREMENT_TOLERANCE = 1e-4  # a transform costs six unknowns: it may come close
+OBSERVATIONS_OF_IMAGE = 100  # from which transforms are estimated: each has those of many images
+INITIAL_DAMPING = 1e-6  # scenes lie nearly right before they are adjusted
 SCALE_LOSS = 3.0  # of residuals of shared points, in their median
 CORRELATION = 4.0  # errors that keypoints of one image share: so many of them count once
 
@@ -150,7 +152,7 @@ def transform_problem(
         options=SolverOptions(
             max_iterations=iterations,
             function_tolerance=1e-6,
-            decrement_tolerance=DECREMENT_TOLERANCE,
+            initial_damping=INITIAL_DAMPING,
             loss_scale=config.adjustment.loss_scale,
             threads=config.threads,
         ),
@@ -191,7 +193,9 @@ def adjust_transform(
         owner[shared.pairs[:, 0]] = owner[shared.pairs[:, 1]] = np.arange(len(shared))
         tracks = tracks_of(assembly, owner)
         problem = transform_problem(assembly, state, tracks, np.array([-1, 0]), config)
-        solution, report = solve(problem, cancel=cancel)
+        solution, report = solve_with_chosen_points(
+            problem, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
+        )
         poses = moved_scenes(assembly, poses, solution)
         errors_px = np.sqrt(problem.errors_px2(solution))
         if last:

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.solver import Report, solve
+from mrasfm_engine.adjustment.point_choice import solve_with_chosen_points
+from mrasfm_engine.adjustment.solver import Report
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.fine import moved_scenes, tracks_of, transform_problem
+from mrasfm_engine.aggregation.fine import OBSERVATIONS_OF_IMAGE, moved_scenes, tracks_of, transform_problem
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
@@ -98,7 +99,9 @@ def adjust_jointly(
     sets = np.arange(len(assembly.scenes))
     sets = np.where(sets == fixed, -1, sets - (sets > fixed))
     problem = transform_problem(assembly, assembly.state(first_from_scene), tracks, sets, config)
-    solution, report = solve(problem, cancel=cancel)
+    solution, report = solve_with_chosen_points(
+        problem, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
+    )
     poses = moved_scenes(assembly, first_from_scene, solution)
     return JointResult(first_from_scene=poses, owner=owner, report=report)
 
