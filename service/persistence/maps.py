@@ -254,8 +254,11 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
 
 def forget_expired(session: Session, now: int) -> None:
     """Delete maps, then scenes, that have passed their retention dates; what a map or a job needs stays."""
+    # Locked first: an aggregation that is asked for at this moment has been recorded then, or finds nothing.
+    session.scalars(select(Map.id).where(Map.expires_us < now).order_by(Map.id).with_for_update()).all()
     busy = select(Job.map_id).where(Job.map_id.is_not(None), Job.state.not_in(TERMINAL))
     session.execute(delete(Map).where(Map.expires_us < now, Map.id.not_in(busy)))
+    session.scalars(select(Scene.id).where(Scene.expires_us < now).order_by(Scene.id).with_for_update()).all()
     in_job = (
         select(JobMember.job_id)
         .join(Job, Job.id == JobMember.job_id)
