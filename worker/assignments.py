@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -100,9 +101,13 @@ class MapAssignment:
     """An aggregation."""
 
     def __init__(self, database: Database, artifacts: ArtifactStore, held: jobs.Claim) -> None:
-        self._artifacts, self._held = artifacts, held
-        with database.read() as session:
-            self._inputs: MapInputs = inputs_of(session, held.job_id)
+        self._database, self._artifacts, self._held = database, artifacts, held
+
+    @cached_property
+    def _inputs(self) -> MapInputs:
+        """Read where they are needed: what publishes must not fail for a database that is away for a moment."""
+        with self._database.read() as session:
+            return inputs_of(session, self._held.job_id)
 
     @property
     def shelf(self) -> Shelf | None:

@@ -13,7 +13,7 @@ from service.persistence import jobs, maps, trees, workers
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.collecting import collect_orphans, collect_unused
 from service.persistence.database import Database
-from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, MapScene, now_us
+from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, now_us
 from service.persistence.wakeups import BrokerError, Wakeups, task_id
 from service.settings import Settings
 
@@ -111,14 +111,17 @@ class Reconciler:
 
     def _expire(self) -> None:
         now = now_us()
+        with self._database.write() as session:  # of its own: aggregations lock maps and scenes before drives
+            maps.forget_expired(session, now)
         with self._database.write() as session:
             # Locked first: a job that is asked for at this moment has been recorded then, or finds no drive.
             expired = session.scalars(select(Drive.id).where(Drive.expires_us < now).with_for_update()).all()
             active = select(Job.drive_id).where(Job.drive_id.is_not(None), Job.state.not_in(TERMINAL))
             in_map = select(MapScene.drive_id)
-            idle = Drive.id.not_in(active) & Drive.id.not_in(in_map)
+            of_jobs = select(JobMember.drive_id).join(Job, Job.id == JobMember.job_id)
+            wanted = of_jobs.where(Job.state.not_in(TERMINAL))
+            idle = Drive.id.not_in(active) & Drive.id.not_in(in_map) & Drive.id.not_in(wanted)
             session.execute(delete(Drive).where(Drive.id.in_(expired), idle))
-            maps.forget_expired(session, now)
             session.execute(delete(Job).where(Job.expires_us < now, Job.state.in_(TERMINAL)))
             kept_us = int(self._settings.idempotency_hours * _HOUR_US)
             session.execute(delete(IdempotencyKey).where(IdempotencyKey.created_us < now - kept_us))

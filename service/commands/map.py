@@ -21,6 +21,7 @@ from service.commands.conversation import (
 )
 
 if TYPE_CHECKING:
+    from schemas.api.aggregations import AggregationRequest
     from schemas.api.jobs import JobResource
     from schemas.api.maps import MapVersionResource
     from service.client import Client, DriveFolder
@@ -81,6 +82,7 @@ def _converse(arguments: argparse.Namespace, summary: Summary, display: Display)
     from service.client.download import require_free
 
     folders = [DriveFolder.read(path) for path in arguments.drives]
+    _asked(arguments, [])  # what cannot be asked for is said before the drives are sent
     if arguments.out is not None:
         require_free(arguments.out, None)
     with connect(arguments, display) as client:
@@ -91,8 +93,6 @@ def _converse(arguments: argparse.Namespace, summary: Summary, display: Display)
 def _ask(
     client: Client, folders: list[DriveFolder], arguments: argparse.Namespace, summary: Summary, display: Display
 ) -> JobResource:
-    from schemas.api.aggregations import AggregationRequest
-    from schemas.api.jobs import ReconstructionSettings
     from service.client import UploadState, start_aggregation, upload_drive
 
     began_s = time.monotonic()
@@ -102,18 +102,33 @@ def _ask(
         summary.drive_ids.append(sent.drive_id)
         display.say(f"drive {sent.drive_id}: {sent.files_sent} files sent, {sent.files_skipped} were there")
     summary.seconds["upload"] = round(time.monotonic() - began_s, 3)
-    asked = AggregationRequest(
-        drives=summary.drive_ids,
-        map_id=arguments.into,
-        remove=arguments.remove,
-        name=arguments.name,
-        settings=ReconstructionSettings(use_gnss=not arguments.no_gnss),
-        require_all=arguments.require_all,
-    )
+    asked = _asked(arguments, summary.drive_ids)
     job = start_aggregation(client, asked, state=states[0] if states else None)
     summary.job_id, summary.job_state, summary.map_id = job.id, job.state, job.map_id
     display.say(f"job {job.id}: {client.url}/v1/jobs/{job.id}")
     return job
+
+
+def _asked(arguments: argparse.Namespace, drive_ids: list[str]) -> AggregationRequest:
+    from pydantic import ValidationError
+
+    from schemas.api.aggregations import AggregationRequest
+    from schemas.api.jobs import ReconstructionSettings
+    from service.client import ClientError
+
+    try:
+        return AggregationRequest(
+            drives=drive_ids,
+            map_id=arguments.into,
+            remove=arguments.remove,
+            name=arguments.name,
+            settings=ReconstructionSettings(use_gnss=not arguments.no_gnss),
+            require_all=arguments.require_all,
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = {"map_id": "into"}.get(str(first["loc"][0]), first["loc"][0])
+        raise ClientError(f"--{option} is {first['input']!r}: {first['msg']}. Correct it.") from None
 
 
 def _receive(

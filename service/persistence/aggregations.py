@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from typing import Any
 
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
@@ -34,6 +35,8 @@ from service.persistence.tables import (
 CHILDREN_PERCENT = 80.0
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 _NAME_LENGTH = 80
+# A row that is locked so is not deleted; other aggregations may do the same, in whatever order.
+_KEPT: Mapping[str, bool] = {"read": True, "key_share": True}
 
 
 @dataclass
@@ -41,7 +44,9 @@ class _Plan:
     """A checked request: which drives come, with which scene where it is there, and what of the map stays."""
 
     drives: list[Drive] = field(default_factory=list)
-    scenes: dict[str, Scene] = field(default_factory=dict)  # by drive
+    scenes: dict[str, Scene] = field(default_factory=dict)  # by drive, as asked for
+    found: dict[str, Scene] = field(default_factory=dict)  # by drive, of those that were asked for by their drives
+    under_way: dict[str, Job] = field(default_factory=dict)  # by drive
     kept: list[MapScene] = field(default_factory=list)
     removed: list[MapScene] = field(default_factory=list)
 
@@ -76,6 +81,8 @@ def create(
         of_map = Map(id=new_id("map"), project_id=project_id, name=asked.name or _map_name(plan))
         session.add(of_map)
     settings = asked.settings.model_dump(mode="json", exclude_none=True)
+    # Before anything locks the project, as a new job does: who publishes a scene holds its job and wants the project.
+    _find_what_is_there(session, plan, settings)
     job = jobs.create(
         session,
         project_id=project_id,
@@ -94,7 +101,7 @@ def create(
         },
         waiting_for=1,  # until its members are known
     )
-    children = list(_members(session, job, plan, asked))
+    children = list(_members(session, job, plan))
     if any(child is not None for child in children):
         session.execute(update(Job).where(Job.id == job.id).values(children_percent=CHILDREN_PERCENT))
     session.flush()
@@ -122,8 +129,9 @@ def _checked(session: Session, project_id: str, asked: AggregationRequest, of_ma
     if of_map is not None:
         plan.kept = maps.scenes_of(session, of_map)
     _take_out(plan, asked.remove, of_map)
+    session.scalars(select(Scene.id).where(Scene.id.in_(asked.scenes)).with_for_update(**_KEPT)).all()
     for scene_id in asked.scenes:
-        scene = require(session, Scene, project_id, scene_id, lock=True)
+        scene = require(session, Scene, project_id, scene_id)
         _require_once(plan, scene.drive_id, f"scene {scene_id}")
         plan.scenes[scene.drive_id] = scene
     found = [drives.get(session, project_id, drive_id, lock=True) for drive_id in sorted(set(asked.drives))]
@@ -192,7 +200,18 @@ def _require_ready(found: Collection[Drive], *, require_all: bool) -> None:
         )
 
 
-def _members(session: Session, job: Job, plan: _Plan, asked: AggregationRequest) -> Iterator[Job | None]:
+def _find_what_is_there(session: Session, plan: _Plan, settings: Mapping[str, Any]) -> None:
+    for drive in plan.drives:
+        # In this order: a job that ends while its row is waited for leaves a scene that is seen afterwards.
+        job = _job_under_way(session, drive, settings)
+        scene = _scene_of(session, drive, settings)
+        if scene is not None:
+            plan.found[drive.id] = scene
+        elif job is not None:
+            plan.under_way[drive.id] = job
+
+
+def _members(session: Session, job: Job, plan: _Plan) -> Iterator[Job | None]:
     """Record what the aggregation brings; for each the job that makes its scene, None where that is there."""
     taken = {scene.name for scene in (*plan.kept, *plan.removed)}
     for drive_id, scene in plan.scenes.items():
@@ -202,7 +221,7 @@ def _members(session: Session, job: Job, plan: _Plan, asked: AggregationRequest)
     for drive in plan.drives:
         member = JobMember(job_id=job.id, drive_id=drive.id, name=_name(drive.name, taken))
         session.add(member)
-        known = _scene_of(session, drive, job)
+        known = plan.found.get(drive.id)
         if known is not None:
             member.scene_id = known.id
             yield None
@@ -210,25 +229,26 @@ def _members(session: Session, job: Job, plan: _Plan, asked: AggregationRequest)
             member.problem = _rejection(drive).model_dump(mode="json", exclude_none=True)
             yield None
         else:
-            child = _job_under_way(session, drive, job) or _child(session, drive, job)
+            child = plan.under_way.get(drive.id) or _child(session, drive, job)
             member.child_id = child.id
             yield child
 
 
-def _scene_of(session: Session, drive: Drive, job: Job) -> Scene | None:
+def _scene_of(session: Session, drive: Drive, settings: Mapping[str, Any]) -> Scene | None:
     """The newest scene of a drive that a reconstruction would make again."""
-    same = (Scene.drive_id == drive.id) & (Scene.settings_sha256 == settings_sha256(job.settings))
-    made = session.scalars(select(Scene).where(same).order_by(Scene.created_us.desc()).with_for_update())
+    same = (Scene.drive_id == drive.id) & (Scene.settings_sha256 == settings_sha256(settings))
+    statement = select(Scene).where(same).order_by(Scene.created_us.desc())
+    made = session.scalars(statement.with_for_update(**_KEPT))
     return next((scene for scene in made if scene.summary.get("engine_version") == version("mrasfm")), None)
 
 
-def _job_under_way(session: Session, drive: Drive, job: Job) -> Job | None:
+def _job_under_way(session: Session, drive: Drive, settings: Mapping[str, Any]) -> Job | None:
     """A reconstruction that somebody has asked for already; locked, so that it does not end unseen."""
     active = jobs.active_of_drive(drive.id).where(Job.kind == JobKind.RECONSTRUCTION, Job.cancel_requested_us.is_(None))
     for found in session.scalars(active.order_by(Job.created_us)).all():
         session.refresh(found, with_for_update=True)
         still = found.state not in TERMINAL and found.cancel_requested_us is None
-        if still and found.settings == job.settings:
+        if still and found.settings == settings:
             return found
     return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from sqlalchemy import delete, func, or_, select, tuple_, update
+from sqlalchemy import delete, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from schemas.api.maps import MapSummary
@@ -114,8 +114,7 @@ def publish(
         Where the job is not this holder's any more; the caller's session must roll back.
     """
     map_id = held.map_id or ""
-    newest = session.scalar(select(func.max(MapVersion.number)).where(MapVersion.map_id == map_id)) or 0
-    number = newest + 1
+    number = (session.scalar(select(Map.newest_version).where(Map.id == map_id)) or 0) + 1
     jobs.succeed(session, held, map_version=number, reused=reused)
     job = session.get_one(Job, held.job_id)
     members = [member for member, _ in jobs.members_of(session, [held.job_id]).get(held.job_id, [])]
@@ -141,7 +140,7 @@ def publish(
     for path, file in files.items():
         blob = blobs.record(session, project_id=held.project_id, within_quota=False, **file.identity)
         session.add(MapFile(map_id=map_id, number=number, path=path, blob_id=blob.id, media_type=media_type(path)))
-    shown = {"current_version": number, "expires_us": expires_us}
+    shown = {"current_version": number, "newest_version": number, "expires_us": expires_us}
     session.execute(update(Map).where(Map.id == map_id).values(**shown))
     return number
 
@@ -254,8 +253,11 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
 
 def forget_expired(session: Session, now: int) -> None:
     """Delete maps, then scenes, that have passed their retention dates; what a map or a job needs stays."""
+    # Locked first: an aggregation that is asked for at this moment has been recorded then, or finds nothing.
+    session.scalars(select(Map.id).where(Map.expires_us < now).order_by(Map.id).with_for_update()).all()
     busy = select(Job.map_id).where(Job.map_id.is_not(None), Job.state.not_in(TERMINAL))
     session.execute(delete(Map).where(Map.expires_us < now, Map.id.not_in(busy)))
+    session.scalars(select(Scene.id).where(Scene.expires_us < now).order_by(Scene.id).with_for_update()).all()
     in_job = (
         select(JobMember.job_id)
         .join(Job, Job.id == JobMember.job_id)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
+from schemas.api.drives import DriveState
 from service.errors import ServiceError, not_found
 from service.persistence import blobs, drives, slots
 from service.persistence.owned import require
 from service.persistence.storing import StoredFile
-from service.persistence.tables import Project, Upload, new_id, now_us
+from service.persistence.tables import Drive, Project, Upload, new_id, now_us
 
 MAX_OPEN = 1000  # of a project: each is a file in the spool
 
@@ -76,10 +77,14 @@ def create(session: Session, *, project_id: str, drive_id: str, announced: Annou
 
 
 def _require_room(session: Session, project_id: str, size_bytes: int) -> None:
-    """What is announced and not here yet counts as if it were: many uploads cannot share the last free bytes."""
+    """What is announced and not here yet counts as if it were: many uploads cannot share the last free bytes.
+
+    Uploads into a drive that was committed meanwhile come to nothing, and count nothing.
+    """
     project = session.get_one(Project, project_id, with_for_update=True)
     still_open = (Upload.project_id == project_id) & ~Upload.is_done & (Upload.expires_us > now_us())
-    announced = select(func.count(), func.coalesce(func.sum(Upload.size_bytes), 0)).where(still_open)
+    announced = select(func.count(), func.coalesce(func.sum(Upload.size_bytes), 0)).select_from(Upload)
+    announced = announced.join(Drive, Drive.id == Upload.drive_id).where(still_open, Drive.state == DriveState.OPEN)
     count, coming_bytes = session.execute(announced).one()
     if count >= MAX_OPEN:
         raise ServiceError(

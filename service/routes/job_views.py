@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 from sqlalchemy import select
@@ -27,9 +28,11 @@ def shown_state(job: Job, settings: Settings) -> ShownState:
     return ShownState(job.state)
 
 
-def etag_of(job: Job, settings: Settings) -> str:
-    """Changes with everything that a reader can see."""
-    return f'"{job.revision}-{shown_state(job, settings).lower()}"'
+def etag_of(job: Job, shown: JobResource) -> str:
+    """Changes with everything that a reader can see; also with members, which go on after an aggregation has ended."""
+    members = "".join(member.model_dump_json() for member in shown.members)
+    of_members = f"-{hashlib.sha256(members.encode()).hexdigest()[:16]}" if members else ""
+    return f'"{job.revision}-{shown.state.lower()}{of_members}"'
 
 
 def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list[JobResource]:

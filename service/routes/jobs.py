@@ -69,7 +69,7 @@ def get_job(
     with context.database.read() as session:
         job = require(session, Job, caller.project_id, job_id)
         shown = view_of(session, job, context.settings)
-    etag = etag_of(job, context.settings)
+    etag = etag_of(job, shown)
     headers = {"ETag": etag, "Cache-Control": "no-cache"}
     if job.state not in TERMINAL:
         headers["Retry-After"] = str(RETRY_AFTER_S)

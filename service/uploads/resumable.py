@@ -229,8 +229,9 @@ def sweep(folder: Path, alive: Callable[[Sequence[str]], set[str]]) -> int:
         with suppress(ServiceError):  # a request holds it; the next sweep comes
             file = PartialFile(folder, upload_id)
             try:
-                file.remove()
-                removed += 1
+                if not alive([upload_id]):  # a request that held it may just have gone on with it
+                    file.remove()
+                    removed += 1
             finally:
                 file.close()
     return removed

@@ -123,6 +123,29 @@ def test_progress_covers_the_tree(client: Client, drives: list[str]) -> None:
     assert events == []
 
 
+def test_the_etag_covers_the_tree(client: Client, drives: list[str]) -> None:
+    """Members change without their aggregation: where one waits again, and after the aggregation has ended."""
+    job = client.aggregate(drives=drives)
+    child = members(client, job["id"])[drives[0]]["job_id"]
+
+    def etag() -> str:
+        return str(client.get(f"/v1/jobs/{job['id']}").headers["etag"])
+
+    held = client.claim(child)
+    running = etag()
+    assert running == etag()
+    with client.api.database.write() as session:
+        jobs.release(session, held)
+    assert members(client, job["id"])[drives[0]]["state"] == "QUEUED"
+    assert etag() != running
+    assert client.post(f"/v1/jobs/{job['id']}:cancel").json()["state"] == "CANCELLED"
+    tend(client)
+    assert members(client, job["id"])[drives[0]]["state"] == "CANCELLED"
+    ended = etag()
+    assert ended != running
+    assert client.get(f"/v1/jobs/{job['id']}", headers={"If-None-Match": ended}).status_code == 304
+
+
 def test_a_drive_that_fails_does_not_take_the_others_with_it(client: Client, drives: list[str]) -> None:
     job = client.aggregate(drives=drives)
     children = {drive: members(client, job["id"])[drive]["job_id"] for drive in drives}

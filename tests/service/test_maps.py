@@ -153,6 +153,14 @@ def test_deleting_versions(api: Api, client: Client, drives: list[str], map_id: 
     assert not [path for path in api.objects(client.project_id) if path.read_bytes() == b"none of these"]
 
 
+def test_the_number_of_a_deleted_version_is_not_given_again(client: Client, drives: list[str], map_id: str) -> None:
+    assert new_version(client, map_id=map_id, drives=[drives[2]])["map_version"] == 2
+    assert client.put(f"/v1/maps/{map_id}/current-version", json={"version": 1}).status_code == 200
+    assert client.delete(f"/v1/maps/{map_id}/versions/2").status_code == 204
+    assert new_version(client, map_id=map_id, drives=[drives[2]])["map_version"] == 3
+    problem_of(client.get(f"/v1/maps/{map_id}/versions/2"), 404, "not-found")
+
+
 def scenes_of(client: Client, drive_id: str) -> list[str]:
     return [scene["id"] for scene in client.get("/v1/scenes", params={"drive_id": drive_id}).json()["items"]][:1]
 

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
@@ -16,8 +17,8 @@ from sqlalchemy import update
 
 from service.app import sweep_uploads
 from service.persistence import durability
-from service.persistence.tables import Upload, now_us
-from service.uploads.resumable import PartialFile
+from service.persistence.tables import Drive, Upload, now_us
+from service.uploads.resumable import PartialFile, sweep
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
 from tests.service.tiny_drive import TinyDrive, png_of, tiny_drive
@@ -292,6 +293,29 @@ def test_refused_creations(start_api: StartApi) -> None:
     other = client.post(f"/v1/drives/{drive_id}/uploads", headers={"Tus-Resumable": "0.2.2", "Upload-Length": "5"})
     problem_of(other, 412, "tus-version")
     assert other.headers["tus-version"] == other.headers["tus-resumable"] == "1.0.0"
+
+
+def test_uploads_into_a_committed_drive_count_nothing(start_api: StartApi) -> None:
+    client = start_api().client(max_bytes=1_000_000)
+    drive_id = client.filled()
+    assert create(client, drive_id, 900_000, archive="").status_code == 201
+    other_id = client.create()
+    problem_of(create(client, other_id, 900_000, archive=""), 413, "quota-full")
+    with client.api.database.write() as session:
+        session.execute(update(Drive).where(Drive.id == drive_id).values(state="COMMITTED"))
+    assert create(client, other_id, 900_000, archive="").status_code == 201
+
+
+def test_an_upload_that_goes_on_while_it_is_swept(tmp_path: Path) -> None:
+    upload_id = "upl_" + "0" * 30
+    file = PartialFile(tmp_path, upload_id)
+    file.append_at(0, b"bytes", min_free_bytes=0)
+    file.close()
+    answers = iter([set[str](), {upload_id}])  # a request has ended between the two, and put its time off
+    assert sweep(tmp_path, lambda _: next(answers)) == 0
+    assert file.path.read_bytes() == b"bytes"
+    assert sweep(tmp_path, lambda _: set()) == 1
+    assert not file.path.exists()
 
 
 def test_a_committed_drive_takes_none(client: Client) -> None:

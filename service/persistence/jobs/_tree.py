@@ -45,11 +45,12 @@ def _settle(member: JobMember, child: Job | None) -> None:
 
 def look_at(session: Session, parent_id: str) -> None:
     """Let an aggregation begin, or end, where it has nothing left to wait for."""
-    open_members = select(func.count()).select_from(JobMember).where(JobMember.job_id == parent_id, _OPEN)
-    left = session.scalar(open_members) or 0
-    parent = session.get(Job, parent_id, populate_existing=True)
+    # Locked before its members are counted: of two that end at one time, the second has to see the first.
+    parent = session.get(Job, parent_id, populate_existing=True, with_for_update=True)
     if parent is None or parent.state in TERMINAL:
         return
+    open_members = select(func.count()).select_from(JobMember).where(JobMember.job_id == parent_id, _OPEN)
+    left = session.scalar(open_members) or 0
     problem = _hopeless(session, parent, left)
     if problem is not None:
         ended = {"state": JobState.FAILED, "finished_us": now_us(), "problem": problem, "waiting_for": left}

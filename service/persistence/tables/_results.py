@@ -49,6 +49,7 @@ class Map(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     name: Mapped[str] = mapped_column(Name)
     current_version: Mapped[int | None]
+    newest_version: Mapped[int] = mapped_column(default=0)  # its number is not given again, also where it is deleted
     created_us: Mapped[int] = mapped_column(default=now_us)
     expires_us: Mapped[int | None] = mapped_column(index=True)
 

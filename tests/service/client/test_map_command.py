@@ -99,6 +99,16 @@ def test_a_map_and_its_next_version(
     assert "it broke" in failing[2]
 
 
+@pytest.mark.parametrize("option", ["--name", "--into", "--remove"])
+def test_what_cannot_be_asked_for_is_said_before_anything_is_sent(
+    option: str, client: Client, drives: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, summary, said = run(client, monkeypatch, capsys, drives[0], drives[1], option, "a\nb")
+    assert (code, summary["drive_ids"]) == (2, [])
+    assert option in said
+    assert client.get("/v1/drives").json()["items"] == []
+
+
 def test_a_folder_of_another_version(client: Client, connect: Connect, tmp_path: Path) -> None:
     ids = [client.frozen(tiny_drive(f"v{i}", seed=f"{tmp_path}v{i}")) for i in range(2)]
     job = client.aggregate(drives=ids)

@@ -85,6 +85,7 @@ def _create_maps() -> None:
         sa.Column("project_id", sa.String(length=40), nullable=False),
         sa.Column("name", sa.String(length=200), nullable=False),
         sa.Column("current_version", sa.BigInteger(), nullable=True),
+        sa.Column("newest_version", sa.BigInteger(), nullable=False),
         sa.Column("created_us", sa.BigInteger(), nullable=False),
         sa.Column("expires_us", sa.BigInteger(), nullable=True),
         sa.ForeignKeyConstraint(["project_id"], ["projects.id"], name=op.f("fk_maps_project_id_projects")),

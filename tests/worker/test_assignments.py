@@ -1,0 +1,29 @@
+"""What the kinds of jobs differ in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from schemas.api.jobs import JobKind
+from service.persistence import jobs
+from service.persistence.artifacts import ArtifactStore
+from service.persistence.database import Database
+from service.settings import Settings
+from worker.assignments import assignment_of
+
+
+def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> None:
+    """Its publication, after hours of work, does not: there a database that fails is asked again."""
+    settings = Settings(data_dir=tmp_path)
+    database = Database.of(settings)  # that has no tables
+    held = jobs.Claim(
+        job_id="job_1", fence=1, attempt=1, project_id="prj_1", kind=JobKind.AGGREGATION, drive_id=None, map_id="map_1",
+        settings={},
+    )  # fmt: skip
+    assignment = assignment_of(database, ArtifactStore(settings), held)
+    with pytest.raises(OperationalError):
+        _ = assignment.shelf
+    database.close()
