@@ -9,9 +9,10 @@ from typing import Any
 from mrasfm_engine import stages
 from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.io.read_map import is_map
 
 
 def reconstruct(
@@ -45,6 +46,12 @@ def reconstruct(
     InputError, ReconstructionError, StorageError, CancelledError
         See `errors`.
     """
+    if is_map(out):
+        raise InputError(
+            f"{out} holds a map, which the scene would overwrite",
+            remedy="Give the scene a folder of its own with --out.",
+            code="not-a-scene",
+        )
     drive = read_drive(drive_folder)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel)
     run.report["drive"] = drive.manifest.name

@@ -41,6 +41,7 @@ MAX_IMAGE_SIDE_PX = 20_000
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
 MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
+UNIT_ROUNDING = 1e-14  # of a quaternion's norm
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=1e6)]
@@ -96,7 +97,8 @@ class Pose(_Model):
         norm = math.sqrt(sum(v * v for v in value))
         if abs(norm - 1.0) > 1e-3:
             raise ValueError(f"quaternion must have norm 1, has {norm:.6g}: give x, y, z, w of a unit quaternion")
-        return [v / norm for v in value]
+        # One that is a unit quaternion to rounding stays: what was written and is read again must not change.
+        return value if abs(norm - 1.0) <= UNIT_ROUNDING else [v / norm for v in value]
 
     @field_validator("translation_m")
     @classmethod

@@ -24,6 +24,8 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.io.export_map import write_map
+from mrasfm_engine.io.publishing import COMPLETE_MARK
+from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.io.stage_store import StageStore
 
 Floats = NDArray[np.float64]
@@ -69,6 +71,12 @@ def aggregate(
     """
     if into is None and remove:
         raise InputError("--remove needs the map to remove from", remedy="Give --into MAP.", code="no-such-scene")
+    if (out / COMPLETE_MARK).is_file() and not is_map(out):
+        raise InputError(
+            f"{out} holds a scene, which the map would overwrite",
+            remedy="Give the map a folder of its own with --out.",
+            code="not-a-map",
+        )
     named = name_scenes(scenes)
     run = stages.Run(config, StageStore(out / ".stages"), into, progress, cancel)
     run.report["settings"] = config.model_dump(mode="json")

@@ -6,9 +6,10 @@ import re
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 
-from schemas import BodyAxes, DocumentError, DriveManifest, LabelMap, SemanticClass, parse_manifest
+from schemas import BodyAxes, DocumentError, DriveManifest, LabelMap, Pose, SemanticClass, parse_manifest
 from schemas.export import SCHEMA_FILE, schema_text
 from schemas.parsing import parse_document
 
@@ -181,3 +182,14 @@ def test_cityscapes_labels() -> None:
         SemanticClass.STATIC,
     )
     assert sorted(ids) == list(range(20))
+
+
+def test_a_pose_that_was_written_reads_back_as_it_was() -> None:
+    """Else a scene that is taken out of a map would pass for another one."""
+    rng = np.random.default_rng(0)
+    for _ in range(1000):
+        quaternion = rng.normal(size=4)
+        pose = Pose(rotation_xyzw=(quaternion / np.linalg.norm(quaternion)).tolist(), translation_m=[0.0, 0.0, 0.0])
+        again = Pose.model_validate_json(pose.model_dump_json())
+        assert again == pose
+    assert 0 < np.linalg.norm(Pose(rotation_xyzw=[0, 0, 0, 1.0005], translation_m=[0, 0, 0]).rotation_xyzw) < 1 + 1e-12
