@@ -27,6 +27,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 SETTLING = 2  # steps of points whose poses have moved
+MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says little about where the minimum is
 
 
 class Termination(StrEnum):
@@ -322,7 +323,8 @@ def _minimise(problem: Problem, cancel: Callable[[], bool] | None) -> tuple[Stat
             continue
         decrement = -float(step @ reduced.gradient)
         if cost - trial_cost <= options.function_tolerance * cost or (
-            free and decrement <= options.decrement_tolerance
+            # A step that damping holds back is short wherever the minimum is.
+            free and damping <= MAX_DAMPING_OF_DECREMENT and decrement <= options.decrement_tolerance
         ):
             termination = Termination.CONVERGED
         state, cost, costs = trial, trial_cost, trial_costs

@@ -45,6 +45,17 @@ def test_exact_observations_are_recovered_exactly() -> None:
     assert report.final_cost < 1e-6 < report.initial_cost
 
 
+def test_a_step_that_is_short_for_its_damping_is_no_convergence() -> None:
+    case = drive(noise_px=0.5)
+    start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8))
+    options = SolverOptions(function_tolerance=0.0, max_iterations=100)
+    best, _ = solve(replace(case.problem, state=start, options=options))
+    slow = replace(options, initial_damping=1e7)
+    solution, report = solve(replace(case.problem, state=start, options=slow))
+    assert report.termination is Termination.CONVERGED
+    assert 0 < position_errors_m(solution, best).max() < 1e-3
+
+
 @pytest.mark.parametrize("outlier_fraction", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(2))
 def test_poses_and_points_are_recovered_from_noise_and_outliers(seed: int, outlier_fraction: float) -> None:
