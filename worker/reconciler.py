@@ -37,6 +37,10 @@ class Reconciler:
         self._wakeups = Wakeups(settings)
         self._broker_was_there = True
 
+    def close(self) -> None:
+        """Let go of the database."""
+        self._database.close()
+
     def run(self, ended: threading.Event) -> None:
         """Reconcile again and again until `ended`.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -60,7 +60,7 @@ def _composed(local_from_ecef: Floats, ecef_from_other: Floats) -> Floats:
 
 
 def _pairs(scenes: Sequence[SourceScene], map_from_scene: Floats, config: AggregationConfig) -> list[tuple[int, int]]:
-    """Pairs of scenes of which one is among the other's candidates: those whose footprints overlap most."""
+    """Pairs of scenes that are to be compared, of those within reach, by how much their footprints overlap."""
     reach = config.position_error_m + SIGHT_SHIFT_M
     scores: dict[tuple[int, int], tuple[float, float]] = {}
     for i, j in combinations(range(len(scenes)), 2):
@@ -68,8 +68,35 @@ def _pairs(scenes: Sequence[SourceScene], map_from_scene: Floats, config: Aggreg
         apart = nearest_distance_m(scenes[i], scenes[j], a_from_b)
         if apart <= reach:
             scores[i, j] = (common_view(scenes[i], scenes[j], a_from_b, config), -apart)
+    return choose_pairs(len(scenes), scores, config.candidates)
+
+
+def choose_pairs(
+    count: int, scores: Mapping[tuple[int, int], tuple[float, ...]], candidates: int
+) -> list[tuple[int, int]]:
+    """Of scored pairs of scenes those of which one is among the other's candidates, and as many between their groups.
+
+    Scenes of one street fill each other's lists: without the latter, those of the street across would be compared with
+    none of them.
+    """
+    best_first = sorted(scores, key=lambda pair: scores[pair], reverse=True)
     chosen: set[tuple[int, int]] = set()
-    for k in range(len(scenes)):
-        own = sorted((pair for pair in scores if k in pair), key=lambda pair: scores[pair], reverse=True)
-        chosen.update(own[: config.candidates])
+    for k in range(count):
+        chosen.update([pair for pair in best_first if k in pair][:candidates])
+    group = _groups(count, chosen)
+    between: dict[tuple[int, int], int] = {}
+    for i, j in best_first:
+        ends = min(group[i], group[j]), max(group[i], group[j])
+        between[ends] = between.get(ends, 0) + 1
+        if ends[0] != ends[1] and between[ends] <= candidates:
+            chosen.add((i, j))
     return sorted(chosen)
+
+
+def _groups(count: int, pairs: set[tuple[int, int]]) -> list[int]:
+    """The group of each of some scenes, which pairs connect."""
+    group = list(range(count))
+    for i, j in sorted(pairs):
+        old, new = group[i], group[j]
+        group = [new if g == old else g for g in group]
+    return group

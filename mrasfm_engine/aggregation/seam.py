@@ -229,6 +229,8 @@ def _why_not(
     settings = config.aggregation
     if quality["inliers"] < settings.min_inliers:
         return f"only {quality['inliers']} points are shared, {settings.min_inliers} are needed"
+    if not np.isfinite(fine.covariance).all():
+        return "what is shared does not determine how the scenes lie"
     if not strict:
         return ""
     assert found.a_from_b is not None

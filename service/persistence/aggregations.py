@@ -35,8 +35,6 @@ from service.persistence.tables import (
 CHILDREN_PERCENT = 80.0
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 _NAME_LENGTH = 80
-# A row that is locked so is not deleted; other aggregations may do the same, in whatever order.
-_KEPT: Mapping[str, bool] = {"read": True, "key_share": True}
 
 
 @dataclass
@@ -129,7 +127,8 @@ def _checked(session: Session, project_id: str, asked: AggregationRequest, of_ma
     if of_map is not None:
         plan.kept = maps.scenes_of(session, of_map)
     _take_out(plan, asked.remove, of_map)
-    session.scalars(select(Scene.id).where(Scene.id.in_(asked.scenes)).with_for_update(**_KEPT)).all()
+    # Rows that are locked so are not deleted; other aggregations may do the same, in whatever order.
+    session.scalars(select(Scene.id).where(Scene.id.in_(asked.scenes)).with_for_update(read=True, key_share=True)).all()
     for scene_id in asked.scenes:
         scene = require(session, Scene, project_id, scene_id)
         _require_once(plan, scene.drive_id, f"scene {scene_id}")
@@ -238,7 +237,7 @@ def _scene_of(session: Session, drive: Drive, settings: Mapping[str, Any]) -> Sc
     """The newest scene of a drive that a reconstruction would make again."""
     same = (Scene.drive_id == drive.id) & (Scene.settings_sha256 == settings_sha256(settings))
     statement = select(Scene).where(same).order_by(Scene.created_us.desc())
-    made = session.scalars(statement.with_for_update(**_KEPT))
+    made = session.scalars(statement.with_for_update(read=True, key_share=True))
     return next((scene for scene in made if scene.summary.get("engine_version") == version("mrasfm")), None)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import pytest
 from sqlalchemy import select, text, update
@@ -187,16 +187,21 @@ def test_a_drive_that_an_aggregation_waits_with_stays(
     publish(database, held)
     with database.write() as session:
         session.execute(update(Drive).values(expires_us=1))
-    Reconciler(database_settings).sweep()
+    sweep(database_settings)
     with database.read() as session:
         assert session.get(Drive, drives[0]) is not None
     cancelled = [job.id, *(str(m.child_id) for m, _ in _members(database, job.id) if m.scene_id is None)]
     for job_id in cancelled:
         with database.write() as session:
             jobs.request_cancel(session, job_id)
-    Reconciler(database_settings).sweep()
+    sweep(database_settings)
     with database.read() as session:
         assert session.get(Drive, drives[0]) is None
+
+
+def sweep(settings: Settings) -> None:
+    with closing(Reconciler(settings)) as reconciler:
+        reconciler.sweep()
 
 
 def _members(database: Database, job_id: str) -> list[tuple[JobMember, Job | None]]:

@@ -14,11 +14,14 @@ from service.persistence.database import migrate
 from service.persistence.keys import ensure_first_key, revoke_key
 from service.persistence.tables import ApiKey
 from tests.service.live_api import Api, Client, api_process, problem_of, settings_of, wait_until
+from tests.service.test_maps import new_version
 from tests.service.tiny_drive import tiny_drive
+from tests.service.tus_client import OFFSET_TYPE, VERSION, begin, metadata
 
 OPEN = {"/livez", "/readyz", "/metrics"}
 BODIES: dict[str, Any] = {
     "/v1/drives": json.loads(tiny_drive().raw),
+    "/v1/maps/{map_id}/current-version": {"version": 1},
     "/v1/drives/{drive_id}/files:declare": {"files": [{"path": "a", "size_bytes": 1, "sha256": "0" * 64}]},
 }
 
@@ -32,7 +35,16 @@ def operations(api: Api) -> list[tuple[str, str]]:
 def body_of(path: str, ids: dict[str, str]) -> Any:
     if path == "/v1/reconstructions":
         return {"drive_id": ids["drive_id"]}
+    if path == "/v1/aggregations":
+        return {"drives": [ids["drive_id"]], "scenes": [ids["scene_id"]]}
     return BODIES.get(path)
+
+
+def headers_of(path: str) -> dict[str, str]:
+    """What the resumable protocol wants to see before it looks for anything."""
+    if "/uploads" not in path:
+        return {}
+    return {**VERSION, "Upload-Length": "1", "Upload-Metadata": metadata(path="a"), "Upload-Offset": "0"}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +53,18 @@ def foreign(api: Api) -> dict[str, str]:
     other = api.client()
     scene_id = other.scene({"points.ply": b"secret"})
     scene = other.get(f"/v1/scenes/{scene_id}").json()
-    return {"scene_id": scene_id, "drive_id": scene["drive_id"], "job_id": scene["job_id"], "path": "points.ply"}
+    drive = tiny_drive("open", seed="open")
+    upload = begin(other, other.create(drive), *next(iter(drive.files.items())))
+    drives = [other.frozen(tiny_drive(f"drive-{i}", seed=str(i))) for i in range(2)]
+    return {
+        "scene_id": scene_id,
+        "drive_id": scene["drive_id"],
+        "job_id": scene["job_id"],
+        "upload_id": upload.rpartition("/")[2],
+        "map_id": new_version(other, {"points.ply": b"secret"}, drives=drives)["map_id"],
+        "version": "1",
+        "path": "points.ply",
+    }
 
 
 def test_no_route_answers_without_a_key(api: Api, foreign: dict[str, str]) -> None:
@@ -65,13 +88,14 @@ def test_no_route_answers_without_a_key(api: Api, foreign: dict[str, str]) -> No
 def test_foreign_ids_are_not_found_at_any_route(api: Api, client: Client, foreign: dict[str, str]) -> None:
     tried = 0
     for method, path in operations(api):
-        if "{" not in path and path != "/v1/reconstructions":
+        if "{" not in path and path not in {"/v1/reconstructions", "/v1/aggregations"}:
             continue
         tried += 1
-        mine = client.request(method, path.format(**foreign), json=body_of(path, foreign))
+        headers = headers_of(path) | ({"Content-Type": OFFSET_TYPE} if method == "PATCH" else {})
+        mine = client.request(method, path.format(**foreign), json=body_of(path, foreign), headers=headers)
         assert mine.status_code == 404, (method, path, mine.text)
         unknown = {name: re.sub(r"[0-9a-f]{30}", "0" * 30, value) for name, value in foreign.items()}
-        other = client.request(method, path.format(**unknown), json=body_of(path, unknown))
+        other = client.request(method, path.format(**unknown), json=body_of(path, unknown), headers=headers)
         assert other.status_code == 404
         if method != "HEAD":
             problem = problem_of(mine, 404, "not-found")

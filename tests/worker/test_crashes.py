@@ -206,7 +206,7 @@ def test_worker_that_was_silent_publishes_nothing(world: World, brief_drive: Pat
     for process in stopped:
         process.resume()
     assert_one_scene(world, job_id, ["worker-lost", "succeeded"])
-    assert '"the job is not ours any more; nothing was published"' in world.log()
+    wait_until(lambda: '"the job is not ours any more; nothing was published"' in world.log(), "the first one notices")
     assert first.poll() is None
 
 
