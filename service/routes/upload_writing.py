@@ -23,6 +23,10 @@ from service.uploads.tus import Checksum
 
 # What may pass, or be made room for: the bytes wait. Anything else would be answered the same way again.
 _MAY_PASS = frozenset({408, 413, 423, 429, 500, 503, 507})
+# How long a request waits for another to let go of an upload: somebody may just have looked how far it is, and a
+# client that comes back is sooner here than the end of its broken connection.
+_PATIENCE_S = 1.0
+_POLL_S = 0.05
 
 
 def look(context: Context, project_id: str, drive_id: str, upload_id: str) -> tuple[Upload, int]:
@@ -81,7 +85,7 @@ class UploadWriting:
         ServiceError
             404, 408, 409, 410, 413, 423, 460, 507, and what a PUT of the file may raise.
         """
-        held = await anyio.to_thread.run_sync(partial(self._begin, offset, length, checksum))
+        held = await self._begun(offset, length, checksum)
         settings = self._context.settings
         compared: Hash | None = None if checksum is None else new_hash(checksum.algorithm)
         whole: Hash | None = new_hash("sha256") if offset == 0 else None
@@ -109,6 +113,16 @@ class UploadWriting:
             return held.upload, held.offset
         finally:
             held.file.close()
+
+    async def _begun(self, offset: int, length: int | None, checksum: Checksum | None) -> _Held:
+        end_s = anyio.current_time() + _PATIENCE_S
+        while True:
+            try:
+                return await anyio.to_thread.run_sync(partial(self._begin, offset, length, checksum))
+            except ServiceError as error:
+                if error.status != 423 or anyio.current_time() > end_s:
+                    raise
+            await anyio.sleep(_POLL_S)
 
     def _begin(self, offset: int, length: int | None, checksum: Checksum | None) -> _Held:
         context = self._context

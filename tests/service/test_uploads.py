@@ -117,12 +117,18 @@ def test_bytes_that_were_not_compared_do_not_count(api: Api, client: Client) -> 
         yield data[10:2_500_000]
         raise ConnectionError
 
+    def counts_at_once() -> bool:
+        with api.database.read() as session:
+            return session.get_one(Upload, url.rsplit("/", 1)[1]).tail_boot is not None
+
     with pytest.raises(ConnectionError):
         patch(client, url, 10, broken(), Upload_Checksum=checksum(data[10:]))
+    wait_until(lambda: not counts_at_once(), "the begin of the request")
     wait_until(lambda: head(client, url).status_code == 200, "the end of the request")
     assert offset_of(client, url) == 10
     with pytest.raises(ConnectionError):
         patch(client, url, 10, broken())
+    wait_until(counts_at_once, "the begin of the request")
     wait_until(lambda: head(client, url).status_code == 200, "the end of the request")
     kept = offset_of(client, url)
     assert 10 < kept <= 2_500_000, "what came without a checksum is kept"
@@ -170,6 +176,17 @@ def test_one_writer_at_a_time(client: Client, api: Api) -> None:
     first.join()
     assert [answer.status_code for answer in answers] == [204]
     assert stored(client, drive_id) == sha256_of(data)
+
+
+def test_a_look_at_an_upload_stops_no_writer(client: Client, api: Api) -> None:
+    """Whoever looks holds the bytes, too; the writer waits for a moment."""
+    data = image(1000)
+    url = begin(client, client.create(), PATH, data)
+    looking = PartialFile(api.settings.uploads_dir, url.rsplit("/", 1)[1])
+    letting_go = threading.Timer(0.3, looking.close)
+    letting_go.start()
+    assert patch(client, url, 0, data).status_code == 204
+    letting_go.join()
 
 
 def test_a_writer_that_is_silent_makes_room(start_api: StartApi) -> None:
