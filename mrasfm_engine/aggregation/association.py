@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, common_view, nearest_distance_m
 from mrasfm_engine.aggregation.source import SourceScene
@@ -43,7 +45,7 @@ def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Assoc
     return Association(
         reference=reference,
         map_from_scene=map_from_scene,
-        pairs=tuple(_pairs(scenes, map_from_scene, config)),
+        pairs=tuple(_pairs(scenes, config)),
     )
 
 
@@ -59,7 +61,7 @@ def _composed(local_from_ecef: Floats, ecef_from_other: Floats) -> Floats:
     return se3.transform(rotation @ ecef_from_other[:3, :3], rotation @ (ecef_from_other[:3, 3] - origin))
 
 
-def _pairs(scenes: Sequence[SourceScene], map_from_scene: Floats, config: AggregationConfig) -> list[tuple[int, int]]:
+def _pairs(scenes: Sequence[SourceScene], config: AggregationConfig) -> list[tuple[int, int]]:
     """Pairs of scenes that are to be compared, of those within reach, by how much their footprints overlap."""
     reach = config.position_error_m + SIGHT_SHIFT_M
     scores: dict[tuple[int, int], tuple[float, float]] = {}
@@ -83,7 +85,7 @@ def choose_pairs(
     chosen: set[tuple[int, int]] = set()
     for k in range(count):
         chosen.update([pair for pair in best_first if k in pair][:candidates])
-    group = _groups(count, chosen)
+    group = component_labels(count, chosen)
     between: dict[tuple[int, int], int] = {}
     for i, j in best_first:
         ends = min(group[i], group[j]), max(group[i], group[j])
@@ -93,10 +95,9 @@ def choose_pairs(
     return sorted(chosen)
 
 
-def _groups(count: int, pairs: set[tuple[int, int]]) -> list[int]:
-    """The group of each of some scenes, which pairs connect."""
-    group = list(range(count))
-    for i, j in sorted(pairs):
-        old, new = group[i], group[j]
-        group = [new if g == old else g for g in group]
-    return group
+def component_labels(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """The component (count,) of each of some scenes, which pairs connect."""
+    ends = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    labels: list[int] = connected_components(graph, directed=False)[1].tolist()
+    return labels

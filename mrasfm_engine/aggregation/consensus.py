@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import pack_cameras, project_points
+from mrasfm_engine.geometry.camera_model import pack_cameras, reprojection_errors_focal
 from mrasfm_engine.registration.resection import resect
 
 Floats = NDArray[np.float64]
@@ -93,12 +93,7 @@ class Relocaliser:
         cam_from_a = se3.inverse(a_from_b @ self._b_from_cam[seen.image])
         points = np.einsum("nij,nj->ni", cam_from_a[:, :3, :3], seen.points_m) + cam_from_a[:, :3, 3]
         camera = self._b.image_camera[seen.image]
-        errors = np.full(len(camera), np.inf)
-        for c in np.unique(camera):
-            rows = np.flatnonzero(camera == c)
-            pixels = project_points(int(self._kind[c]), self._params[c], points[rows])
-            errors[rows] = np.linalg.norm(pixels - seen.xy_px[rows], axis=1) / self._params[c, :2].mean()
-        return np.where(np.isfinite(errors), errors, np.inf)
+        return reprojection_errors_focal(self._kind, self._params, camera, points, seen.xy_px)
 
     def hypothesis(self, unit: int, seen: Sightings) -> Floats | None:
         """How b lies in a (4, 4) by one unit alone."""

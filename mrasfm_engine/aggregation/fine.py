@@ -22,7 +22,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.matching import CrossMatches
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.geometry.camera_model import reprojection_errors_focal
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.triangulate import cam_from_world
 
@@ -82,13 +82,8 @@ def errors_focal(assembly: Assembly, state: State, rows: Ints, points_m: Floats)
         state, assembly.image_unit[image], camera, None if assembly.simultaneous else image
     )
     local = np.einsum("nij,nj->ni", rotation, points_m) + translation
-    errors = np.full(len(rows), np.inf)
-    for c in np.unique(camera):
-        own = np.flatnonzero(camera == c)
-        pixels = project_points(int(assembly.camera_kind[c]), state.camera_params[c], local[own])
-        off = np.linalg.norm(pixels - assembly.keypoint_xy_px[rows[own]], axis=1)
-        errors[own] = off / state.camera_params[c, :2].mean()
-    return np.where(np.isfinite(errors), errors, np.inf)
+    pixels = assembly.keypoint_xy_px[rows]
+    return reprojection_errors_focal(assembly.camera_kind, state.camera_params, camera, local, pixels)
 
 
 @dataclass(frozen=True, kw_only=True)

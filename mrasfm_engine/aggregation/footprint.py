@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.geometry.frustum import seen_fractions
+from mrasfm_engine.geometry.frustum import mutual_overlap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,16 +86,13 @@ def overlaps(
     camera = np.concatenate([a.image_camera, b.image_camera + cameras])
     size = np.array([(c.width, c.height) for s in (a, b) for c in s.drive.cameras], dtype=np.int64)
     numbered = np.column_stack([pairs[:, 0], pairs[:, 1] + len(a.image_camera)]).astype(np.int64)
-    result = np.ones(len(pairs))
-    for directed in (numbered, numbered[:, ::-1]):
-        result *= seen_fractions(
-            np.ascontiguousarray(directed),
-            world_from_cam=poses,
-            camera=camera,
-            kind=np.concatenate(kinds),
-            params=np.concatenate(params),
-            size_px=size,
-            samples=np.concatenate(samples),
-            max_depth_m=max_depth_m,
-        )
-    return np.sqrt(result)
+    return mutual_overlap(
+        numbered,
+        world_from_cam=poses,
+        camera=camera,
+        kind=np.concatenate(kinds),
+        params=np.concatenate(params),
+        size_px=size,
+        samples=np.concatenate(samples),
+        max_depth_m=max_depth_m,
+    )

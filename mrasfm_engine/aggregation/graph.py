@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.aggregation.association import component_labels
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.registration.pose_graph import Edges, optimise_pose_graph
@@ -55,13 +56,8 @@ class SeamGraph:
 
     def components(self) -> list[tuple[int, ...]]:
         """Scenes that accepted seams connect, the largest first, each with its members ascending."""
-        label = list(range(self._count))
-        for (a, b), seam in zip(self._ends, self.seams, strict=True):
-            if seam.accepted and label[a] != label[b]:
-                old, new = max(label[a], label[b]), min(label[a], label[b])
-                label = [new if value == old else value for value in label]
         groups: dict[int, list[int]] = {}
-        for scene, value in enumerate(label):
+        for scene, value in enumerate(component_labels(self._count, (self._ends[k] for k in self._accepted()))):
             groups.setdefault(value, []).append(scene)
         return sorted((tuple(g) for g in groups.values()), key=lambda g: (-len(g), g))
 

@@ -20,7 +20,6 @@ from mrasfm_engine.aggregation.map_scene import map_scene
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
-from mrasfm_engine.correspondence.plugins import load_plugins
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.export_map import MapContent
@@ -52,6 +51,11 @@ class MapResult:
         """Scenes that share nothing with the map's other ones."""
         connected = set(self.chains[0].scenes) if len(self.chains[0].scenes) > 1 else set()
         return [scene.name for k, scene in enumerate(self.scenes) if k not in connected]
+
+    def ends_of(self, seam: Seam) -> tuple[int, int]:
+        """The numbers of a seam's scenes."""
+        names = [scene.name for scene in self.scenes]
+        return names.index(seam.a), names.index(seam.b)
 
     def units_of(self, k: int) -> Floats:
         """Poses (u, 4, 4) of a scene's units in the map; NaN where not registered."""
@@ -86,7 +90,6 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
     """Everything that is written."""
     reference = result.scenes[result.association.reference]
     scene = map_scene(result.assembly, result.final.model, reference)
-    plugins = load_plugins(run.config, None)
     by_name = {s.name: s for s in result.scenes}
     return MapContent(
         scene=scene,
@@ -97,7 +100,7 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
         scenes={s.name: (s.fingerprint, *s.pack()) for s in result.scenes},
         seams={
             stages.seam_name(seam.a, seam.b): (
-                stages.seam_key(run.config, plugins, by_name[seam.a], by_name[seam.b]),
+                stages.seam_key(run, by_name[seam.a], by_name[seam.b]),
                 *seam.pack(),
             )
             for seam in result.found_seams
@@ -151,7 +154,6 @@ def _scene(result: MapResult, k: int) -> dict[str, Any]:
 def _seam(result: MapResult, number: int) -> dict[str, Any]:
     seam = result.seams[number]
     closing = next((c for chain in result.chains for c in chain.closings if c.seam == number), None)
-    a, b = (next(k for k, s in enumerate(result.scenes) if s.name == name) for name in (seam.a, seam.b))
     document: dict[str, Any] = {"a": seam.a, "b": seam.b, "accepted": seam.accepted}
     if seam.reason:
         document["reason"] = seam.reason
@@ -163,16 +165,16 @@ def _seam(result: MapResult, number: int) -> dict[str, Any]:
             "units_of_a": seam.units_a,
             "units_of_b": seam.units_b,
             "in_chain": any(number in chain.seams for chain in result.chains),
-            "adjusted_by_m": _moved(result, seam, a, b, result.map_from_scene),
+            "adjusted_by_m": _moved(result, seam),
         }
     if closing is not None:
         document["closes_loop"] = {"shift_m": closing.shift_m, "turn_deg": closing.turn_deg, "seams": closing.length}
     return document
 
 
-def _moved(result: MapResult, seam: Seam, a: int, b: int, poses: Floats) -> float:
+def _moved(result: MapResult, seam: Seam) -> float:
     """How far, at the seam, the map is from what the seam alone says."""
-    at = seam.place_b_m[None]
+    (a, b), poses, at = result.ends_of(seam), result.map_from_scene, seam.place_b_m[None]
     lies = se3.apply(se3.inverse(poses[a]) @ poses[b], at)
     return float(np.linalg.norm(lies - se3.apply(seam.a_from_b, at)))
 
@@ -193,7 +195,7 @@ def map_pictures(run: stages.Run, result: MapResult) -> dict[str, bytes]:
 
 
 def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
-    a, b = (next(k for k, s in enumerate(result.scenes) if s.name == name) for name in (seam.a, seam.b))
+    a, b = result.ends_of(seam)
     way_a, way_b = (result.units_of(k)[result.scenes[k].unit_registered, :3, 3] for k in (a, b))
     at_seam = np.concatenate([result.units_of(a)[seam.units_a, :3, 3], result.units_of(b)[seam.units_b, :3, 3]])
     centre, side = shown_square(at_seam)

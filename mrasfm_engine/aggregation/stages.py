@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,11 @@ class Run:
     report: dict[str, Any] = field(
         default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": []}
     )
+
+    @cached_property
+    def plugins(self) -> Plugins:
+        """The matcher; its model is loaded when first asked for, once."""
+        return load_plugins(self.config, None)
 
     def step(self, stage: str) -> Callable[[int, int], None]:
         """The progress callback of a stage."""
@@ -213,7 +219,6 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
 def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Seam]:
     """The seam of every pair of scenes that is to be compared; those found before are taken from the store or map."""
     started = time.perf_counter()
-    plugins = load_plugins(run.config, None)
     result, reused = [], 0
     older = None if run.into is None else StageStore(run.into / SEAMS_FOLDER)
     total = len(known.pairs)
@@ -221,7 +226,7 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
         if run.cancel():
             raise CancelledError
         a, b = found[i], found[j]
-        key, name = seam_key(run.config, plugins, a, b), seam_name(a.name, b.name)
+        key, name = seam_key(run, a, b), seam_name(a.name, b.name)
         kept = run.store.load(f"seam-{name}", key)
         if kept is None and older is not None:
             kept = older.load(name, key)
@@ -230,7 +235,7 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
                 a,
                 b,
                 coarse_transform(a, b),
-                plugins.matcher,
+                run.plugins.matcher,
                 run.config,
                 cancel=run.cancel,
                 progress=lambda done, of, number=number: run.progress(  # type: ignore[misc]
@@ -255,9 +260,10 @@ def seam_name(a: str, b: str) -> str:
     return f"{a}--{b}"
 
 
-def seam_key(config: EngineConfig, plugins: Plugins, a: SourceScene, b: SourceScene) -> str:
+def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
     """What a seam depends on: both scenes' content, in this order, settings, models and code; not their names."""
+    config = run.config
     settings = [config.matching.model_dump(), config.mapping.max_error_px, config.adjustment.loss_scale, config.seed]
     aggregation = config.aggregation.model_dump(exclude={"candidates", "joint", "final_adjustment"})
-    models = plugins.fingerprint_of("matcher")
+    models = run.plugins.fingerprint_of("matcher")
     return fingerprint(a.fingerprint, b.fingerprint, settings, aggregation, models, code_version())

@@ -170,6 +170,26 @@ def project_points(kind: int, params: Floats, points_cam_m: ArrayLike) -> Floats
     return pixels
 
 
+def reprojection_errors_focal(
+    kind: NDArray[np.int64], params: Floats, camera: NDArray[np.int64], points_cam_m: Floats, pixels: Floats
+) -> Floats:
+    """Distances (n,) of pixels (n, 2) from where points (n, 3) are seen, in focal lengths; infinite behind the camera.
+
+    Parameters
+    ----------
+    kind, params
+        Of all cameras (c,) and (c, 8).
+    camera
+        Which of them (n,) sees each point, given in that camera's axes.
+    """
+    errors = np.full(len(camera), np.inf)
+    for c in np.unique(camera):
+        rows = np.flatnonzero(camera == c)
+        seen = project_points(int(kind[c]), params[c], points_cam_m[rows])
+        errors[rows] = np.linalg.norm(seen - pixels[rows], axis=1) / params[c, :2].mean()
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
 def unproject_pixels(kind: int, params: Floats, pixels: ArrayLike) -> Floats:
     """Unit viewing rays (n, 3) in camera axes of pixels (n, 2)."""
     pixels = np.ascontiguousarray(pixels, dtype=np.float64)

@@ -89,24 +89,19 @@ def view_overlap(
             for k, p, (w, h) in zip(kind, params, size_px, strict=True)
         ]
     )
-    fractions = [
-        seen_fractions(
-            directed,
-            world_from_cam=world_from_cam,
-            camera=camera,
-            kind=kind,
-            params=params,
-            size_px=size_px,
-            samples=samples,
-            max_depth_m=max_depth_m,
-        )
-        for directed in (pairs, pairs[:, ::-1])
-    ]
-    result: Floats = np.sqrt(fractions[0] * fractions[1])
-    return result
+    return mutual_overlap(
+        pairs,
+        world_from_cam=world_from_cam,
+        camera=camera,
+        kind=kind,
+        params=params,
+        size_px=size_px,
+        samples=samples,
+        max_depth_m=max_depth_m,
+    )
 
 
-def seen_fractions(
+def mutual_overlap(
     pairs: Ints,
     *,
     world_from_cam: Floats,
@@ -117,15 +112,17 @@ def seen_fractions(
     samples: Floats,
     max_depth_m: float,
 ) -> Floats:
-    """Shares (n,) of the first image's samples that the second image of each pair sees.
+    """As `view_overlap`, of any samples of what the cameras see.
 
     Parameters
     ----------
     samples
         Points (cameras, s, 3) in every camera's axes; the rest as in `view_overlap`.
     """
-    out = np.empty(len(pairs))
-    _seen_fractions(
-        np.ascontiguousarray(pairs), world_from_cam, camera, kind, params, size_px, samples, max_depth_m, out
-    )
-    return out
+    seen = np.empty((2, len(pairs)))
+    for out, directed in zip(seen, (pairs, pairs[:, ::-1]), strict=True):
+        _seen_fractions(
+            np.ascontiguousarray(directed), world_from_cam, camera, kind, params, size_px, samples, max_depth_m, out
+        )
+    result: Floats = np.sqrt(seen[0] * seen[1])
+    return result

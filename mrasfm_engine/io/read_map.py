@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.read_scene import read_json
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.scene.drive import matrix_from_pose
 from schemas import Pose
@@ -57,7 +57,7 @@ def read_map(folder: Path) -> MapPoses:
     InputError
         Where its files are missing, malformed or contradict each other.
     """
-    document, poses = (_read(folder / name) for name in (MAP_FILE, "poses.json"))
+    document, poses = (read_json(folder / name, remedy=REMEDY) for name in (MAP_FILE, "poses.json"))
     try:
         names = [scene["name"] for scene in document["scenes"]]
         units = [unit for unit in poses["units"] if unit["registered"]]
@@ -84,13 +84,3 @@ def _trajectory(units: list[dict[str, Any]]) -> Trajectory:
         timestamps_us=np.array([unit["timestamp_us"] for unit in units], dtype=np.int64),
         world_from_rig=np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
     )
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}", remedy=REMEDY) from error
-    if not isinstance(document, dict):
-        raise InputError(f"{path} holds no JSON object", remedy=REMEDY)
-    return document

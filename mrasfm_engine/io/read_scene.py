@@ -44,7 +44,7 @@ def read_poses(folder: Path) -> ScenePoses:
         raise InputError(f"{folder} is not a scene: it has no poses.tum", remedy=REMEDY)
     trajectory = read_tum(folder / "poses.tum")
     path = folder / "poses.json"
-    document = _read_json(path)
+    document = read_json(path)
     try:
         units, images = document["units"], document["images"]
         registered = [image for image in images if image["registered"]]
@@ -74,7 +74,7 @@ def read_calibration(path: Path) -> dict[str, Floats]:
     InputError
         Where the file is neither.
     """
-    document = _read_json(path)
+    document = read_json(path)
     try:
         if "cameras" in document and "version" in document:
             document = {name: camera["refined"]["rig_from_cam"] for name, camera in document["cameras"].items()}
@@ -83,11 +83,18 @@ def read_calibration(path: Path) -> dict[str, Floats]:
         raise InputError(f"{path} is not a calibration: {error}", remedy="Give a calibration.json.") from error
 
 
-def _read_json(path: Path) -> Any:
+def read_json(path: Path, *, remedy: str = REMEDY) -> dict[str, Any]:
+    """The JSON object in a file that was written with a scene or map.
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}", remedy=REMEDY) from error
+        raise InputError(f"{path} cannot be read: {error}", remedy=remedy) from error
     if not isinstance(document, dict):
-        raise InputError(f"{path} holds no JSON object", remedy=REMEDY)
+        raise InputError(f"{path} holds no JSON object", remedy=remedy)
     return document

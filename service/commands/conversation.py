@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
+    from schemas.api.jobs import JobResource
     from schemas.api.problems import Problem
     from service.client import Client
     from service.client.display import Display
@@ -68,6 +69,16 @@ def talk(converse: Callable[[Display], int], summary: Told, *, job_of: Callable[
         except KeyboardInterrupt:
             more = f" Job {job_of()} goes on." if job_of() else ""
             return failed(summary, display, f"interrupted.{more} The same command goes on from here.", EXIT_INTERRUPTED)
+
+
+def job_failed(job: JobResource, summary: Told, display: Display) -> int:
+    """Say how a job ended that has no result, and give the exit code back."""
+    if job.problem is None:
+        text = f"job {job.id} was {job.state}. Give the same command again for another job."
+        return failed(summary, display, text, EXIT_JOB_FAILED)
+    summary.problem = job.problem.model_dump(mode="json", exclude_defaults=True)
+    lines = [f"job {job.id} {job.state}: {job.problem.detail.rstrip('.')}. {job.problem.remedy}"]
+    return failed(summary, display, "\n".join([*lines, *items_of(job.problem)]), EXIT_JOB_FAILED)
 
 
 def items_of(problem: Problem) -> list[str]:

@@ -9,16 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.commands.conversation import (
-    EPILOG,
-    EXIT_JOB_FAILED,
-    EXIT_REFUSED,
-    add_connection,
-    connect,
-    failed,
-    items_of,
-    talk,
-)
+from service.commands.conversation import EPILOG, add_connection, connect, job_failed, talk
 
 if TYPE_CHECKING:
     from schemas.api.aggregations import AggregationRequest
@@ -141,12 +132,7 @@ def _receive(
     summary.job_state, summary.version = job.state, job.map_version
     summary.seconds["wait"] = round(time.monotonic() - began_s, 3)
     if job.map_id is None or job.map_version is None:
-        if job.problem is None:
-            text = f"job {job.id} was {job.state}. Give the same command again for another job."
-            return failed(summary, display, text, EXIT_JOB_FAILED)
-        summary.problem = job.problem.model_dump(mode="json", exclude_defaults=True)
-        lines = [f"job {job.id} {job.state}: {job.problem.detail.rstrip('.')}. {job.problem.remedy}"]
-        return failed(summary, display, "\n".join([*lines, *items_of(job.problem)]), EXIT_JOB_FAILED)
+        return job_failed(job, summary, display)
     version = client.map_version(job.map_id, job.map_version)
     _say(version, client, summary, display)
     if arguments.out is not None:
@@ -164,6 +150,3 @@ def _say(version: MapVersionResource, client: Client, summary: Summary, display:
     for drive in version.failed:
         display.say(f"  warning: {drive.name} ({drive.drive_id}) is not in it: {drive.problem.detail}")
     summary.unconnected, summary.failed = list(version.unconnected), [drive.drive_id for drive in version.failed]
-
-
-__all__ = ["EXIT_REFUSED", "register", "run"]

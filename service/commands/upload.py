@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.commands.conversation import EPILOG, EXIT_JOB_FAILED, add_connection, connect, failed, items_of, talk
+from service.commands.conversation import EPILOG, add_connection, connect, job_failed, talk
 
 if TYPE_CHECKING:
     from schemas.api.jobs import JobResource
@@ -111,7 +111,7 @@ def _receive(
     summary.job_state, summary.scene_id = job.state, job.scene_id
     summary.seconds["wait"] = round(time.monotonic() - began_s, 3)
     if job.state != JobState.SUCCEEDED or job.scene_id is None:
-        return _job_failed(job, summary, display)
+        return job_failed(job, summary, display)
     display.say(f"scene {job.scene_id}: {client.url}/v1/scenes/{job.scene_id}")
     if arguments.out is not None:
         began_s = time.monotonic()
@@ -120,15 +120,3 @@ def _receive(
         summary.out = str(arguments.out)
         display.say(f"{arguments.out}: {done.files_received} files received, {done.files_skipped} were there")
     return 0
-
-
-def _job_failed(job: JobResource, summary: Summary, display: Display) -> int:
-    if job.problem is None:
-        text = f"job {job.id} was {job.state}. Give the same command again for another job."
-        return failed(summary, display, text, EXIT_JOB_FAILED)
-    summary.problem = job.problem.model_dump(mode="json", exclude_defaults=True)
-    lines = [
-        f"job {job.id} {job.state}: {job.problem.detail.rstrip('.')}. {job.problem.remedy}",
-        *items_of(job.problem),
-    ]
-    return failed(summary, display, "\n".join(lines), EXIT_JOB_FAILED)
