@@ -19,6 +19,7 @@ from mrasfm_engine.adjustment.normal_equations import BEHIND_PX, MIN_DEPTH_M, ca
 from mrasfm_engine.geometry.camera_model import project
 
 SETTLED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
+WORTH = 3e-2  # gain an observation, after which a point is still far enough from its minimum for one more step
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
@@ -112,10 +113,11 @@ def settle(
                 cost = back
                 for i in range(3):
                     x[i] = trial[i]
-        gained = abs(cost - costs_before[p])
+        gained, enough = abs(cost - costs_before[p]), SETTLED
         for _ in range(steps):
-            if gained <= SETTLED * (end - begin):
+            if gained <= enough * (end - begin):
                 break
+            enough = WORTH
             gained = 0.0
             _point_system(
                 unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,

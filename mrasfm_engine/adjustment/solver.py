@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +18,7 @@ from mrasfm_engine.adjustment.priors import Term
 from mrasfm_engine.adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
 from mrasfm_engine.adjustment.reduced import Extra, Reduced
 from mrasfm_engine.adjustment.unit_sets import UnitSets
+from mrasfm_engine.parallel import in_parts, in_ranges
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
@@ -85,7 +84,7 @@ class Problem:
         """Squared reprojection errors (n,) of all observations."""
         o = self.observations
         out = np.empty(len(o.unit))
-        _in_ranges(
+        in_ranges(
             self.options.threads,
             len(out),
             lambda lo, hi, _: squared_errors(
@@ -114,7 +113,7 @@ class Problem:
     def point_costs(self, state: State) -> Floats:
         """Sums (p,) of log(1 + r^2 / s^2) over the observations of every point."""
         o, out = self.observations, np.empty(self.observations.num_points)
-        _in_ranges(
+        in_ranges(
             self.options.threads,
             len(out),
             lambda lo, hi, _: point_costs(
@@ -152,7 +151,7 @@ class Problem:
     def settle(self, state: State, before: State, costs_before: Floats, *, steps: int = 1) -> tuple[Floats, float]:
         """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
         o, options, costs = self.observations, self.options, np.empty(self.observations.num_points)
-        _in_ranges(
+        in_ranges(
             options.threads,
             len(costs),
             lambda lo, hi, _: settle(
@@ -181,7 +180,7 @@ class Problem:
         gradient = np.zeros((parts, layout.size))
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
         slots = layout.unit_slot, layout.camera_slot, units
-        _in_parts(
+        in_parts(
             coupling.shares(parts),
             lambda lo, hi, t: accumulate(
                 *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, coupling.image, o.xy_px,
@@ -215,7 +214,7 @@ class Problem:
         """Points (p, 3) that go with a step of the reduced vector."""
         o, layout, options = self.observations, self.layout, self.options
         out = np.empty_like(state.points_m)
-        _in_ranges(
+        in_ranges(
             options.threads,
             o.num_points,
             lambda lo, hi, _: substitute(
@@ -239,32 +238,6 @@ def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic] | None, ...]:
         state.camera_params,
         state.points_m,
     )
-
-
-def _in_ranges(parts: int, count: int, work: Callable[[int, int, int], None]) -> None:
-    """Run `work(lo, hi, part)` over `count` items in so many threads; the kernels release the interpreter's lock."""
-    if parts <= 1 or count < 512:
-        work(0, count, 0)
-        return
-    bounds = np.linspace(0, count, parts + 1).astype(int)
-    _in_parts(bounds, work)
-
-
-def _in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:
-    parts = len(bounds) - 1
-    if parts == 1:
-        work(int(bounds[0]), int(bounds[1]), 0)
-        return
-    list(_pool(parts).map(work, bounds[:-1], bounds[1:], range(parts)))
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that wait for the next of a solver's many short passes: starting them anew would take as long as one."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="adjustment")
-
-
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
 _THREADS = ThreadpoolController()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 HYPOTHESES = 96  # planes through three points
@@ -66,19 +70,13 @@ def fit_height_plane(
     """
     if len(height_m) < min_points or not weight.sum() > 0:
         return None
-    gate = GATE_SIGMAS * sigma_m
-    best: tuple[float, Floats] | None = None
-    for start in _hypotheses(xy_m, height_m, sigma_m, weight, expected_slope, max_slope_change, rng):
-        plane = _optimise(start, xy_m, height_m, sigma_m, weight, expected_slope, sigma_slope)
-        if np.hypot(*(plane[1:] - expected_slope)) > max_slope_change:
-            continue
-        score = float((weight * np.minimum(((height_m - plane[0] - xy_m @ plane[1:]) / gate) ** 2, 1.0)).sum())
-        if best is None or score < best[0]:
-            best = score, plane
-    if best is None:
+    starts = _hypotheses(xy_m, height_m, sigma_m, weight, expected_slope, max_slope_change, rng)
+    plane = np.empty(3)
+    if not _best(
+        starts, xy_m, height_m, sigma_m, weight, expected_slope, sigma_slope, max_slope_change, plane
+    ):  # fmt: skip
         return None
-    plane = best[1]
-    inliers = np.abs(height_m - plane[0] - xy_m @ plane[1:]) < gate
+    inliers = np.abs(height_m - plane[0] - xy_m @ plane[1:]) < GATE_SIGMAS * sigma_m
     if inliers.sum() < min_points:
         return None
     return HeightPlane(
@@ -99,9 +97,14 @@ def _hypotheses(
     rng: np.random.Generator,
 ) -> Floats:
     """The best few planes (k, 3) of offset and slope through random points."""
-    chance: Floats = weight / sigma
-    chance /= chance.sum()
-    some = rng.choice(len(height), (HYPOTHESES, 3), p=chance)
+    chance = np.cumsum(weight / sigma)
+    chance /= chance[-1]
+
+    def drawn(*shape: int) -> Ints:
+        result: Ints = np.minimum(chance.searchsorted(rng.random(shape), side="right"), len(height) - 1)
+        return result
+
+    some = drawn(HYPOTHESES, 3)
     a, b = xy[some[:, 1]] - xy[some[:, 0]], xy[some[:, 2]] - xy[some[:, 0]]
     det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     wide = np.abs(det) > 2 * SMALLEST_AREA_M2
@@ -109,7 +112,7 @@ def _hypotheses(
     rise_a, rise_b = height[some[:, 1]] - height[some[:, 0]], height[some[:, 2]] - height[some[:, 0]]
     slope = np.stack([rise_a * b[:, 1] - rise_b * a[:, 1], a[:, 0] * rise_b - b[:, 0] * rise_a], 1) / det[:, None]
     offset = height[some[:, 0]] - (slope * xy[some[:, 0]]).sum(1)
-    single = rng.choice(len(height), LEVEL_HYPOTHESES, p=chance)
+    single = drawn(LEVEL_HYPOTHESES)
     level = np.tile(expected_slope, (LEVEL_HYPOTHESES, 1))
     planes = np.concatenate(
         [
@@ -117,27 +120,69 @@ def _hypotheses(
             np.column_stack([height[single] - xy[single] @ expected_slope, level]),
         ]
     )
-    scored = rng.choice(len(height), SCORED, p=chance) if len(height) > SCORED else np.arange(len(height))
+    scored = drawn(SCORED) if len(height) > SCORED else np.arange(len(height))
     residual = height[scored] - planes[:, :1] - planes[:, 1:] @ xy[scored].T
     cost = np.minimum((residual / (GATE_SIGMAS * sigma[scored])) ** 2, 1.0) @ weight[scored]
     result: Floats = planes[np.argsort(cost, kind="stable")[:OPTIMISED]]
     return result
 
 
-def _optimise(
-    plane: Floats, xy: Floats, height: Floats, sigma: Floats, weight: Floats, expected_slope: Floats, sigma_slope: float
-) -> Floats:
-    """Least squares with Tukey's weights from a hypothesis (3,), with the prior on the slope."""
-    rows = np.column_stack([np.ones(len(xy)), xy])
+@njit(cache=True, nogil=True, error_model="numpy")
+def _best(
+    starts: Any, xy: Any, height: Any, sigma: Any, weight: Any, expected: Any, sigma_slope: float,
+    max_slope_change: float, plane: Any,
+) -> bool:  # fmt: skip
+    """The best plane (3,), written into `plane`, of those that hypotheses (k, 3) lead to; whether there is one."""
+    found, least = False, np.inf
+    x = np.empty(3)
+    for start in starts:
+        x[:] = start
+        _optimise(x, xy, height, sigma, weight, expected, sigma_slope)
+        if math.hypot(x[1] - expected[0], x[2] - expected[1]) > max_slope_change:
+            continue
+        score = 0.0
+        for n in range(len(height)):
+            e = (height[n] - x[0] - xy[n, 0] * x[1] - xy[n, 1] * x[2]) / (GATE_SIGMAS * sigma[n])
+            score += weight[n] * min(e * e, 1.0)
+        if score < least:
+            found, least = True, score
+            plane[:] = x
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _optimise(x: Any, xy: Any, height: Any, sigma: Any, weight: Any, expected: Any, sigma_slope: float) -> None:
+    """Least squares with Tukey's weights from a hypothesis x (3,), in place, with the prior on the slope."""
+    prior = 1.0 / sigma_slope**2
     for _ in range(STEPS):
-        residual = (height - rows @ plane) / (GATE_SIGMAS * sigma)
-        w = weight / sigma**2 * np.clip(1.0 - residual**2, 0.0, None) ** 2
-        normal = rows.T @ (w[:, None] * rows) + np.diag([1e-12, sigma_slope**-2, sigma_slope**-2])
-        right = rows.T @ (w * height) + np.append(0.0, expected_slope) / sigma_slope**2
-        if not w.any():
-            return plane
-        before = plane
-        plane = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
-        if np.abs(plane - before).max() < CONVERGED_M:
-            break
-    return plane
+        h00, h01, h02, h11, h12, h22 = 1e-12, 0.0, 0.0, prior, 0.0, prior
+        g0, g1, g2 = 0.0, expected[0] * prior, expected[1] * prior
+        agree = 0
+        for n in range(len(height)):
+            a, b = xy[n, 0], xy[n, 1]
+            e = (height[n] - x[0] - a * x[1] - b * x[2]) / (GATE_SIGMAS * sigma[n])
+            if e * e >= 1.0 or weight[n] <= 0.0:
+                continue
+            agree += 1
+            w = weight[n] / sigma[n] ** 2 * (1.0 - e * e) ** 2
+            h00 += w
+            h01 += w * a
+            h02 += w * b
+            h11 += w * a * a
+            h12 += w * a * b
+            h22 += w * b * b
+            g0 += w * height[n]
+            g1 += w * a * height[n]
+            g2 += w * b * height[n]
+        if agree == 0:
+            return
+        # The offset is eliminated, and the slope's two equations are left: sums about the weighted mean.
+        s11, s12, s22 = h11 - h01 * h01 / h00, h12 - h01 * h02 / h00, h22 - h02 * h02 / h00
+        r1, r2 = g1 - h01 * g0 / h00, g2 - h02 * g0 / h00
+        det = s11 * s22 - s12 * s12
+        slope0, slope1 = (s22 * r1 - s12 * r2) / det, (s11 * r2 - s12 * r1) / det
+        offset = (g0 - h01 * slope0 - h02 * slope1) / h00
+        change = max(abs(offset - x[0]), abs(slope0 - x[1]), abs(slope1 - x[2]))
+        x[0], x[1], x[2] = offset, slope0, slope1
+        if change < CONVERGED_M:
+            return

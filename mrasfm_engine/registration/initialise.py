@@ -41,20 +41,54 @@ class Initialisation:
     method: str
 
 
-def unit_scores(model: Model, pairs: Sequence[PairMatches]) -> tuple[NDArray[np.float64], dict[tuple[int, int], int]]:
-    """Verified matches inside every unit (units,), and those that show motion between units, smaller unit first."""
-    inside = np.zeros(len(model.registered))
-    between: dict[tuple[int, int], int] = {}
-    for pair in pairs:
-        u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
-        if not model.keyframe[[u, v]].all():
-            continue
-        count = int(pair.inliers.sum())
-        if u == v:
-            inside[u] += count
-        else:
-            between[u, v] = between.get((u, v), 0) + round(count * _share_that_moves(model, pair))
-    return inside, between
+@dataclass(frozen=True, kw_only=True)
+class UnitScores:
+    """How much pairs of units have in common.
+
+    Parallax takes its time to compute, and no pair of units has more matches that show motion than it has matches:
+    those that come into question are asked first.
+    """
+
+    model: Model
+    inside: Ints  # (units,) verified matches between the images of a unit
+    between: dict[tuple[int, int], list[PairMatches]]  # by unit and later unit
+
+    @staticmethod
+    def of(model: Model, pairs: Sequence[PairMatches]) -> UnitScores:
+        """Of a drive's keyframes."""
+        inside = np.zeros(len(model.registered), dtype=np.int64)
+        between: dict[tuple[int, int], list[PairMatches]] = {}
+        for pair in pairs:
+            u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
+            if not (model.keyframe[u] and model.keyframe[v]):
+                continue
+            if u == v:
+                inside[u] += np.count_nonzero(pair.inliers)
+            else:
+                between.setdefault((u, v), []).append(pair)
+        return UnitScores(model=model, inside=inside, between=between)
+
+    def moving(self, u: int, v: int) -> int:
+        """Verified matches between two units that show motion."""
+        return sum(
+            round(np.count_nonzero(pair.inliers) * _share_that_moves(self.model, pair)) for pair in self.between[u, v]
+        )
+
+    def best_of_gap(self, gap: int) -> tuple[int, int]:
+        """The units, so many apart, with most matches inside them and such between them."""
+        most = {
+            (u, v): int(self.inside[u] + self.inside[v]) + sum(np.count_nonzero(pair.inliers) for pair in between)
+            for (u, v), between in self.between.items()
+            if v - u == gap
+        }
+        best, best_score = (-1, -1), -1
+        for units in sorted(most, key=lambda units: -most[units]):
+            if most[units] <= best_score:
+                break
+            score = int(self.inside[list(units)].sum()) + self.moving(*units)
+            if score > best_score:
+                best, best_score = units, score
+        return best
 
 
 def _share_that_moves(model: Model, pair: PairMatches) -> float:
@@ -80,10 +114,11 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
     """
     prior = prior_world_from_rig
     known = np.isfinite(prior[:, 0, 3]) if prior is not None else np.zeros(len(model.registered), dtype=np.bool_)
-    inside, between = unit_scores(model, pairs)
-    ranked = sorted(between, key=lambda uv: -(between[uv] + inside[uv[0]] + inside[uv[1]]))
+    scores = UnitScores.of(model, pairs)
     best: tuple[int, Initialisation, Floats, Floats] | None = None
-    for u, v in _varied(ranked):
+    # Not the same gap over and over: with a longer step points get better angles.
+    for gap in sorted({v - u for u, v in scores.between})[:CANDIDATES]:
+        u, v = scores.best_of_gap(gap)
         anchor = np.eye(4) if prior is None or not known[u] else prior[u]
         for method, pose in _proposals(model, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
             points = _evaluate(model, u, v, anchor, pose)
@@ -111,14 +146,6 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
     model.renew_motion()
     model.triangulate()
     return result
-
-
-def _varied(ranked: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The best pairs, but not the same gap over and over: with a longer step points get better angles."""
-    chosen: list[tuple[int, int]] = []
-    for gap in sorted({v - u for u, v in ranked})[:CANDIDATES]:
-        chosen.append(next((u, v) for u, v in ranked if v - u == gap))
-    return chosen
 
 
 def _proposals(

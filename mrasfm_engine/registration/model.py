@@ -88,6 +88,7 @@ class Model:
             self.camera_kind,
             max_error_px=config.mapping.max_error_px,
             min_angle_deg=config.mapping.min_angle_deg,
+            threads=config.threads,
         )
         # What registration asks for again and again: how many points every unit sees, as of which points; keypoints
         # by unit, and the tracks they are in.
@@ -270,13 +271,13 @@ class Model:
         """The adjustment of some units (and cameras) with all points they see; also those points' tracks."""
         rows, tracks, point = self.observed(free_units, everything=free_cameras is not None)
         problem = Problem(
-            state=replace(self.state, points_m=self.state.points_m[tracks]),
+            state=replace(self.state, points_m=self.state.points_m.take(tracks, axis=0)),
             camera_kind=self.camera_kind,
             observations=Observations(
-                unit=self.keypoints.unit[rows],
-                camera=self.keypoints.camera[rows],
+                unit=self.keypoints.unit.take(rows),
+                camera=self.keypoints.camera.take(rows),
                 point=point,
-                xy_px=self.keypoints.xy_px[rows],
+                xy_px=self.keypoints.xy_px.take(rows, axis=0),
                 num_points=len(tracks),
                 shot=None if self.state.simultaneous else self.keypoints.shot[rows],
             ),

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.parallel import mapped
 from mrasfm_engine.registration.model import Model
 from mrasfm_engine.scene.scene import PairMatches
 
@@ -68,12 +69,7 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
     along = np.zeros(len(keypoints.image), dtype=np.int64)  # matches for and against
     seen, moves = np.zeros((2, len(keypoints.image)), dtype=np.bool_)
     for a, b, least_px, moved_px in _flows(model, pairs):
-        tells = least_px > MIN_FLOW_PX
-        vote = np.where(tells, np.where(moved_px < STILL_SHARE * least_px, 1, -1), 0)
-        for rows in (a, b):
-            np.add.at(along, rows, vote)
-            seen[rows] = True
-            moves[rows[moved_px > STILL_PX]] = True
+        _vote(a, b, least_px, moved_px, along, seen, moves)
     # What stands still may be far away where no ground tells: above the horizon of a straight street. It counts with
     # what moves along only where most of the keypoints that do tell are such.
     with_it, still = along > 0, seen & (along == 0) & ~moves
@@ -116,29 +112,44 @@ def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools)
 
 def _flows(model: Model, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
     """Of every pair of one camera's images: keypoints of both, and by how much each must and does move, pixels."""
-    keypoints = model.keypoints
-    rig_from_cam = model.state.rig_from_cam
     posed = model.registered[model.image_unit] & ~model.missing
-    world_from_image = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
-    for pair in pairs:
-        unit_a, unit_b = int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])
-        camera = int(model.image_camera[pair.image_a])
-        if unit_a == unit_b or camera != model.image_camera[pair.image_b]:
-            continue
-        if not (posed[pair.image_a] and posed[pair.image_b]):
-            continue
-        a, b = model.matched_keypoints(pair, unit_a)
-        world_from_a = world_from_image[pair.image_a] @ rig_from_cam[camera]
-        world_from_b = world_from_image[pair.image_b] @ rig_from_cam[camera]
+    world_from_cam = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
+    world_from_cam = world_from_cam @ model.state.rig_from_cam[model.image_camera]
+
+    def tells(pair: PairMatches) -> bool:
+        a, b = pair.image_a, pair.image_b
+        along = model.image_unit[a] != model.image_unit[b] and model.image_camera[a] == model.image_camera[b]
+        return bool(along and posed[a] and posed[b])
+
+    def flow(pair: PairMatches) -> tuple[Ints, Ints, Floats, Floats]:
+        keypoints, camera = model.keypoints, int(model.image_camera[pair.image_a])
+        a, b = model.matched_keypoints(pair, int(model.image_unit[pair.image_a]))
+        xy_px = keypoints.xy_px.take(a, axis=0)
         least_px = _least_flow_px(
-            keypoints.rays[a],
-            keypoints.xy_px[a],
-            se3.inverse(world_from_b) @ world_from_a,
-            up=rig_from_cam[camera, 2, :3],
+            keypoints.rays.take(a, axis=0),
+            xy_px,
+            se3.inverse(world_from_cam[pair.image_b]) @ world_from_cam[pair.image_a],
+            up=model.state.rig_from_cam[camera, 2, :3],
             kind=int(model.camera_kind[camera]),
             params=model.state.camera_params[camera],
         )
-        yield a, b, least_px, np.linalg.norm(keypoints.xy_px[b] - keypoints.xy_px[a], axis=1)
+        return a, b, least_px, np.hypot(*(keypoints.xy_px.take(b, axis=0) - xy_px).T)
+
+    yield from mapped(model.config.threads, flow, [pair for pair in pairs if tells(pair)])
+
+
+@njit(cache=True, nogil=True)
+def _vote(a: Any, b: Any, least_px: Any, moved_px: Any, along: Any, seen: Any, moves: Any) -> None:
+    """Count a pair's matches of keypoints a and b (n,) for and against moving along, for both."""
+    for n in range(len(a)):
+        vote = 0
+        if least_px[n] > MIN_FLOW_PX:
+            vote = 1 if moved_px[n] < STILL_SHARE * least_px[n] else -1
+        for k in (a[n], b[n]):
+            along[k] += vote
+            seen[k] = True
+            if moved_px[n] > STILL_PX:
+                moves[k] = True
 
 
 def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats, kind: int, params: Floats) -> Floats:

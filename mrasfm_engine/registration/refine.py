@@ -274,7 +274,7 @@ def _observation_sigma(model: Model) -> float:
         )
     tracks = model.tracks.of_keypoint[rows]
     errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, tracks)
-    points = len(np.unique(tracks))
+    points = np.count_nonzero(np.bincount(tracks))
     redundancy = max(0.1, 1.0 - 3.0 * points / (2.0 * len(rows)))
     # The squared length of a 2D normal error has the median 2 ln 2 sigma^2.
     sigma = float(np.sqrt(np.median(errors**2) / (2 * np.log(2)) / redundancy))

@@ -58,7 +58,7 @@ def find_still_keypoints(
         for pair in group:
             a = keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
             b = keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
-            flow_px = np.linalg.norm(keypoints.xy_px[b] - keypoints.xy_px[a], axis=1)
+            flow_px = np.hypot(*(keypoints.xy_px.take(b, axis=0) - keypoints.xy_px.take(a, axis=0)).T)
             moves = flow_px > STILL_PX
             if len(flow_px) < MIN_MATCHES:
                 continue

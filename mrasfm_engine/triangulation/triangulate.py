@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 
@@ -297,8 +298,9 @@ class Triangulator:
         *,
         max_error_px: float,
         min_angle_deg: float,
+        threads: int = 1,
     ) -> None:
-        self._keypoints = keypoints
+        self._keypoints, self._threads = keypoints, threads
         self._shot_unit, self._shot_camera, self._kind = shot_unit, shot_camera, camera_kind
         self._few_shots = len(shot_unit) <= ALL_SHOTS
         self.max_error_px = max_error_px
@@ -335,29 +337,41 @@ class Triangulator:
         its observations into kept (keypoints,).
         """
         r, t = self._cam_from_world(state, _members(tracks, which))
-        _triangulate(
-            which, tracks.first, tracks.keypoints, self._keypoints.shot, self._keypoints.camera, self._keypoints.xy_px,
-            self._keypoints.rays, usable, r, t, self._kind, state.camera_params,
-            self.max_error_px**2, self._min_angle, points_m, solved, kept,
+        k = self._keypoints
+        in_ranges(
+            self._threads,
+            len(which),
+            lambda lo, hi, _: _triangulate(
+                which[lo:hi], tracks.first, tracks.keypoints, k.shot, k.camera, k.xy_px, k.rays, usable, r, t,
+                self._kind, state.camera_params, self.max_error_px**2, self._min_angle, points_m, solved, kept,
+            ),
         )  # fmt: skip
 
     def has_angle(self, state: State, tracks: Tracks, kept: Bools, which: Ints) -> Bools:
         """Which of the tracks `which` are still seen under an angle that gives depth by their kept observations."""
         r, _ = self._cam_from_world(state, _members(tracks, which))
-        out = np.empty(len(which), dtype=np.bool_)
-        _has_angle(
-            which, tracks.first, tracks.keypoints, kept, self._keypoints.shot, self._keypoints.rays, r,
-            math.cos(self._min_angle), out,
+        out, k = np.empty(len(which), dtype=np.bool_), self._keypoints
+        in_ranges(
+            self._threads,
+            len(which),
+            lambda lo, hi, _: _has_angle(
+                which[lo:hi], tracks.first, tracks.keypoints, kept, k.shot, k.rays, r, math.cos(self._min_angle),
+                out[lo:hi],
+            ),
         )  # fmt: skip
         return out
 
     def errors_px(self, state: State, rows: Ints, points_m: Floats, point: Ints) -> Floats:
         """Reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) of points_m; 1e6 behind."""
         r, t = self._cam_from_world(state, rows)
-        out = np.empty(len(rows))
-        _errors(
-            rows, point, self._keypoints.shot, self._keypoints.camera, self._keypoints.xy_px, r, t, self._kind,
-            state.camera_params, points_m, out,
+        out, k = np.empty(len(rows)), self._keypoints
+        in_ranges(
+            self._threads,
+            len(rows),
+            lambda lo, hi, _: _errors(
+                rows[lo:hi], point[lo:hi], k.shot, k.camera, k.xy_px, r, t, self._kind, state.camera_params, points_m,
+                out[lo:hi],
+            ),
         )  # fmt: skip
         return np.sqrt(out)
 

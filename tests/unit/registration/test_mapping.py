@@ -20,7 +20,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.registration.calibration import heading_change_deg
 from mrasfm_engine.registration.incremental import MappingLog, grow
-from mrasfm_engine.registration.initialise import initialise, unit_scores
+from mrasfm_engine.registration.initialise import UnitScores, initialise
 from mrasfm_engine.registration.mapping_report import describe
 from mrasfm_engine.registration.model import Model
 
@@ -157,14 +157,32 @@ def test_nothing_in_common_is_an_error_that_says_so() -> None:
     assert caught.value.code == "nothing-matches"
 
 
-def test_unit_scores_count_verified_matches() -> None:
-    simulated = make_simulated_drive(units=3, cameras=2, points=500)
+def test_the_units_with_most_in_common() -> None:
+    simulated = make_simulated_drive(units=5, cameras=2, points=500)
     pairs = true_matches(simulated)
     pairs[0].inliers[:5] = False
-    inside, between = unit_scores(make_model(simulated, pairs), pairs)
-    assert inside.sum() + sum(between.values()) == sum(int(p.inliers.sum()) for p in pairs)
-    assert set(between) == {(0, 1), (0, 2), (1, 2)}
-    assert (inside > 0).all()
+    model = make_model(simulated, pairs)
+    scores = UnitScores.of(model, pairs)
+    moving = {units: scores.moving(*units) for units in scores.between}
+    assert scores.inside.sum() + sum(moving.values()) == sum(int(p.inliers.sum()) for p in pairs)
+    assert (scores.inside > 0).all()
+    for gap in {v - u for u, v in moving}:
+        score = {(u, v): moving[u, v] + scores.inside[u] + scores.inside[v] for u, v in moving if v - u == gap}
+        assert score[scores.best_of_gap(gap)] == max(score.values())
+
+
+def test_units_that_stand_have_nothing_in_common() -> None:
+    """However many matches they have: without motion they are no points."""
+    simulated = make_simulated_drive(units=3, cameras=2, points=500)
+    pairs = true_matches(simulated)
+    model = make_model(simulated, pairs)
+    for pair in pairs:
+        if (model.image_unit[[pair.image_a, pair.image_b]] == [0, 1]).all():
+            a, b = model.matched_keypoints(pair, 0)
+            model.keypoints.rays[b] = model.keypoints.rays[a]
+    scores = UnitScores.of(model, pairs)
+    assert scores.moving(0, 1) < 0.5 * scores.moving(1, 2)
+    assert scores.best_of_gap(1) == (1, 2)
 
 
 def test_cancelling() -> None:

@@ -1,0 +1,56 @@
+"""Short passes over many items in several threads: compiled kernels release the interpreter's lock.
+
+Work must not start such passes of its own: the threads that it would wait for are those that wait for it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+FEW = 512  # items that one thread has done before others have heard of them
+BATCH = 128  # items whose results are held at one time
+
+
+def in_ranges(threads: int, count: int, work: Callable[[int, int, int], None]) -> None:
+    """Run `work(lo, hi, part)` over `count` items in so many threads."""
+    if threads <= 1 or count < FEW:
+        work(0, count, 0)
+        return
+    in_parts(np.linspace(0, count, threads + 1).astype(np.int64), work)
+
+
+def in_parts(bounds: NDArray[np.int64], work: Callable[[int, int, int], None]) -> None:
+    """Run `work(lo, hi, part)` between any two neighbouring bounds, each in a thread."""
+    parts = len(bounds) - 1
+    if parts == 1:
+        work(int(bounds[0]), int(bounds[1]), 0)
+        return
+    list(_pool(parts).map(work, bounds[:-1], bounds[1:], range(parts)))
+
+
+def mapped(threads: int, work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Results of `work` in the items' order; only those of some are held at one time."""
+    if threads <= 1:
+        yield from map(work, items)
+        return
+    for begin in range(0, len(items), BATCH):
+        yield from _pool(threads).map(work, items[begin : begin + BATCH])
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that wait for the next of many short passes: starting them anew would take as long as one."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="parallel")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
