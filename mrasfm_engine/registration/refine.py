@@ -41,7 +41,7 @@ Bools = NDArray[np.bool_]
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering
 TOLERANCE = 1e-6
-DECREMENT_TOLERANCE = 5e-3  # in the last round; a tenth of a standard deviation
+DECREMENT_TOLERANCE = 3e-2  # of the last step of the last round: a quarter of a standard deviation
 ROUGH_DECREMENT_TOLERANCE = 0.5  # in those before, after which observations change anyway
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
@@ -124,6 +124,7 @@ def refine(
     result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
     _settle(model, result, _terms(model, positions, result))
     for done in range(ROUNDS):
+        is_last = done == ROUNDS - 1
         result.sigma_px = _observation_sigma(model)
         terms = _terms(model, positions, result)
         result.adjustments.append(
@@ -132,18 +133,18 @@ def refine(
                 free_cameras=result.recalibrated,
                 free_focal=result.focal_free,
                 terms=terms,
-                options=_options(model, result.sigma_px, rough=done < ROUNDS - 1),
+                options=_options(model, result.sigma_px, rough=not is_last),
                 cancel=cancel,
             )
         )
         _settle(model, result, terms)
-        if done < ROUNDS - 1:
-            model.complete()
-        else:
+        if is_last:
             model.readmit()
+        else:
+            model.complete()
         observations, points = model.filter(model.config.mapping.filter_error_px)
         if model.config.mapping.semantic_triangulation:
-            result.road = drop_off_road(model, final=done == ROUNDS - 1)
+            result.road = drop_off_road(model, final=is_last)
         result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points

@@ -18,7 +18,7 @@
 | 14 | time of mapping a rendered drive of six cameras beside COLMAP's mappers on the same matches |
 | 15 | how time, memory and error grow with the length of simulated routes |
 | 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
-| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time |
+| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -56,7 +56,7 @@ from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.semantics import real_road, shadowed_road
-from tests.benchmarks.service import service
+from tests.benchmarks.service import maps_over_http, service
 from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.table import Figure, failed, save, show
 
@@ -91,7 +91,7 @@ LINES = {
     "14": Line(repeated=(surround_speed,)),
     "15": Line(timed=(long_routes,)),
     "16": Line(repeated=(correspondence,)),
-    "20": Line(timed=(kitti, speed_of_aggregation), by_seed=(crossing, repeated, loop)),
+    "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
 }
 
 

@@ -23,6 +23,7 @@ TIMES_AS_FAST = {
 MAX_KITTI_RMSE_M = 0.10
 MAX_SHARE_OF_WHOLE_WAY = 1 / 3
 SURROUND_UNITS = 60
+ALONE = 2  # runs of ours without peers
 PATIENCE = 1.25  # a peer is given so many times what would do: it need not come to its end to be slower
 ROUTES = (500, 1000, 2000, 4541)
 MAX_GROWTH, MAX_MEMORY_GB, MAX_ERROR_PERCENT = 1.5, 8.0, 0.1
@@ -72,13 +73,15 @@ def long_routes(data: Path, work: Path) -> Iterator[Figure]:
 
 def _beside_peers(line: str, name: str, drive: Path, out: Path, repeat: int) -> Iterator[Figure]:
     wanted = TIMES_AS_FAST[name]
-    alone = _row(_bench(drive, "--out", out), "mrasfm")
+    # Ours takes so much less time that a moment's load weighs on it most: it is measured before the peers, too.
+    alone = _row(_bench(drive, "--out", out, "--repeat", ALONE), "mrasfm")
     patience_s = PATIENCE * max(wanted.values()) * alone["whole_s"]
     result = _bench(
         drive, "--out", out, "--peers", ",".join(wanted), "--repeat", repeat, "--timeout-s", f"{patience_s:.0f}"
     )
     ours = _row(result, "mrasfm")
-    yield Figure(line=line, what=f"{name}: mapping and refinement", value=ours["whole_s"], unit="s")
+    ours_s = statistics.median([*alone["runs_s"], *ours["runs_s"]])
+    yield Figure(line=line, what=f"{name}: mapping and refinement", value=ours_s, unit="s")
     errors = ours["errors"]
     yield Figure(line=line, what=f"{name}: metric RMSE", value=errors["metric_rmse_m"], unit="m", most=MAX_KITTI_RMSE_M)
     for peer, times in wanted.items():
@@ -86,7 +89,7 @@ def _beside_peers(line: str, name: str, drive: Path, out: Path, repeat: int) -> 
         seconds = row["whole_s"] if row["whole_s"] is not None else patience_s
         remark = row["failure"] or f"{row['registered_images']} images"
         yield Figure(line=line, what=f"{name}: {peer} on the same matches", value=seconds, unit="s", remark=remark)
-        ratio = seconds / ours["whole_s"]
+        ratio = seconds / ours_s
         yield Figure(line=line, what=f"{name}: times as fast as {peer}", value=ratio, above=times, most=1e4)
 
 
