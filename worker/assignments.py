@@ -132,6 +132,8 @@ class MapAssignment:
             into=into,
             remove=inputs.remove,
             failed=inputs.failed,
+            members=inputs.members,
+            leave_out=not inputs.require_all,
         )
 
     def _fetch(self, target: Path, file: StoredArtifact) -> None:
@@ -148,6 +150,7 @@ class MapAssignment:
             files=files,
             summary=_map_summary(done.report),
             unconnected=done.report["map"]["unconnected"],
+            failed=done.report["failed_drives"],
             expires_us=_expires_us(settings.map_retention_days),
             reused=_reused(done.report),
         )

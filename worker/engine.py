@@ -18,6 +18,7 @@ from mrasfm_engine.io.preflight import UnsoundDriveError, is_sound
 from mrasfm_engine.io.preflight_content import inspect_drive
 from mrasfm_engine.learned.model_folder import default_folder
 from mrasfm_engine.pipeline import reconstruct
+from schemas.api.problems import PROBLEM_TYPE, Problem
 from worker.engine_settings import engine_config
 from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
 from worker.progress_pipe import ProgressWriter
@@ -94,10 +95,13 @@ def _aggregate(
         config,
         into=request.into,
         remove=request.remove,
+        leave_out=request.leave_out,
         progress=report,
         cancel=cancelled,
     )
-    written = {**_written_report(request.out), "failed_drives": request.failed}
+    written = _written_report(request.out)
+    unfit = [{**request.members[found["scene"]], "problem": _problem(found)} for found in written.pop("left_out")]
+    written["failed_drives"] = [*request.failed, *unfit]
     # The engine does not know of drives that it was not given; who reads the map's report shall.
     path = request.out / "report.json"
     partial = path.with_name(".report.json.partial")
@@ -105,6 +109,18 @@ def _aggregate(
     partial.replace(path)
     progress("export", 1, 1)
     return {**written, "map": _figures(json.loads((request.out / "map.json").read_text(encoding="utf-8")))}
+
+
+def _problem(found: dict[str, Any]) -> dict[str, Any]:
+    """Why a scene is not in the map."""
+    problem = Problem(
+        type=PROBLEM_TYPE + found["code"],
+        title="The scene fits into no map",
+        detail=found["what"],
+        remedy=found["remedy"],
+        retryable=False,
+    )
+    return problem.model_dump(mode="json", exclude_defaults=True)
 
 
 def _figures(document: dict[str, Any]) -> dict[str, Any]:

@@ -54,8 +54,10 @@ class ChildRequest:
     scenes, into, remove
         Of an aggregation: folders of scenes by name, folder of the map that they are added to, names of scenes that it
         shall lose.
-    failed
-        Of an aggregation: drives that have no scene, for its report.
+    failed, members
+        Of an aggregation: drives that have no scene, for its report, and what that calls those that have one, by name.
+    leave_out
+        Of an aggregation: whether a scene that fits into no map does not take the others with it.
     """
 
     work: Work
@@ -71,6 +73,8 @@ class ChildRequest:
     into: Path | None = None
     remove: list[str] = field(default_factory=list)
     failed: list[dict[str, Any]] = field(default_factory=list)
+    members: dict[str, dict[str, Any]] = field(default_factory=dict)
+    leave_out: bool = False
 
     def write(self, path: Path) -> None:
         """Put the request where the child reads it."""

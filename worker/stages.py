@@ -65,7 +65,7 @@ class Attempt:
         only where the files' times of modification are those of the last time.
     settings
         As in the API's `ReconstructionSettings`.
-    scenes, into, remove, failed
+    scenes, into, remove, failed, members, leave_out
         Of an aggregation, see ChildRequest.
     """
 
@@ -76,6 +76,8 @@ class Attempt:
     into: Path | None = None
     remove: Sequence[str] = ()
     failed: Sequence[Mapping[str, Any]] = ()
+    members: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    leave_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,8 @@ def run_attempt(attempt: Attempt, *, scratch: Path, tick: Tick, meter: ProgressM
             into=None if attempt.into is None else attempt.into.resolve(),
             remove=list(attempt.remove),
             failed=[dict(drive) for drive in attempt.failed],
+            members={name: dict(member) for name, member in attempt.members.items()},
+            leave_out=attempt.leave_out,
         ).write(folder.request)
         # -P: the working directory holds files from outside and is no place to import from.
         return [sys.executable, "-P", "-m", "worker.child", str(folder.request)]

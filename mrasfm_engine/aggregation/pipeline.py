@@ -38,6 +38,7 @@ def aggregate(
     *,
     into: Path | None = None,
     remove: Sequence[str] = (),
+    leave_out: bool = False,
     progress: stages.Progress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
@@ -54,6 +55,9 @@ def aggregate(
         A map that these scenes are added to. It is only read, and may be `out` itself.
     remove
         Names of scenes that the new map does not take over from `into`.
+    leave_out
+        Make the map without scenes that can be in none, for being damaged, or placed nowhere on the earth; the report
+        says which and why under `left_out`. Else they are errors, as they are where nothing new is left.
     progress
         Called as progress(stage, done, total).
     cancel
@@ -80,7 +84,7 @@ def aggregate(
     named = name_scenes(scenes)
     run = stages.Run(config, StageStore(out / ".stages"), into, progress, cancel)
     run.report["settings"] = config.model_dump(mode="json")
-    found = stages.scenes(run, named, remove)
+    found = stages.scenes(run, named, remove, leave_out=leave_out)
     known = stages.association(run, found)
     seams = stages.seams(run, found, known)
     graph, chains = _graph(found, known, seams)

@@ -43,7 +43,7 @@ class Run:
     progress: Progress
     cancel: Callable[[], bool]
     report: dict[str, Any] = field(
-        default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": []}
+        default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": [], "left_out": []}
     )
 
     @cached_property
@@ -68,8 +68,8 @@ class Run:
         self.report["findings"].append(as_json(finding))
 
 
-def scenes(run: Run, folders: Mapping[str, Path], remove: Sequence[str]) -> list[SourceScene]:
-    """All scenes of the map, those that it has already first; checked against one another."""
+def scenes(run: Run, folders: Mapping[str, Path], remove: Sequence[str], *, leave_out: bool) -> list[SourceScene]:
+    """All scenes of the map, those that it has already too; checked against one another."""
     started = time.perf_counter()
     kept = {} if run.into is None else _scenes_of_map(run.into)
     for number, name in enumerate(remove):
@@ -82,6 +82,7 @@ def scenes(run: Run, folders: Mapping[str, Path], remove: Sequence[str]) -> list
             )
         del kept[name]
     result = list(kept.values())
+    unfit: dict[str, InputError] = {}
     for done, (name, folder) in enumerate(folders.items(), 1):
         if name in kept:
             raise InputError(
@@ -89,8 +90,18 @@ def scenes(run: Run, folders: Mapping[str, Path], remove: Sequence[str]) -> list
                 remedy="Remove it first (--remove), or give the new one another name: NAME=FOLDER.",
                 code="duplicate-scene",
             )
-        result.append(read_scene(folder, name))
+        try:
+            result.append(read_scene(folder, name))
+        except InputError as error:
+            if not leave_out:
+                raise
+            unfit[name] = error
         run.progress("scenes", done, len(folders))
+    if unfit and (len(unfit) == len(folders) or len(result) < MIN_SCENES):
+        raise next(iter(unfit.values()))
+    run.report["left_out"] = [
+        {"scene": name, "code": error.code, "what": error.what, "remedy": error.remedy} for name, error in unfit.items()
+    ]
     result.sort(key=lambda scene: scene.name)
     _check_together(run, result)
     run.ended("scenes", started, scenes=len(result), taken_from_the_map=len(kept))

@@ -43,6 +43,10 @@ class MapInputs:
         Of all scenes of the new version, by name.
     failed
         Drives that have no scene, as the report names them.
+    members
+        What it calls those that have one, by name.
+    require_all
+        Whether a scene that fits into no map takes the others with it.
     """
 
     scenes: Mapping[str, Sequence[StoredArtifact]]
@@ -50,6 +54,8 @@ class MapInputs:
     remove: Sequence[str]
     scene_ids: Mapping[str, str]
     failed: Sequence[Mapping[str, Any]]
+    members: Mapping[str, Mapping[str, Any]]
+    require_all: bool
 
 
 def inputs_of(session: Session, job_id: str) -> MapInputs:
@@ -64,7 +70,9 @@ def inputs_of(session: Session, job_id: str) -> MapInputs:
         base=_files_of_version(session, job.map_id, request.get("base_version")),
         remove=list(request.get("remove", ())),
         scene_ids={**kept, **coming},
-        failed=maps.failed_drives(members),
+        failed=[{**maps.named(member), "problem": member.problem} for member in members if member.problem is not None],
+        members={member.name: maps.named(member) for member in members if member.scene_id is not None},
+        require_all=bool(request.get("require_all")),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 from sqlalchemy import delete, or_, select, tuple_, update
 from sqlalchemy.orm import Session
@@ -93,6 +94,7 @@ def publish(
     files: Mapping[str, StoredFile],
     summary: MapSummary,
     unconnected: Collection[str],
+    failed: Sequence[Mapping[str, Any]],
     expires_us: int | None,
     reused: Sequence[str] = (),
 ) -> int:
@@ -102,6 +104,8 @@ def publish(
     ----------
     unconnected
         Names of the scenes that overlap no other.
+    failed
+        Members that are not in it, see `named`, and why: `problem`.
 
     Returns
     -------
@@ -126,13 +130,18 @@ def publish(
             job_id=held.job_id,
             fence=held.fence,
             summary=summary.model_dump(mode="json"),
-            failed=failed_drives(members),
+            failed=[dict(drive) for drive in failed],
         )
     )
     session.flush()
-    named = [(scene.name, scene.drive_id, scene.scene_id) for scene in kept]
-    named += [(member.name, member.drive_id, member.scene_id) for member in members if member.scene_id is not None]
-    for name, drive_id, scene_id in named:
+    missing = {drive["name"] for drive in failed}
+    there = [(scene.name, scene.drive_id, scene.scene_id) for scene in kept]
+    there += [
+        (member.name, member.drive_id, member.scene_id)
+        for member in members
+        if member.scene_id is not None and member.name not in missing
+    ]
+    for name, drive_id, scene_id in there:
         connected = name not in unconnected
         session.add(
             MapScene(map_id=map_id, number=number, name=name, drive_id=drive_id, scene_id=scene_id, connected=connected)
@@ -154,13 +163,9 @@ def kept_scenes(session: Session, job: Job) -> list[MapScene]:
     return [scene for scene in found if scene.name not in removed]
 
 
-def failed_drives(members: Sequence[JobMember]) -> list[dict[str, object]]:
-    """Members that have no scene, as a version and its report name them."""
-    return [
-        {"name": member.name, "drive_id": member.drive_id, "job_id": member.child_id, "problem": member.problem}
-        for member in members
-        if member.problem is not None
-    ]
+def named(member: JobMember) -> dict[str, Any]:
+    """A member, as a version and its report call it."""
+    return {"name": member.name, "drive_id": member.drive_id, "job_id": member.child_id}
 
 
 def show_version(session: Session, found: Map, number: int) -> None:

@@ -26,6 +26,7 @@ from service.persistence import blobs, drives, jobs, maps, scenes
 from service.persistence.database import Database, migrate
 from service.persistence.durability import secure_drive
 from service.persistence.keys import create_key, create_project
+from service.persistence.map_inputs import inputs_of
 from service.persistence.storing import StoredFile, store_file
 from service.persistence.tables import Project, new_id
 from service.settings import Settings
@@ -187,7 +188,13 @@ class Client(httpx.Client):
         stored = self._store(files)
         with self.api.database.write() as session:
             return maps.publish(
-                session, held, files=stored, summary=MAP_SUMMARY, unconnected=unconnected, expires_us=None
+                session,
+                held,
+                files=stored,
+                summary=MAP_SUMMARY,
+                unconnected=unconnected,
+                failed=inputs_of(session, held.job_id).failed,
+                expires_us=None,
             )
 
     def _store(self, files: dict[str, bytes]) -> dict[str, StoredFile]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,35 @@ def test_two_drives_become_a_map(unpowered: World, two_drives: list[Path]) -> No
     run(world, job)
     assert "seams" in world.job(job.id).reused
     assert list(world.settings.scratch_dir.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_scene_that_fits_into_no_map_is_left_out(unpowered: World, two_drives: list[Path]) -> None:
+    """As its drive was driven without a receiver. Where all are required, it takes the others with it."""
+    world = unpowered
+    folder = Path(world.settings.data_dir) / "indoors"
+    shutil.copytree(two_drives[1], folder)
+    manifest = json.loads((folder / "drive.json").read_text())
+    del manifest["gnss"]
+    manifest["name"] = "indoors"
+    (folder / "drive.json").write_text(json.dumps(manifest))
+    ids = [world.add_drive(drive) for drive in (*two_drives, folder)]
+    job, due = ask(world, drives=ids)
+    run(world, *due, job)
+    ended = world.job(job.id)
+    assert (ended.state, ended.map_version) == ("SUCCEEDED", 1), ended.problem
+    (version,) = versions(world)
+    (failed,) = version.failed
+    assert (failed["name"], failed["drive_id"], failed["job_id"]) == ("indoors", ids[2], due[2].id)
+    assert failed["problem"]["type"].endswith("not-georeferenced")
+    assert document(world, 1, "report.json")["failed_drives"] == version.failed
+    assert len(document(world, 1, "map.json")["scenes"]) == version.summary["scenes"] == 2
+
+    job, due = ask(world, drives=ids, require_all=True)
+    run(world, *due)
+    refused = world.job(job.id)
+    assert refused.problem is not None
+    assert (refused.state, refused.problem["type"]) == ("FAILED", "urn:mrasfm:problem:not-georeferenced")
 
 
 @pytest.mark.slow
