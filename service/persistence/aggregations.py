@@ -78,6 +78,8 @@ def create(
     if of_map is None:
         of_map = Map(id=new_id("map"), project_id=project_id, name=asked.name or _map_name(plan))
         session.add(of_map)
+    if of_map.current_version is None:
+        of_map.expires_us = job_expires_us  # its record is all there is of it, until a version is published
     settings = asked.settings.model_dump(mode="json", exclude_none=True)
     # Before anything locks the project, as a new job does: who publishes a scene holds its job and wants the project.
     _find_what_is_there(session, plan, settings)
