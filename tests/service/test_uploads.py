@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -18,6 +19,7 @@ from sqlalchemy import update
 from service.app import sweep_uploads
 from service.persistence import durability
 from service.persistence.tables import Drive, Upload, now_us
+from service.routes import upload_writing
 from service.uploads.resumable import PartialFile, sweep
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
@@ -260,6 +262,44 @@ def test_an_archive(client: Client, drive: TinyDrive) -> None:
     assert patch(client, url, 0, zipped[:100]).status_code == 204
     assert patch(client, url, 100, zipped[100:]).status_code == 204
     assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+
+
+def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
+    client: Client, api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unpacking, go_on = api.context.unpacking, threading.Event()
+    unpack_now = upload_writing.keep_archive
+
+    def unpack_later(*given: Any) -> Any:
+        assert go_on.wait(30)
+        return unpack_now(*given)
+
+    monkeypatch.setattr(upload_writing, "keep_archive", unpack_later)
+    answers: list[int] = []
+
+    def send(url: str, offset: int, data: bytes) -> threading.Thread:
+        own = api.client_of(client.project_id, client.key)
+        thread = threading.Thread(target=lambda: answers.append(patch(own, url, offset, data).status_code))
+        thread.start()
+        return thread
+
+    zips = [tiny_drive(seed=f"turn{i}").zipped() for i in range(int(unpacking.total_tokens) + 1)]
+    *urls, last = [begin_archive(client, client.create(), zipped) for zipped in zips]
+    try:
+        sending = [send(url, 0, zipped) for url, zipped in zip(urls, zips[:-1], strict=True)]
+        wait_until(lambda: unpacking.available_tokens == 0, "that all places are taken")
+        client.timeout = 5
+        assert patch(client, last, 0, zips[-1][:100]).status_code == 204
+        sending.append(send(last, 100, zips[-1][100:]))
+        wait_until(lambda: unpacking.statistics().tasks_waiting == 1, "that the last one waits")
+        with api.database.read() as session:
+            kept_bytes = session.get_one(Upload, last.rsplit("/", 1)[1]).kept_bytes
+        assert kept_bytes == len(zips[-1]), "what came does not wait"
+    finally:
+        go_on.set()
+    for thread in sending:
+        thread.join()
+    assert answers == [204] * len(zips)
 
 
 def test_bytes_that_are_not_what_was_announced(api: Api, client: Client) -> None:
