@@ -17,7 +17,7 @@ from service.persistence import uploads
 from service.persistence.durability import boot_id
 from service.persistence.storing import file_sha256
 from service.persistence.tables import Upload, now_us
-from service.routes.keeping import keep_archive, keep_file
+from service.routes.keeping import keep_archive, keep_file, require_open, require_wanted
 from service.uploads.resumable import Appender, Hash, PartialFile, append, new_hash
 from service.uploads.spool import Spooled, require_space
 from service.uploads.tus import Checksum
@@ -60,6 +60,7 @@ def _secured(context: Context, project_id: str, drive_id: str, upload_id: str) -
     file = PartialFile(context.settings.uploads_dir, upload_id)
     try:
         held = _Held(context, project_id, drive_id, upload_id, file)
+        held.require_wanted()
         held.secure()
     except BaseException:
         file.close()
@@ -143,6 +144,7 @@ class UploadWriting:
         file = PartialFile(context.settings.uploads_dir, self._of[2])
         try:
             held = _Held(context, *self._of, file)
+            held.require_wanted()
             held.begin(offset, length, counts_at_once=checksum is None)
         except BaseException:
             file.close()
@@ -207,6 +209,18 @@ class _Held:
         self.offset = offset
         # The record must not be lost by what its bytes survive: it waits for the disk, too.
         self._record(durable=True, kept_bytes=offset)
+
+    def require_wanted(self) -> None:
+        """Refuse bytes that are to come for nothing: the drive may have been committed since."""
+        upload = self.upload
+        if upload.is_done or self.offset == upload.size_bytes:
+            return
+        of = (self._context, upload.project_id, upload.drive_id)
+        with self._dropped_where_refused():
+            if upload.path is None:
+                require_open(*of)
+            else:
+                require_wanted(*of, upload.path, sha256=upload.sha256, size_bytes=upload.size_bytes)
 
     def take(self, begin: int, offset: int, checksum: Checksum | None, compared: Hash | None) -> None:
         """Take what was appended, where it is right."""

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,7 +25,7 @@ from service.uploads.resumable import PartialFile, sweep
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
 from tests.service.tiny_drive import TinyDrive, png_of, tiny_drive
-from tests.service.tus_client import VERSION, begin, checksum, create, head, offset_of, patch
+from tests.service.tus_client import OFFSET_TYPE, VERSION, begin, checksum, create, head, offset_of, patch
 
 PATH = "front/000000.png"
 
@@ -302,6 +303,65 @@ def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
     assert answers == [204] * len(zips)
 
 
+def begun(client: Client, method: str, url: str, **headers: str) -> tuple[int, bytes]:
+    """The answer to a request whose body does not come."""
+    connection = HTTPConnection(urlsplit(client.api.url).netloc, timeout=10)
+    try:
+        connection.putrequest(method, url)
+        for name, value in {"Authorization": f"Bearer {client.key}", **headers}.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("method", ["PATCH", "HEAD"])
+@pytest.mark.parametrize("what", ["file", "archive"])
+def test_a_drive_that_was_committed_meanwhile_is_told_before_the_bytes_come(
+    client: Client, api: Api, drive: TinyDrive, what: str, method: str
+) -> None:
+    drive_id, size_bytes = client.filled(drive), 10_000_000
+    announced = {"archive": ""} if what == "archive" else {"path": PATH, "replace": "true"}
+    url = create(client, drive_id, size_bytes, **announced).headers["location"]
+    assert patch(client, url, 0, b"x" * 1000).status_code == 204
+    commit(api, drive_id)
+    headers = {} if method == "HEAD" else {"Upload_Offset": "1000", "Content_Length": str(size_bytes - 1000)}
+    status, body = begun(client, method, url, Tus_Resumable="1.0.0", Content_Type=OFFSET_TYPE, **headers)
+    assert status == 409
+    assert method == "HEAD" or b"drive-committed" in body
+    assert head(client, url).status_code == 404, "as at its end, there is nothing to go on with"
+    assert not any(name.startswith(url.rsplit("/", 1)[1]) for name in bytes_left(api))
+
+
+def commit(api: Api, drive_id: str) -> None:
+    with api.database.write() as session:
+        session.execute(update(Drive).where(Drive.id == drive_id).values(state="COMMITTED"))
+
+
+def test_what_a_committed_drive_has_may_come_again(client: Client, api: Api, drive: TinyDrive) -> None:
+    drive_id, data = client.create(drive), drive.files[PATH]
+    urls = [begin(client, drive_id, PATH, data, **known) for known in ({"sha256": sha256_of(data)}, {})]
+    client.send_files(drive_id, drive)
+    commit(api, drive_id)
+    for url in urls:
+        assert patch(client, url, 0, data).status_code == 204
+    other = png_of(64, 48, b"other")
+    large = str(20_000_000)
+    status, body = begun(client, "PUT", f"/v1/drives/{drive_id}/files/{PATH}?replace=true", Content_Length=large)
+    assert (status, b"drive-committed" in body) == (409, True)
+    problem_of(client.put(f"/v1/drives/{drive_id}/files/{PATH}", content=other), 409, "drive-committed")
+
+
+def test_a_drive_that_was_deleted_meanwhile_is_told_before_the_bytes_come(client: Client) -> None:
+    drive_id = client.create()
+    url = create(client, drive_id, 10_000_000, archive="").headers["location"]
+    assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
+    headers = {"Tus_Resumable": "1.0.0", "Content_Type": OFFSET_TYPE, "Upload_Offset": "0"}
+    assert begun(client, "PATCH", url, **headers, Content_Length="10000000")[0] == 404
+
+
 def test_bytes_that_are_not_what_was_announced(api: Api, client: Client) -> None:
     drive_id, data = client.create(), image(1000)
     url = begin(client, drive_id, PATH, data, sha256=sha256_of(b"other"))
@@ -358,8 +418,7 @@ def test_uploads_into_a_committed_drive_count_nothing(start_api: StartApi) -> No
     assert create(client, drive_id, 900_000, archive="").status_code == 201
     other_id = client.create()
     problem_of(create(client, other_id, 900_000, archive=""), 413, "quota-full")
-    with client.api.database.write() as session:
-        session.execute(update(Drive).where(Drive.id == drive_id).values(state="COMMITTED"))
+    commit(client.api, drive_id)
     assert create(client, other_id, 900_000, archive="").status_code == 201
 
 
