@@ -85,7 +85,8 @@ def create_upload(
 ) -> Response:
     """Begin a resumable upload of one file of an open drive, or of an archive; `Location` takes its bytes.
 
-    Where the project has the content already (by `sha256`) the upload is complete at once: `Upload-Offset` says so.
+    Where a drive of the project has the content already (by `sha256`) the upload is complete at once: `Upload-Offset`
+    says so.
     """
     tus.require_version(tus_resumable)
     if upload_concat is not None:

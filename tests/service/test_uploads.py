@@ -256,6 +256,19 @@ def test_what_is_there_is_not_sent_again(client: Client, drive: TinyDrive) -> No
     assert answer.headers["upload-offset"] == "0"
 
 
+def test_what_is_there_and_is_no_file_of_a_drive_is_sent_and_checked(client: Client, drive: TinyDrive) -> None:
+    """A manifest here; else any result of a job would pass for an image."""
+    client.create(drive)
+    drive_id, data = client.create(tiny_drive("other")), drive.raw
+    answer = create(client, drive_id, len(data), path=PATH, sha256=sha256_of(data))
+    assert (answer.headers["upload-offset"], answer.json()["done"]) == ("0", False)
+    problem_of(patch(client, answer.headers["location"], 0, data), 422, "not-an-image")
+    file = {"path": PATH, "size_bytes": len(data), "sha256": sha256_of(data)}
+    declared = client.post(f"/v1/drives/{drive_id}/files:declare", json={"files": [file]})
+    assert declared.json() == {"stored": [], "to_send": [PATH]}
+    assert stored(client, drive_id) is None
+
+
 def test_an_archive(client: Client, drive: TinyDrive) -> None:
     drive_id, zipped = client.create(drive), drive.zipped()
     answer = create(client, drive_id, len(zipped), archive="", sha256=sha256_of(zipped))
