@@ -308,8 +308,8 @@ def _rejection(drive: Drive) -> Problem:
 
 
 def _name(wanted: str, taken: set[str]) -> str:
-    """A scene's name in the map: a file's name could be made of it, and no other has it."""
-    safe = _UNSAFE.sub("-", wanted).strip("-.")[:_NAME_LENGTH] or "drive"
+    """A scene's name in the map: the engine takes it, a file's name could be made of it, and no other has it."""
+    safe = _UNSAFE.sub("-", wanted).strip("-._")[:_NAME_LENGTH] or "drive"
     names = (safe if i == 1 else f"{safe}-{i}" for i in range(1, len(taken) + 2))
     found = next(name for name in names if name not in taken)
     taken.add(found)

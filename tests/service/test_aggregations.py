@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import delete, update
 
+from mrasfm_engine.aggregation.load import name_scenes
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.persistence import jobs, trees
 from service.persistence.tables import Drive, Job, JobMember, Scene
@@ -362,3 +364,11 @@ def test_drives_of_one_name(client: Client) -> None:
     drives = [client.frozen(tiny_drive("Straße 1/2", seed=f"{client.project_id}{i}")) for i in range(3)]
     job = client.aggregate(drives=drives)
     assert [member["name"] for member in job["members"]] == ["Stra-e-1-2", "Stra-e-1-2-2", "Stra-e-1-2-3"]
+
+
+def test_names_of_drives_that_no_scene_can_have(client: Client) -> None:
+    names = {"_night": "night", "...": "drive", "-_-": "drive-2", "ÄÖ ~ x": "x", "y" * 120: "y" * 80}
+    drives = [client.frozen(tiny_drive(name, seed=f"{client.project_id}{name}")) for name in names]
+    given = [member["name"] for member in client.aggregate(drives=drives)["members"]]
+    assert sorted(given) == sorted(names.values())
+    assert name_scenes({name: Path(name) for name in given})
