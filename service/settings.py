@@ -86,7 +86,7 @@ class Settings(BaseSettings):
     drive_retention_days: Annotated[float, Field(gt=0)] | None = None
     scene_retention_days: Annotated[float, Field(gt=0)] | None = None
     map_retention_days: Annotated[float, Field(gt=0)] | None = None  # since its newest version
-    job_retention_days: Annotated[float, Field(gt=0)] | None = None
+    job_retention_days: Annotated[float, Field(gt=0)] | None = None  # also of maps that have no version
     idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
 
     @field_validator(*{name for first, _, second in _IN_STEP for name in (first, second)})

@@ -9,7 +9,7 @@ from service.client.api import Client
 from service.client.drive_folder import LocalFile
 from service.client.errors import ApiError, ClientError
 from service.client.parallel import Meter
-from service.client.transport import TroubleError
+from service.client.transport import Patience, TroubleError
 
 # Smaller ones are sent again from their beginning: the questions where to go on would take as long.
 FROM_BYTES = 8 << 20
@@ -32,21 +32,24 @@ class ResumableUpload:
         self._file = file
         self._meter = meter
         self._counted_bytes = 0
-        self.url = url
+        self._url = url or ""
 
     def begin(self) -> str:
         """Where the bytes go: as before, where the service still knows it; else anew."""
-        if self.url is not None:
+        if self._url:
             try:
-                self._client.upload_offset(self.url)
-                return self.url
+                self._offset(self._client.patience())
+                return self._url
             except ApiError as error:
                 if error.status not in _ENDED:
                     raise
+        self._url = self._create()
+        return self._url
+
+    def _create(self) -> str:
         file = self._file
         metadata = {"path": file.path, "sha256": file.sha256, "replace": "true"}
-        self.url = self._client.create_upload(self._drive_id, file.size_bytes, metadata)
-        return self.url
+        return self._client.create_upload(self._drive_id, file.size_bytes, metadata)
 
     def send(self) -> None:
         """All that is missing, from wherever the service is; again and again while trouble may pass.
@@ -58,21 +61,35 @@ class ResumableUpload:
         UnreachableError
             It does not answer.
         """
-        url, patience = self.begin(), self._client.patience()
-        while (offset := self._client.upload_offset(url)) < self._file.size_bytes:
+        self.begin()
+        patience = self._client.patience()
+        while (offset := self._offset(patience)) < self._file.size_bytes:
             if offset > self._counted_bytes:
                 patience.renew()
             self._count(offset)
             try:
-                self._client.append_to_upload(url, offset, lambda at=offset: self._pieces(at))  # type: ignore[misc]
+                self._client.append_to_upload(self._url, offset, lambda at=offset: self._pieces(at))  # type: ignore[misc]
             except TroubleError as trouble:
                 patience.pause(trouble)
             except ApiError as error:
                 # Another request, perhaps an earlier one of ours, is still being served, or has just been.
-                if error.status not in (HTTPStatus.CONFLICT, HTTPStatus.LOCKED) or error.code == "file-exists":
+                if error.code not in ("wrong-offset", "upload-locked"):
                     raise
                 patience.pause(TroubleError(error, 1.0))
         self._count(self._file.size_bytes)
+
+    def _offset(self, patience: Patience) -> int:
+        while True:
+            try:
+                return self._client.upload_offset(self._url)
+            except ApiError as error:
+                match error.status:
+                    case HTTPStatus.LOCKED:
+                        patience.pause(TroubleError(error, 1.0))
+                    case HTTPStatus.CONFLICT:  # an answer to HEAD has no words: this one says why, or begins anew
+                        self._url = self._create()
+                    case _:
+                        raise
 
     def _pieces(self, offset: int) -> Iterator[bytes]:
         for piece in self._file.pieces(offset):

@@ -27,6 +27,7 @@ from service.persistence.tables import (
     JobState,
     Map,
     MapScene,
+    Project,
     Scene,
     new_id,
 )
@@ -48,6 +49,12 @@ class _Plan:
     kept: list[MapScene] = field(default_factory=list)
     removed: list[MapScene] = field(default_factory=list)
 
+    @property
+    def missing(self) -> list[Drive]:
+        """Drives whose scenes nobody makes yet; those that cannot have one are none of them."""
+        known = self.found.keys() | self.under_way.keys()
+        return [d for d in self.drives if d.id not in known and d.preflight_state != PreflightState.REJECTED]
+
 
 def create(
     session: Session,
@@ -68,7 +75,8 @@ def create(
     ------
     ServiceError
         404 for what is not there; 409 where a drive is not committed or the map is being made; 422 where a drive comes
-        twice, no map can come of it or, with `require_all`, a drive was rejected; 429 as `jobs.create`.
+        twice, no map can come of it, with `require_all` a drive was rejected, or the project may never have so many
+        jobs at one time; 429 where it may not now.
     """
     map_id = asked.map_id if retry_of is None else retry_of.map_id
     of_map = None if map_id is None else maps.get(session, project_id, map_id, lock=True)
@@ -78,9 +86,12 @@ def create(
     if of_map is None:
         of_map = Map(id=new_id("map"), project_id=project_id, name=asked.name or _map_name(plan))
         session.add(of_map)
+    if of_map.current_version is None:
+        of_map.expires_us = job_expires_us  # its record is all there is of it, until a version is published
     settings = asked.settings.model_dump(mode="json", exclude_none=True)
     # Before anything locks the project, as a new job does: who publishes a scene holds its job and wants the project.
     _find_what_is_there(session, plan, settings)
+    _require_quota(session, project_id, plan)
     job = jobs.create(
         session,
         project_id=project_id,
@@ -210,6 +221,23 @@ def _find_what_is_there(session: Session, plan: _Plan, settings: Mapping[str, An
             plan.under_way[drive.id] = job
 
 
+def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
+    """Room for the aggregation and all that it needs, before any of them is recorded."""
+    needed, limit = 1 + len(plan.missing), session.get_one(Project, project_id).max_active_jobs
+    if needed > limit:
+        raise ServiceError(
+            422,
+            "aggregation-too-large",
+            "The project's quota of jobs is too small for it",
+            f"the aggregation and the reconstructions that it needs are {needed} jobs at one time, the project's quota "
+            f"is {limit}: waiting does not help",
+            remedy=f"Reconstruct at least {needed - limit} of the drives first, no more than {limit} at one time, then "
+            "ask again: scenes made with the same settings are reused, others can be named as scenes. Or ask the "
+            "operator for a larger quota.",
+        )
+    jobs.require_places(session, project_id, needed)
+
+
 def _members(session: Session, job: Job, plan: _Plan) -> Iterator[Job | None]:
     """Record what the aggregation brings; for each the job that makes its scene, None where that is there."""
     taken = {scene.name for scene in (*plan.kept, *plan.removed)}
@@ -280,8 +308,8 @@ def _rejection(drive: Drive) -> Problem:
 
 
 def _name(wanted: str, taken: set[str]) -> str:
-    """A scene's name in the map: a file's name could be made of it, and no other has it."""
-    safe = _UNSAFE.sub("-", wanted).strip("-.")[:_NAME_LENGTH] or "drive"
+    """A scene's name in the map: the engine takes it, a file's name could be made of it, and no other has it."""
+    safe = _UNSAFE.sub("-", wanted).strip("-._")[:_NAME_LENGTH] or "drive"
     names = (safe if i == 1 else f"{safe}-{i}" for i in range(1, len(taken) + 2))
     found = next(name for name in names if name not in taken)
     taken.add(found)

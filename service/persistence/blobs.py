@@ -71,6 +71,11 @@ def exists(session: Session, project_id: str, sha256: str) -> bool:
     return session.scalar(found) is not None
 
 
+def is_drive_file() -> ColumnElement[bool]:
+    """The condition that a drive has a blob as a file. What else a project stores was not checked to be an image."""
+    return sql_exists().where(DriveFile.blob_id == Blob.id)
+
+
 def find(session: Session, project_id: str, sha256: str) -> Blob | None:
     """The project's blob of this content, kept from being collected for a while."""
     blob = session.scalar(select(Blob).where(Blob.project_id == project_id, Blob.sha256 == sha256))
@@ -174,7 +179,7 @@ def unused() -> ColumnElement[bool]:
     """The condition that nothing refers to a blob."""
     return ~(
         sql_exists().where(Drive.manifest_blob_id == Blob.id)
-        | sql_exists().where(DriveFile.blob_id == Blob.id)
+        | is_drive_file()
         | sql_exists().where(SceneFile.blob_id == Blob.id)
         | sql_exists().where(Checkpoint.blob_id == Blob.id)
         | sql_exists().where(MapFile.blob_id == Blob.id)

@@ -151,7 +151,7 @@ def require_open(drive: Drive) -> None:
 
 
 def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) -> tuple[list[str], list[str]]:
-    """Use contents that the project has already, for the files of an open drive.
+    """Use contents that drives of the project have already, for the files of an open drive.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) ->
     unknown = sorted(wanted.keys() - present.keys())
     if unknown:
         raise slots.not_in_manifest(drive.id, unknown[0])
-    known = _known_blobs(session, drive.project_id, sorted({file.sha256 for file in wanted.values()}))
+    known = known_files(session, drive.project_id, sorted({file.sha256 for file in wanted.values()}))
     stored, to_send = [], []
     for path, file in wanted.items():
         blob = known.get(file.sha256)
@@ -195,10 +195,11 @@ def _identities(session: Session, drive: Drive, paths: Sequence[str]) -> dict[st
     return found
 
 
-def _known_blobs(session: Session, project_id: str, digests: Sequence[str]) -> dict[str, Blob]:
+def known_files(session: Session, project_id: str, digests: Sequence[str]) -> dict[str, Blob]:
+    """Files of the project's drives, by their contents; they are kept from being collected for a while."""
     found: dict[str, Blob] = {}
     for i in range(0, len(digests), _BATCH):
-        some = (Blob.project_id == project_id) & Blob.sha256.in_(digests[i : i + _BATCH])
+        some = (Blob.project_id == project_id) & Blob.sha256.in_(digests[i : i + _BATCH]) & blobs.is_drive_file()
         session.execute(update(Blob).where(some).values(touched_us=now_us()))
         found.update((blob.sha256, blob) for blob in session.scalars(select(Blob).where(some)))
     return found

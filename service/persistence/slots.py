@@ -96,6 +96,24 @@ def find(session: Session, project_id: str, drive_id: str, path: str, *, lock: b
     )
 
 
+def require_taken(slot: Slot, *, sha256: str | None, size_bytes: int | None) -> None:
+    """Refuse bytes that have not come yet, where it is certain that `fill` will.
+
+    Parameters
+    ----------
+    sha256, size_bytes
+        What is known of them. A committed drive still takes what it has.
+
+    Raises
+    ------
+    ServiceError
+        409 where the drive is committed.
+    """
+    may_be_same = sha256 in (None, slot.sha256) and size_bytes in (None, slot.size_bytes)
+    if not slot.is_open and not may_be_same:
+        raise drive_committed(slot.drive_id)
+
+
 def fill(session: Session, slot: Slot, stored: StoredFile, *, replace: bool) -> blobs.Recorded | None:
     """Give a slot its bytes.
 

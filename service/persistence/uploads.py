@@ -38,7 +38,7 @@ class Announced:
 
 
 def create(session: Session, *, project_id: str, drive_id: str, announced: Announced, expires_us: int) -> Upload:
-    """Record an upload. One whose content the project has already is done at once.
+    """Record an upload. One whose content a drive of the project has already is done at once.
 
     Raises
     ------
@@ -50,7 +50,8 @@ def create(session: Session, *, project_id: str, drive_id: str, announced: Annou
     known = None
     if announced.path is not None:
         slot = slots.find(session, project_id, drive_id, announced.path)
-        known = None if announced.sha256 is None else blobs.find(session, project_id, announced.sha256)
+        digests = [] if announced.sha256 is None else [announced.sha256]
+        known = drives.known_files(session, project_id, digests).get(announced.sha256 or "")
         if known is not None and known.size_bytes == announced.size_bytes:
             there = StoredFile(sha256=known.sha256, size_bytes=known.size_bytes, key=known.key, is_new=False)
             slots.fill(session, slot, there, replace=announced.replace)

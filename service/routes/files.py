@@ -24,7 +24,7 @@ from service.persistence.idempotency import Answer
 from service.persistence.tables import Blob, DriveFile
 from service.routes.bodies import Body, describe, describe_bytes, json_body
 from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, problems
-from service.routes.keeping import keep_archive, keep_file, require_wanted
+from service.routes.keeping import keep_archive, keep_file, require_open, require_wanted
 from service.routes.paging import cursor_of, position_of
 from service.uploads.digests import parse_digest
 from service.uploads.spool import receive, receive_into
@@ -118,14 +118,17 @@ async def put_file(
     """Store one file of an open drive, whole or not at all. Sending the same bytes again changes nothing."""
     stream = request.stream()
     try:
-        if int(request.headers.get("content-length", _ASK_FIRST_BYTES)) >= _ASK_FIRST_BYTES:
-            await run_in_threadpool(require_wanted, context, caller.project_id, drive_id, path)
+        announced = _announced(request, context, content_digest)
+        size_bytes, sha256 = announced["expected_bytes"], announced["expected_sha256"]
+        if size_bytes is None or size_bytes >= _ASK_FIRST_BYTES:
+            of_file = partial(require_wanted, sha256=sha256, size_bytes=size_bytes)
+            await run_in_threadpool(of_file, context, caller.project_id, drive_id, path)
         new, shown = await receive_into(
             lambda spooled: keep_file(context, caller.project_id, drive_id, path, spooled, replace),
             stream,
             context.settings.spool_dir,
             max_bytes=context.settings.max_file_bytes,
-            **_announced(request, context, content_digest),
+            **announced,
         )
     except ServiceError:
         await _drain(request, stream)
@@ -159,7 +162,7 @@ async def put_archive(
     """Store all files of an archive in an open drive, or none of them. One folder around them is taken off."""
     stream = request.stream()
     try:
-        await run_in_threadpool(_require_open, context, caller.project_id, drive_id)
+        await run_in_threadpool(require_open, context, caller.project_id, drive_id)
         archive = await receive(
             stream,
             context.settings.spool_dir,
@@ -204,11 +207,6 @@ async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
                 return
     except (ClientDisconnect, RuntimeError):  # RuntimeError: the stream has been read to its end
         return
-
-
-def _require_open(context: Context, project_id: str, drive_id: str) -> None:
-    with context.database.read() as session:
-        drives.require_open(drives.get(session, project_id, drive_id))
 
 
 def _shown(file: DriveFile, blob: Blob | None) -> DriveFileResource:

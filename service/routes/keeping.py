@@ -22,10 +22,25 @@ from service.uploads.images import check_image
 from service.uploads.spool import Spooled
 
 
-def require_wanted(context: Context, project_id: str, drive_id: str, path: str) -> None:
-    """Refuse a file that would not be taken, before its bytes are."""
+def require_wanted(
+    context: Context,
+    project_id: str,
+    drive_id: str,
+    path: str,
+    *,
+    sha256: str | None = None,
+    size_bytes: int | None = None,
+) -> None:
+    """Refuse a file that would not be taken, before its bytes are; with what is known of them."""
     with context.database.read() as session:
-        slots.find(session, project_id, drive_id, path)
+        slot = slots.find(session, project_id, drive_id, path)
+    slots.require_taken(slot, sha256=sha256, size_bytes=size_bytes)
+
+
+def require_open(context: Context, project_id: str, drive_id: str) -> None:
+    """Refuse an archive that comes too late, before its bytes do."""
+    with context.database.read() as session:
+        drives.require_open(drives.get(session, project_id, drive_id))
 
 
 def keep_file(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import anyio.to_thread
@@ -16,7 +17,7 @@ from service.persistence import uploads
 from service.persistence.durability import boot_id
 from service.persistence.storing import file_sha256
 from service.persistence.tables import Upload, now_us
-from service.routes.keeping import keep_archive, keep_file
+from service.routes.keeping import keep_archive, keep_file, require_open, require_wanted
 from service.uploads.resumable import Appender, Hash, PartialFile, append, new_hash
 from service.uploads.spool import Spooled, require_space
 from service.uploads.tus import Checksum
@@ -29,7 +30,7 @@ _PATIENCE_S = 1.0
 _POLL_S = 0.05
 
 
-def look(context: Context, project_id: str, drive_id: str, upload_id: str) -> tuple[Upload, int]:
+async def look(context: Context, project_id: str, drive_id: str, upload_id: str) -> tuple[Upload, int]:
     """An upload and how far it is for good.
 
     One that was killed between its last byte and its end is ended now: a client that sees all bytes there will not
@@ -40,19 +41,31 @@ def look(context: Context, project_id: str, drive_id: str, upload_id: str) -> tu
     ServiceError
         404, 410, 423, and what its end may raise.
     """
+    found = await anyio.to_thread.run_sync(_secured, context, project_id, drive_id, upload_id)
+    if isinstance(found, Upload):
+        return found, found.size_bytes
+    try:
+        await found.complete(None)
+        return found.upload, found.offset
+    finally:
+        found.file.close()
+
+
+def _secured(context: Context, project_id: str, drive_id: str, upload_id: str) -> Upload | _Held:
+    """An upload that is done, or one that is held and whose bytes are on the disk."""
     with context.database.read() as session:
         upload = uploads.get(session, project_id, drive_id, upload_id)
     if upload.is_done:
-        return upload, upload.size_bytes
+        return upload
     file = PartialFile(context.settings.uploads_dir, upload_id)
     try:
         held = _Held(context, project_id, drive_id, upload_id, file)
+        held.require_wanted()
         held.secure()
-        if held.offset == held.upload.size_bytes:
-            held.complete(None)
-        return held.upload, held.offset
-    finally:
+    except BaseException:
         file.close()
+        raise
+    return held
 
 
 def discard(context: Context, project_id: str, drive_id: str, upload_id: str) -> None:
@@ -107,9 +120,9 @@ class UploadWriting:
                     await anyio.to_thread.run_sync(partial(held.keep, offset if drop else appender.offset))
                 raise
             with anyio.CancelScope(shield=True):  # also for a client that does not wait for the answer
-                end = partial(held.end, offset, appender.offset, checksum, compared, whole)
-                is_archive = held.upload.path is None
-                await anyio.to_thread.run_sync(end, limiter=self._context.unpacking if is_archive else None)
+                taking = partial(held.take, offset, appender.offset, checksum, compared)
+                await anyio.to_thread.run_sync(taking)
+                await held.complete(None if whole is None else whole.digest().hex())
             return held.upload, held.offset
         finally:
             held.file.close()
@@ -131,6 +144,7 @@ class UploadWriting:
         file = PartialFile(context.settings.uploads_dir, self._of[2])
         try:
             held = _Held(context, *self._of, file)
+            held.require_wanted()
             held.begin(offset, length, counts_at_once=checksum is None)
         except BaseException:
             file.close()
@@ -196,10 +210,20 @@ class _Held:
         # The record must not be lost by what its bytes survive: it waits for the disk, too.
         self._record(durable=True, kept_bytes=offset)
 
-    def end(
-        self, begin: int, offset: int, checksum: Checksum | None, compared: Hash | None, whole: Hash | None
-    ) -> None:
-        """Take what was appended, where it is right; with the last byte the upload is complete."""
+    def require_wanted(self) -> None:
+        """Refuse bytes that are to come for nothing: the drive may have been committed since."""
+        upload = self.upload
+        if upload.is_done or self.offset == upload.size_bytes:
+            return
+        of = (self._context, upload.project_id, upload.drive_id)
+        with self._dropped_where_refused():
+            if upload.path is None:
+                require_open(*of)
+            else:
+                require_wanted(*of, upload.path, sha256=upload.sha256, size_bytes=upload.size_bytes)
+
+    def take(self, begin: int, offset: int, checksum: Checksum | None, compared: Hash | None) -> None:
+        """Take what was appended, where it is right."""
         if checksum is not None and compared is not None and compared.digest() != checksum.digest:
             self.keep(begin)
             raise ServiceError(
@@ -211,25 +235,34 @@ class _Held:
                 headers={"Upload-Offset": str(begin)},
             )
         self.keep(offset)
-        if offset == self.upload.size_bytes and not self.upload.is_done:
-            self.complete(None if whole is None else whole.digest().hex())
 
-    def complete(self, sha256: str | None) -> None:
-        """Make the bytes the drive's; `sha256` of all of them, where it is known."""
+    async def complete(self, sha256: str | None) -> None:
+        """Make the bytes the drive's once all are there; `sha256` of all of them, where it is known.
+
+        Only what unpacks takes a place of those that may.
+        """
+        if self.offset == self.upload.size_bytes and not self.upload.is_done:
+            limiter = self._context.unpacking if self.upload.path is None else None
+            await anyio.to_thread.run_sync(self._complete, sha256, limiter=limiter)
+
+    def _complete(self, sha256: str | None) -> None:
         upload = self.upload
-        if upload.is_done:
-            return
-        try:
+        with self._dropped_where_refused():
             sha256 = sha256 or file_sha256(self.file.path)
             if upload.sha256 is not None and sha256 != upload.sha256:
                 raise _wrong_digest(upload, sha256)
             self._hand_over(sha256)
+        self._record(durable=True, is_done=True)
+        self.file.remove()
+
+    @contextmanager
+    def _dropped_where_refused(self) -> Iterator[None]:
+        try:
+            yield
         except ServiceError as error:
             if error.status not in _MAY_PASS:
                 self._drop()
             raise
-        self._record(durable=True, is_done=True)
-        self.file.remove()
 
     def _hand_over(self, sha256: str) -> None:
         """As a PUT does. The file itself stays until that is recorded: a process that is killed here does it again."""

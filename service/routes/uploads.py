@@ -85,7 +85,8 @@ def create_upload(
 ) -> Response:
     """Begin a resumable upload of one file of an open drive, or of an archive; `Location` takes its bytes.
 
-    Where the project has the content already (by `sha256`) the upload is complete at once: `Upload-Offset` says so.
+    Where a drive of the project has the content already (by `sha256`) the upload is complete at once: `Upload-Offset`
+    says so.
     """
     tus.require_version(tus_resumable)
     if upload_concat is not None:
@@ -137,7 +138,7 @@ async def get_offset(
 ) -> Response:
     """Where to go on. All bytes up to `Upload-Offset` are here, also after a crash of the service or its machine."""
     tus.require_version(tus_resumable)
-    upload, offset = await anyio.to_thread.run_sync(look, context, caller.project_id, drive_id, upload_id)
+    upload, offset = await look(context, caller.project_id, drive_id, upload_id)
     headers = {**_headers(upload, offset), "Upload-Length": str(upload.size_bytes), "Cache-Control": "no-store"}
     if upload.given_metadata:
         headers["Upload-Metadata"] = upload.given_metadata

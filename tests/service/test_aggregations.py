@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import delete, update
 
+from mrasfm_engine.aggregation.load import name_scenes
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.persistence import jobs, trees
 from service.persistence.tables import Drive, Job, JobMember, Scene
@@ -332,15 +334,41 @@ def test_the_same_request_twice(client: Client, drives: list[str]) -> None:
     )
 
 
-def test_children_count_against_the_quota_as_one(api: Api) -> None:
+def test_the_quota_of_jobs_counts_the_whole_tree(api: Api) -> None:
     client = api.client(max_active_jobs=3)
     drives = [client.frozen(tiny_drive(str(i), seed=f"quota{i}")) for i in range(3)]
-    problem_of(client.post("/v1/aggregations", json={"drives": drives}), 429, "too-many-jobs")
-    with api.database.read() as session:
-        assert session.query(JobMember).join(Job).filter(Job.project_id == client.project_id).count() == 0
+    asked = {"drives": drives}
+
+    def refused(status: int, code: str) -> dict[str, Any]:
+        answer = client.post("/v1/aggregations", json=asked)
+        problem = problem_of(answer, status, code)
+        assert ("retry-after" in answer.headers) == (status == 429)
+        with api.database.read() as session:
+            assert session.query(JobMember).join(Job).filter(Job.project_id == client.project_id).count() == 0
+        assert client.get("/v1/maps").json()["items"] == []
+        return problem
+
+    problem = refused(422, "aggregation-too-large")
+    assert "4 jobs at one time, the project's quota is 3" in problem["detail"]
+    assert "at least 1 of the drives first" in problem["remedy"]
+    # The remedy helps: what is there and what is under way needs no other job, only its time.
+    first, second = (client.reconstruct(drive)["id"] for drive in drives[:2])
+    assert "2 jobs queued or running, its quota is 3, and this needs 2 more" in refused(429, "too-many-jobs")["detail"]
+    finish(client, first)
+    job = client.aggregate(**asked)
+    assert [member["job_id"] for member in job["members"]][:2] == [None, second]
+    problem_of(client.post("/v1/reconstructions", json={"drive_id": drives[0]}), 429, "too-many-jobs")
 
 
 def test_drives_of_one_name(client: Client) -> None:
     drives = [client.frozen(tiny_drive("Straße 1/2", seed=f"{client.project_id}{i}")) for i in range(3)]
     job = client.aggregate(drives=drives)
     assert [member["name"] for member in job["members"]] == ["Stra-e-1-2", "Stra-e-1-2-2", "Stra-e-1-2-3"]
+
+
+def test_names_of_drives_that_no_scene_can_have(client: Client) -> None:
+    names = {"_night": "night", "...": "drive", "-_-": "drive-2", "ÄÖ ~ x": "x", "y" * 120: "y" * 80}
+    drives = [client.frozen(tiny_drive(name, seed=f"{client.project_id}{name}")) for name in names]
+    given = [member["name"] for member in client.aggregate(drives=drives)["members"]]
+    assert sorted(given) == sorted(names.values())
+    assert name_scenes({name: Path(name) for name in given})

@@ -165,7 +165,7 @@ def test_a_retention_date_passes_while_it_is_asked_for(database: Database, proje
 
     with meanwhile(database, forget) as (session, begin):
         request = AggregationRequest(scenes=made, map_id="map_1")
-        aggregations.create(session, project_id=project_id, asked=request, job_expires_us=None)
+        aggregations.create(session, project_id=project_id, asked=request, job_expires_us=1)
         begin()
     with database.read() as session:
         assert session.get(Map, "map_1") is not None

@@ -10,8 +10,9 @@ from sqlalchemy import select, update
 
 from service.persistence import jobs, maps
 from service.persistence.tables import Blob, Map, MapFile, Scene, now_us
+from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, forget_all, problem_of
-from tests.service.test_aggregations import FILES, finish, job_of, members
+from tests.service.test_aggregations import BROKEN, FILES, fail, finish, job_of, members
 from tests.service.tiny_drive import tiny_drive
 
 CONTENT = bytes(range(256)) * 40
@@ -134,6 +135,46 @@ def test_a_scene_that_is_being_put_into_a_map_stays(api: Api, client: Client, dr
         session.execute(update(Scene).where(Scene.id == scene_id).values(expires_us=1))
         maps.forget_expired(session, now_us())
     assert client.get(f"/v1/scenes/{scene_id}").status_code == 200
+
+
+@pytest.mark.parametrize("end", ["failed", "cancelled"])
+def test_a_map_that_nothing_came_of_goes_with_its_job(start_api: StartApi, end: str) -> None:
+    """And one that has a version by then does not."""
+    client = start_api(job_retention_days=2).client()
+    job = client.aggregate(drives=made_drives(client, 2))
+    map_id, soon_us = job["map_id"], now_us() + 3 * 86_400 * 1_000_000
+
+    def expires() -> tuple[str | None, str | None]:
+        return job_of(client, job["id"])["expires_at"], client.get(f"/v1/maps/{map_id}").json()["expires_at"]
+
+    def expire() -> int:
+        with client.api.database.write() as session:
+            maps.forget_expired(session, soon_us)
+        return client.get(f"/v1/maps/{map_id}").status_code
+
+    of_job, of_map = expires()
+    assert of_job == of_map is not None
+    assert expire() == 200, "its job is under way"
+    if end == "cancelled":
+        assert client.post(f"/v1/jobs/{job['id']}:cancel").status_code == 202
+    else:
+        fail(client, job["members"][0]["job_id"])
+        finish(client, job["members"][1]["job_id"])
+    assert job_of(client, job["id"])["state"] == end.upper()
+    first, job = job, client.post(f"/v1/jobs/{job['id']}:retry").json()
+    of_job, of_map = expires()
+    assert of_job == of_map > first["expires_at"], "it goes with the last one"
+    for member in members(client, job["id"]).values():
+        if member["scene_id"] is None:
+            finish(client, member["job_id"])
+    held = client.claim(job["id"])
+    if end == "cancelled":
+        client.publish_map(held, FILES)
+        assert (expires()[1], expire()) == (None, 200), "it is kept as maps are"
+        return
+    with client.api.database.write() as session:
+        jobs.fail(session, held, BROKEN, max_attempts=1, retry_delay_us=0)
+    assert expire() == 404
 
 
 def test_deleting_versions(api: Api, client: Client, drives: list[str], map_id: str) -> None:

@@ -8,7 +8,9 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -18,11 +20,12 @@ from sqlalchemy import update
 from service.app import sweep_uploads
 from service.persistence import durability
 from service.persistence.tables import Drive, Upload, now_us
+from service.routes import upload_writing
 from service.uploads.resumable import PartialFile, sweep
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
 from tests.service.tiny_drive import TinyDrive, png_of, tiny_drive
-from tests.service.tus_client import VERSION, begin, checksum, create, head, offset_of, patch
+from tests.service.tus_client import OFFSET_TYPE, VERSION, begin, checksum, create, head, offset_of, patch
 
 PATH = "front/000000.png"
 
@@ -253,6 +256,19 @@ def test_what_is_there_is_not_sent_again(client: Client, drive: TinyDrive) -> No
     assert answer.headers["upload-offset"] == "0"
 
 
+def test_what_is_there_and_is_no_file_of_a_drive_is_sent_and_checked(client: Client, drive: TinyDrive) -> None:
+    """A manifest here; else any result of a job would pass for an image."""
+    client.create(drive)
+    drive_id, data = client.create(tiny_drive("other")), drive.raw
+    answer = create(client, drive_id, len(data), path=PATH, sha256=sha256_of(data))
+    assert (answer.headers["upload-offset"], answer.json()["done"]) == ("0", False)
+    problem_of(patch(client, answer.headers["location"], 0, data), 422, "not-an-image")
+    file = {"path": PATH, "size_bytes": len(data), "sha256": sha256_of(data)}
+    declared = client.post(f"/v1/drives/{drive_id}/files:declare", json={"files": [file]})
+    assert declared.json() == {"stored": [], "to_send": [PATH]}
+    assert stored(client, drive_id) is None
+
+
 def test_an_archive(client: Client, drive: TinyDrive) -> None:
     drive_id, zipped = client.create(drive), drive.zipped()
     answer = create(client, drive_id, len(zipped), archive="", sha256=sha256_of(zipped))
@@ -260,6 +276,103 @@ def test_an_archive(client: Client, drive: TinyDrive) -> None:
     assert patch(client, url, 0, zipped[:100]).status_code == 204
     assert patch(client, url, 100, zipped[100:]).status_code == 204
     assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+
+
+def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
+    client: Client, api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unpacking, go_on = api.context.unpacking, threading.Event()
+    unpack_now = upload_writing.keep_archive
+
+    def unpack_later(*given: Any) -> Any:
+        assert go_on.wait(30)
+        return unpack_now(*given)
+
+    monkeypatch.setattr(upload_writing, "keep_archive", unpack_later)
+    answers: list[int] = []
+
+    def send(url: str, offset: int, data: bytes) -> threading.Thread:
+        own = api.client_of(client.project_id, client.key)
+        thread = threading.Thread(target=lambda: answers.append(patch(own, url, offset, data).status_code))
+        thread.start()
+        return thread
+
+    zips = [tiny_drive(seed=f"turn{i}").zipped() for i in range(int(unpacking.total_tokens) + 1)]
+    *urls, last = [begin_archive(client, client.create(), zipped) for zipped in zips]
+    try:
+        sending = [send(url, 0, zipped) for url, zipped in zip(urls, zips[:-1], strict=True)]
+        wait_until(lambda: unpacking.available_tokens == 0, "that all places are taken")
+        client.timeout = 5
+        assert patch(client, last, 0, zips[-1][:100]).status_code == 204
+        sending.append(send(last, 100, zips[-1][100:]))
+        wait_until(lambda: unpacking.statistics().tasks_waiting == 1, "that the last one waits")
+        with api.database.read() as session:
+            kept_bytes = session.get_one(Upload, last.rsplit("/", 1)[1]).kept_bytes
+        assert kept_bytes == len(zips[-1]), "what came does not wait"
+    finally:
+        go_on.set()
+    for thread in sending:
+        thread.join()
+    assert answers == [204] * len(zips)
+
+
+def begun(client: Client, method: str, url: str, **headers: str) -> tuple[int, bytes]:
+    """The answer to a request whose body does not come."""
+    connection = HTTPConnection(urlsplit(client.api.url).netloc, timeout=10)
+    try:
+        connection.putrequest(method, url)
+        for name, value in {"Authorization": f"Bearer {client.key}", **headers}.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("method", ["PATCH", "HEAD"])
+@pytest.mark.parametrize("what", ["file", "archive"])
+def test_a_drive_that_was_committed_meanwhile_is_told_before_the_bytes_come(
+    client: Client, api: Api, drive: TinyDrive, what: str, method: str
+) -> None:
+    drive_id, size_bytes = client.filled(drive), 10_000_000
+    announced = {"archive": ""} if what == "archive" else {"path": PATH, "replace": "true"}
+    url = create(client, drive_id, size_bytes, **announced).headers["location"]
+    assert patch(client, url, 0, b"x" * 1000).status_code == 204
+    commit(api, drive_id)
+    headers = {} if method == "HEAD" else {"Upload_Offset": "1000", "Content_Length": str(size_bytes - 1000)}
+    status, body = begun(client, method, url, Tus_Resumable="1.0.0", Content_Type=OFFSET_TYPE, **headers)
+    assert status == 409
+    assert method == "HEAD" or b"drive-committed" in body
+    assert head(client, url).status_code == 404, "as at its end, there is nothing to go on with"
+    assert not any(name.startswith(url.rsplit("/", 1)[1]) for name in bytes_left(api))
+
+
+def commit(api: Api, drive_id: str) -> None:
+    with api.database.write() as session:
+        session.execute(update(Drive).where(Drive.id == drive_id).values(state="COMMITTED"))
+
+
+def test_what_a_committed_drive_has_may_come_again(client: Client, api: Api, drive: TinyDrive) -> None:
+    drive_id, data = client.create(drive), drive.files[PATH]
+    urls = [begin(client, drive_id, PATH, data, **known) for known in ({"sha256": sha256_of(data)}, {})]
+    client.send_files(drive_id, drive)
+    commit(api, drive_id)
+    for url in urls:
+        assert patch(client, url, 0, data).status_code == 204
+    other = png_of(64, 48, b"other")
+    large = str(20_000_000)
+    status, body = begun(client, "PUT", f"/v1/drives/{drive_id}/files/{PATH}?replace=true", Content_Length=large)
+    assert (status, b"drive-committed" in body) == (409, True)
+    problem_of(client.put(f"/v1/drives/{drive_id}/files/{PATH}", content=other), 409, "drive-committed")
+
+
+def test_a_drive_that_was_deleted_meanwhile_is_told_before_the_bytes_come(client: Client) -> None:
+    drive_id = client.create()
+    url = create(client, drive_id, 10_000_000, archive="").headers["location"]
+    assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
+    headers = {"Tus_Resumable": "1.0.0", "Content_Type": OFFSET_TYPE, "Upload_Offset": "0"}
+    assert begun(client, "PATCH", url, **headers, Content_Length="10000000")[0] == 404
 
 
 def test_bytes_that_are_not_what_was_announced(api: Api, client: Client) -> None:
@@ -318,8 +431,7 @@ def test_uploads_into_a_committed_drive_count_nothing(start_api: StartApi) -> No
     assert create(client, drive_id, 900_000, archive="").status_code == 201
     other_id = client.create()
     problem_of(create(client, other_id, 900_000, archive=""), 413, "quota-full")
-    with client.api.database.write() as session:
-        session.execute(update(Drive).where(Drive.id == drive_id).values(state="COMMITTED"))
+    commit(client.api, drive_id)
     assert create(client, other_id, 900_000, archive="").status_code == 201
 
 

@@ -10,7 +10,15 @@ back writes nothing.
 
 from __future__ import annotations
 
-from service.persistence.jobs._asking import OfTree, cancel_orphan, create, request_cancel, require_failed, retry
+from service.persistence.jobs._asking import (
+    OfTree,
+    cancel_orphan,
+    create,
+    request_cancel,
+    require_failed,
+    require_places,
+    retry,
+)
 from service.persistence.jobs._ending import cancelled, fail, record_findings, release, succeed
 from service.persistence.jobs._holding import (
     ProgressNote,
@@ -53,6 +61,7 @@ __all__ = [
     "release",
     "request_cancel",
     "require_failed",
+    "require_places",
     "retry",
     "succeed",
     "tend",

@@ -53,7 +53,7 @@ def create(
         429 where the project has as many active jobs as its quota allows.
     """
     if kind is not JobKind.PREFLIGHT:  # a drive's check is part of committing it
-        _require_place(session, project_id)
+        require_places(session, project_id, 1)
     job = Job(
         id=new_id("job"),
         project_id=project_id,
@@ -70,17 +70,30 @@ def create(
     return job
 
 
-def _require_place(session: Session, project_id: str) -> None:
+def require_places(session: Session, project_id: str, count: int) -> None:
+    """Refuse jobs that the project's quota has no room for now.
+
+    Parameters
+    ----------
+    count
+        How many come at one time.
+
+    Raises
+    ------
+    ServiceError
+        429.
+    """
     # Locked, so that two requests cannot take the last place together.
     project = session.get_one(Project, project_id, with_for_update=True)
     mine = (Job.project_id == project_id) & (Job.kind != JobKind.PREFLIGHT) & Job.state.in_(ACTIVE)
     active = session.scalar(select(func.count()).select_from(Job).where(mine)) or 0
-    if active >= project.max_active_jobs:
+    if active + count > project.max_active_jobs:
+        wanted = f", and this needs {count} more at one time" if count > 1 else ""
         raise ServiceError(
             429,
             "too-many-jobs",
             "Too many jobs",
-            f"the project has {active} jobs queued or running, its quota is {project.max_active_jobs}",
+            f"the project has {active} jobs queued or running, its quota is {project.max_active_jobs}{wanted}",
             remedy="Wait until some have ended, or cancel some.",
             headers={"Retry-After": "60"},
         )

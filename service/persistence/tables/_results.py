@@ -40,7 +40,10 @@ class SceneFile(Base):
 
 
 class Map(Base):
-    """What aggregations make, version by version. One that has no version yet is being made, or failed to be."""
+    """What aggregations make, version by version.
+
+    One that has no version yet is being made, or failed to be: it goes with the record of the job that tried last.
+    """
 
     __tablename__ = "maps"
     __table_args__ = (Index(None, "project_id", "created_us", "id"),)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 import pytest
 
-from service.client import ClientError, DriveFolder, UploadState, resumable, upload_drive
+from service.client import ApiError, ClientError, DriveFolder, UploadState, resumable, upload_drive
+from service.client.drive_folder import identify
+from service.client.parallel import Meter, no_report
+from service.client.resumable import ResumableUpload
 from service.client.upload_state import STATE_NAME
+from service.persistence.tables import Drive
+from service.uploads.resumable import PartialFile
 from tests.service.client.bad_network import Cut, bad_network
 from tests.service.client.conftest import Connect, written
 from tests.service.live_api import Api, Client
@@ -71,9 +77,38 @@ def test_an_upload_that_is_gone_begins_anew(client: Client, connect: Connect, la
     library, folder = connect(client), DriveFolder.read(large_drive)
     state = UploadState(folder, library.url)
     (large,) = [path for path in folder.paths if (large_drive / path).stat().st_size > SIZE_BYTES]
-    from service.client.drive_folder import identify
-
     file = identify(folder.root, large)
     state.note_upload(f"{file.path} {file.sha256}", "/v1/drives/drv_0/uploads/upl_0")
     sent = upload_drive(library, folder, state=state)
     assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_drive_that_is_committed_meanwhile(
+    api: Api, client: Client, connect: Connect, large_drive: Path, is_known: bool
+) -> None:
+    """Said in the service's words, before the file is sent."""
+    library, folder = connect(client), DriveFolder.read(large_drive)
+    file, drive_id, counted = identify(folder.root, "front/000001.png"), client.filled(), list[int]()
+    meter = Meter(lambda stage, done, total: counted.append(done), "send", file.size_bytes)
+    url = ResumableUpload(library, drive_id, file, meter).begin()
+    with api.database.write() as session:
+        session.get_one(Drive, drive_id).state = "COMMITTED"
+    with pytest.raises(ApiError) as raised:
+        ResumableUpload(library, drive_id, file, meter, url=url if is_known else None).send()
+    assert raised.value.code == "drive-committed"
+    assert max(counted) == 0
+
+
+def test_another_request_still_holds_the_upload(api: Api, client: Client, connect: Connect, large_drive: Path) -> None:
+    """As after a connection that broke, which the service has not seen yet."""
+    library, folder = connect(client), DriveFolder.read(large_drive)
+    file, drive_id = identify(folder.root, "front/000001.png"), client.create()
+    upload = ResumableUpload(library, drive_id, file, Meter(no_report, "send", file.size_bytes))
+    holding = PartialFile(api.settings.uploads_dir, upload.begin().rsplit("/", 1)[1])
+    letting_go = threading.Timer(0.5, holding.close)
+    letting_go.start()
+    upload.send()
+    letting_go.join()
+    (sent,) = client.get(f"/v1/drives/{drive_id}/files", params={"stored": "true"}).json()["items"]
+    assert sent["sha256"] == file.sha256
