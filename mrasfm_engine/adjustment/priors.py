@@ -6,7 +6,7 @@ few rows a unit or camera, so plain numpy does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -197,13 +197,14 @@ class UprightPrior:
     unit: Ints  # (n,)
     sigma_roll_rad: float
     sigma_pitch_rad: float
+    up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit vector of the world frame
 
     def _rows(self, state: State) -> tuple[Floats, Floats]:
         # The rig's y axis (left) tells roll, its x axis (forward) pitch.
         axes = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]], 1, 2)  # (n, 2, 3)
         scale = np.array([self.sigma_roll_rad, self.sigma_pitch_rad]) * np.sqrt(len(self.unit))
-        jacobian = np.cross(axes, [0.0, 0.0, 1.0]) / scale[:, None]
-        return axes[:, :, 2] / scale, jacobian
+        jacobian = np.cross(axes, self.up) / scale[:, None]
+        return axes @ self.up / scale, jacobian
 
     def cost(self, state: State) -> float:
         """See `Term`."""

@@ -41,7 +41,7 @@ class MapModel:
     rows: Ints  # (n,) keypoints of the assembly that observe a point, sorted by point
     point: Ints  # (n,)
     owner: Ints  # (p,) the map's point that every scene's point became, -1 where it was dropped
-    joined: Bools  # (points,) which are of several scenes
+    joined: Bools  # (points,) which several scenes see
     errors_px: Floats  # (n,)
 
 
@@ -115,7 +115,7 @@ def adjust_map(
         points[seen] = solution.points_m
         problem = replace(problem, state=replace(solution, points_m=points))
         positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
-    model, observations, points_dropped = _filtered(problem, tracks.rows, owners, joined, config)
+    model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
     return FinalResult(
         model=model,
         positions=positions,
@@ -159,13 +159,18 @@ def _terms(assembly: Assembly, positions: dict[int, DrivePositions], free: Bools
         units = np.flatnonzero((assembly.scene_of_unit == k) & free)
         if len(units) and assembly.scenes[k].common_world is None:
             terms.append(
-                UprightPrior(unit=units, sigma_roll_rad=float(SIGMA_ROLL_RAD), sigma_pitch_rad=float(SIGMA_PITCH_RAD))
+                UprightPrior(
+                    unit=units,
+                    sigma_roll_rad=float(SIGMA_ROLL_RAD),
+                    sigma_pitch_rad=float(SIGMA_PITCH_RAD),
+                    up=p.up,
+                )
             )
     return terms
 
 
 def _filtered(
-    problem: Problem, rows: Ints, owners: Ints, joined: Bools, config: EngineConfig
+    assembly: Assembly, problem: Problem, rows: Ints, owners: Ints, config: EngineConfig
 ) -> tuple[MapModel, int, int]:
     """The model without observations that do not fit and points that are left with fewer than two."""
     o = problem.observations
@@ -175,12 +180,17 @@ def _filtered(
     alive = left >= 2
     keep &= alive[o.point]
     number = np.where(alive, np.cumsum(alive) - 1, -1)
+    # What was to be joined may be left to one scene.
+    scene = assembly.scene_of_unit[o.unit[keep]]
+    first, last = np.full(o.num_points, len(assembly.scenes)), np.full(o.num_points, -1)
+    np.minimum.at(first, o.point[keep], scene)
+    np.maximum.at(last, o.point[keep], scene)
     model = MapModel(
         state=replace(problem.state, points_m=problem.state.points_m[alive]),
         rows=rows[keep],
         point=number[o.point[keep]],
         owner=np.where(owners >= 0, number[owners], -1),
-        joined=joined[alive],
+        joined=(first < last)[alive],
         errors_px=errors[keep],
     )
     return model, int((~keep).sum()), int((~alive).sum())

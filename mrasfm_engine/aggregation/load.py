@@ -182,7 +182,8 @@ def _place(frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[F
     with _damaged(Path("frame.json"), name):
         result = np.array(matrix, dtype=np.float64)
         rotation = result[:3, :3]
-        if result.shape != (4, 4) or not np.isfinite(result).all() or not np.allclose(rotation @ rotation.T, np.eye(3)):
+        rigid = result.shape == (4, 4) and np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+        if not rigid or not np.isfinite(result).all() or not np.array_equal(result[3], [0, 0, 0, 1]):
             raise ValueError("the frame's transform is not a rigid one")
     return result, None if frame.get("georeferenced") is True else world
 

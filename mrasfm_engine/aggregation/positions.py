@@ -27,8 +27,10 @@ ROUGH_CORRELATION = 4.0  # neighbouring rough poses share most of their error
 class DrivePositions:
     """Measured positions of one drive in the map's frame, with the constant error that is taken from them."""
 
-    prior: PositionPrior  # units as the assembly numbers them; positions with the bias taken off
+    measured: PositionPrior  # units as the assembly numbers them; positions and sigmas as given
+    prior: PositionPrior  # with the bias taken off, and sigmas as large as what is left
     bias_m: Floats  # (3,) measured minus adjusted
+    up: Floats  # (3,) at the drive's place, in the map: far from the map's origin it is not the map's z axis
 
 
 def drive_positions(
@@ -51,7 +53,9 @@ def drive_positions(
         step_s = float(np.median(np.diff(scene.drive.timestamps_us))) / 1e6 if len(measured) > 1 else np.inf
         correlated = max(1.0, config.correlation_time_s / max(step_s, 1e-6))
     elif known.rough_world_from_rig is not None and scene.manifest.rough_poses is not None:
-        measured = se3.apply(map_from_scene, known.rough_world_from_rig[:, :3, 3])
+        assert known.rough_world_from_local is not None
+        scene_from_rough = se3.inverse(scene.ecef_from_local) @ known.rough_world_from_local
+        measured = se3.apply(map_from_scene @ scene_from_rough, known.rough_world_from_rig[:, :3, 3])
         sigma = np.full(measured.shape, scene.manifest.rough_poses.sigma_translation_m)
         lever, correlated = np.zeros(3), ROUGH_CORRELATION
     else:
@@ -65,15 +69,15 @@ def drive_positions(
         sigma_m=sigma[units] * np.sqrt(correlated),
         lever_arm_m=lever,
     )
-    return DrivePositions(prior=prior, bias_m=np.zeros(3))
+    return DrivePositions(measured=prior, prior=prior, bias_m=np.zeros(3), up=map_from_scene[:3, 2])
 
 
 def with_bias(positions: DrivePositions, state: State) -> DrivePositions:
     """The positions with their constant error estimated anew from where the drive's units are."""
-    prior = positions.prior
-    measured = prior.position_m + positions.bias_m
-    antenna = state.unit_position_m[prior.unit] + state.unit_rotation[prior.unit] @ prior.lever_arm_m
-    bias = geometric_median(measured - antenna)
-    whitened = np.linalg.norm((measured - bias - antenna) / prior.sigma_m, axis=1)
+    given = positions.measured
+    antenna = state.unit_position_m[given.unit] + state.unit_rotation[given.unit] @ given.lever_arm_m
+    bias = geometric_median(given.position_m - antenna)
+    whitened = np.linalg.norm((given.position_m - bias - antenna) / given.sigma_m, axis=1)
     factor = max(1.0, float(np.median(whitened)) / USUAL_LENGTH)
-    return DrivePositions(prior=replace(prior, position_m=measured - bias, sigma_m=prior.sigma_m * factor), bias_m=bias)
+    prior = replace(given, position_m=given.position_m - bias, sigma_m=given.sigma_m * factor)
+    return replace(positions, prior=prior, bias_m=bias)

@@ -159,8 +159,12 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
         )
     for k, scene in enumerate(found):
         for other in found[:k]:
-            same_frames = scene.manifest.frames == other.manifest.frames and scene.manifest.gnss == other.manifest.gnss
-            if scene.fingerprint == other.fingerprint or same_frames:
+            # Recordings may all begin at zero and number their files alike, but not be at the same places as well.
+            same_drive = all(
+                getattr(scene.manifest, part) == getattr(other.manifest, part)
+                for part in ("frames", "gnss", "rough_poses")
+            )
+            if scene.fingerprint == other.fingerprint or same_drive:
                 raise InputError(
                     f"scenes {other.name} and {scene.name} are of the same drive",
                     remedy="Give each drive once.",
@@ -173,7 +177,7 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
         found,
         "common_world",
         "different-worlds",
-        "a world",
+        "worlds",
         "Give all drives GNSS, or rough_poses in one common_world.",
     )
     datums = sorted({scene.height_datum for scene in found})
