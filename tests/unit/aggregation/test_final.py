@@ -1,0 +1,236 @@
+"""The map's last adjustment: which units vary, what becomes of their errors, and what becomes of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_scenes import CONFIG, PLACE, Driven, Street, configured, drive_along, in_assembly, make_street, shared_points
+
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.association import coarse_transform
+from mrasfm_engine.aggregation.final import FinalResult, adjust_map, all_points
+from mrasfm_engine.aggregation.positions import drive_positions
+from mrasfm_engine.geometry import se3
+
+BEND_M = 0.08
+BIAS_M = ((0.5, -0.3, 0.2), (-0.4, 0.6, -0.3))
+WAYS = np.arange(0.0, 14.0, 2.0), np.arange(5.0, 19.0, 2.0)  # they overlap by half
+
+
+@pytest.fixture(scope="module")
+def street() -> Street:
+    return make_street(length_m=20.0, points=700)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("final")
+
+
+@pytest.fixture(scope="module")
+def two(street: Street, folder: Path) -> list[Driven]:
+    """One is bent to one side, the other to the other."""
+    return [
+        drive_along(street, folder / str(k), WAYS[k], bend_m=(1 - 2 * k) * BEND_M, bias_m=BIAS_M[k], seed=k)
+        for k in range(2)
+    ]
+
+
+def owner_of(drives: Sequence[Driven]) -> np.ndarray:
+    """The joined point of all points of two scenes, as the street's tell it."""
+    a, b = drives
+    pairs = shared_points(a, b)
+    owner = np.full(len(a.point_of_street) + len(b.point_of_street), -1)
+    owner[pairs[:, 0]] = owner[pairs[:, 1] + len(a.point_of_street)] = np.arange(len(pairs))
+    return owner
+
+
+def adjusted(
+    drives: Sequence[Driven], which: str, *, positions: bool = True, owner: np.ndarray | None = None
+) -> FinalResult:
+    """From where scenes truly lie; each as bent as it is."""
+    config = configured(final_adjustment=which)
+    assembly = Assembly(scenes=[d.source for d in drives])
+    known = {}
+    for k, driven in enumerate(drives):
+        believed = se3.transform(np.eye(3), BIAS_M[k]) @ driven.street_from_scene
+        if positions:
+            found = drive_positions(driven.source, believed, int(assembly.first_unit[k]), config.gnss)
+            assert found is not None
+            known[k] = found
+    poses = np.stack([d.street_from_scene for d in drives])
+    return adjust_map(
+        assembly, poses, owner_of(drives) if owner is None else owner, known, config, cancel=lambda: False
+    )
+
+
+def errors_m(result: FinalResult, drives: Sequence[Driven]) -> list[np.ndarray]:
+    """Distances between units and where they were, by drive, the whole map where it fits best.
+
+    How the whole lies only receivers tell, to centimetres, before and after.
+    """
+    first = np.cumsum([0] + [len(d.street_from_rig) for d in drives])
+    at, truth = result.model.state.unit_position_m, np.concatenate([d.street_from_rig[:, :3, 3] for d in drives])
+    turn = Rotation.align_vectors(truth - truth.mean(0), at - at.mean(0))[0].as_matrix()
+    at = (at - at.mean(0)) @ turn.T + truth.mean(0)
+    return [
+        np.linalg.norm(at[first[k] : first[k + 1]] - d.street_from_rig[:, :3, 3], axis=1) for k, d in enumerate(drives)
+    ]
+
+
+def mean_error_m(result: FinalResult, drives: Sequence[Driven]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(errors_m(result, drives)) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def untouched(two: list[Driven]) -> FinalResult:
+    return adjusted(two, "none")
+
+
+def test_none_leaves_everything_where_it_is(two: list[Driven], untouched: FinalResult) -> None:
+    assert untouched.free_units == 0
+    assert untouched.reports == ()
+    expected = np.concatenate([d.street_from_scene @ d.source.world_from_rig for d in two])
+    np.testing.assert_allclose(untouched.model.state.world_from_rig, expected, atol=1e-12)
+    assert BEND_M * 0.4 < max(e.max() for e in errors_m(untouched, two)) < BEND_M * 1.3
+
+
+@pytest.mark.parametrize("which", ["overlap", "all"])
+def test_bent_scenes_settle_nearer_to_the_truth(two: list[Driven], untouched: FinalResult, which: str) -> None:
+    result = adjusted(two, which)
+    before, after = mean_error_m(untouched, two), mean_error_m(result, two)
+    assert 0.0005 < after < 0.7 * before
+    moved = result.model.state.unit_position_m - untouched.model.state.unit_position_m
+    assert 0 < np.linalg.norm(moved.mean(0)) < 0.05
+    assert len(result.reports) == 2
+    # And so do the points of both scenes.
+    assert np.median(result.model.errors_px) < np.median(untouched.model.errors_px)
+    units = sum(len(d.street_from_rig) for d in two)
+    assert result.free_units == units if which == "all" else 8 <= result.free_units <= units
+    # Receivers' constant errors are told apart, but for what they have in common.
+    told = result.positions[0].bias_m - result.positions[1].bias_m
+    assert 0 < np.abs(told - (np.array(BIAS_M[0]) - BIAS_M[1])).max() < 0.2
+
+
+def test_units_out_of_the_overlap_stay_with_overlap_only(street: Street, folder: Path) -> None:
+    """The second drive sees nothing of what the first units of the first one see."""
+    long = make_street(length_m=120.0, points=2500, seed=3)
+    drives = [
+        drive_along(long, folder / f"long{k}", np.arange(s, s + 48.0, 4.0), bend_m=0.05 * k, bias_m=BIAS_M[k], seed=k)
+        for k, s in enumerate((0.0, 76.0))
+    ]
+    result = adjusted(drives, "overlap")
+    assembly = Assembly(scenes=[d.source for d in drives])
+    before = assembly.state(np.stack([d.street_from_scene for d in drives])).unit_position_m
+    moved = np.linalg.norm(result.model.state.unit_position_m - before, axis=1)
+    assert 0 < result.free_units == (moved > 0).sum() < len(moved)
+    assert moved[0] == 0
+    assert moved.max() < 0.2
+    everything = adjusted(drives, "all")
+    moved = np.linalg.norm(everything.model.state.unit_position_m - before, axis=1)
+    assert (moved > 0).all()
+    assert moved.max() < 0.5
+
+
+def test_all_without_any_positions(two: list[Driven], untouched: FinalResult) -> None:
+    """Nothing holds the whole then, and it stays about where it is."""
+    result = adjusted(two, "all", positions=False)
+    assert result.positions == {}
+    assert np.isfinite(result.model.state.unit_position_m).all()
+    assert 0 < mean_error_m(result, two) < 1.5 * mean_error_m(untouched, two)
+
+
+@pytest.mark.parametrize("which", ["none", "overlap", "all"])
+def test_every_drive_keeps_its_calibration_and_points_that_are_one_become_one(
+    two: list[Driven], untouched: FinalResult, which: str
+) -> None:
+    result = untouched if which == "none" else adjusted(two, which)
+    state, model = result.model.state, result.model
+    rigs = [d.source.drive.rig_from_cam for d in two]
+    assert np.abs(rigs[0] - rigs[1]).max() > 1e-3
+    np.testing.assert_array_equal(state.rig_from_cam, np.concatenate(rigs))
+    a, b = two
+    pairs = in_assembly(shared_points(a, b), a)
+    one = model.owner[pairs]
+    kept = (one >= 0).all(1)
+    assert kept.mean() > 0.9
+    np.testing.assert_array_equal(one[kept, 0], one[kept, 1])
+    assert len(np.unique(one[kept, 0])) == kept.sum()
+    # What a point's observations are of, and how far they are off, is said of the very point.
+    source = Assembly(scenes=[a.source, b.source]).keypoint_point
+    np.testing.assert_array_equal(model.owner[source[model.rows]], model.point)
+    assert (np.diff(model.point) >= 0).all()
+    assert np.bincount(model.point).min() >= 2
+    assert 0 < model.errors_px.max() < CONFIG.mapping.filter_error_px
+    truth = np.concatenate([d.point_of_street for d in two])
+    where = np.full(len(state.points_m), -1)
+    where[model.owner[model.owner >= 0]] = truth[model.owner >= 0]
+    assert (where >= 0).all()
+
+
+def test_a_point_whose_other_scene_does_not_fit_is_no_joined_one(two: list[Driven]) -> None:
+    """Joined are points that two scenes see in the map, not those that were meant to be."""
+    a, b = two
+    pairs = shared_points(a, b)
+    wrong = pairs[:30, 1]
+    xy = b.source.keypoint_xy_px.copy()
+    xy[np.isin(b.source.keypoint_point, wrong)] += np.float32(60.0)
+    result = adjusted([a, replace(b, source=replace(b.source, keypoint_xy_px=xy))], "none", owner=owner_of(two))
+    scene = (result.model.rows >= len(a.source.keypoint_point)).astype(int)
+    count = len(result.model.state.points_m)
+    seen = np.stack([np.bincount(result.model.point[scene == s], minlength=count) for s in (0, 1)])
+    np.testing.assert_array_equal(result.model.joined, (seen > 0).all(0))
+    left = result.model.owner[pairs[:30, 0]]
+    assert not result.model.joined[left[left >= 0]].any()
+    assert result.dropped_observations >= 60
+
+
+def test_images_that_are_not_simultaneous_stay_where_they_are_in_their_units(
+    street: Street, folder: Path, untouched: FinalResult, two: list[Driven]
+) -> None:
+    moving = drive_along(
+        street, folder / "moving", WAYS[1], bend_m=-BEND_M, bias_m=BIAS_M[1], offset_ms=[0, 12, -15, 30], seed=7
+    )
+    drives = [two[0], moving]
+    assert len(moving.source.unit_from_image) == len(moving.source.image_unit)
+    before = mean_error_m(adjusted(drives, "none"), drives)
+    for which in ("overlap", "all"):
+        result = adjusted(drives, which)
+        assert 0.0005 < mean_error_m(result, drives) < 0.8 * before
+        shots = result.model.state.unit_from_shot
+        np.testing.assert_allclose(shots[: len(two[0].source.image_unit)], np.tile(np.eye(4), (28, 1, 1)), atol=1e-12)
+        np.testing.assert_allclose(shots[28:], moving.source.unit_from_image, atol=1e-12)
+
+
+def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:
+    """Up is elsewhere at the other end of a degree: 110 km north, vehicles stand 1 deg inclined to the map's frame."""
+    north = make_street(length_m=20.0, points=700, place=(PLACE[0] + 1.0, *PLACE[1:]), seed=5)
+    far = drive_along(north, folder / "far", WAYS[0], seed=8)
+    scenes = [two[0].source, far.source]
+    map_from_scene = np.stack([np.eye(4), coarse_transform(*scenes)])
+    config = configured(final_adjustment="all")
+    assembly = Assembly(scenes=scenes)
+    known = {
+        k: found
+        for k, scene in enumerate(scenes)
+        if (found := drive_positions(scene, map_from_scene[k], int(assembly.first_unit[k]), config.gnss)) is not None
+    }
+    assert len(known) == 2
+    owner = np.full(int(assembly.first_point[-1]), -1)
+    result = adjust_map(assembly, map_from_scene, owner, known, config, cancel=lambda: False)
+    poses = result.model.state.world_from_rig[int(assembly.first_unit[1]) :]
+    turned = se3.inverse(map_from_scene[1] @ far.source.world_from_rig) @ poses
+    assert 0.9 < se3.rotation_angle_deg(map_from_scene[1][:3, :3]) < 1.1
+    # About the way, where nothing but the prior holds it; how it is turned otherwise, receivers say within their noise.
+    assert 0 < np.degrees(np.abs(se3.log_so3(turned[:, :3, :3])[:, 0]).max()) < 0.2
+
+
+def test_points_of_their_own_are_numbered_after_joined_ones() -> None:
+    np.testing.assert_array_equal(all_points(np.array([-1, 1, 0, -1, 1])), [2, 1, 0, 3, 1])
+    np.testing.assert_array_equal(all_points(np.array([-1, -1])), [0, 1])
+    assert len(all_points(np.zeros(0, dtype=np.int64))) == 0
