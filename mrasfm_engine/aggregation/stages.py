@@ -68,7 +68,9 @@ class Run:
         self.report["findings"].append(as_json(finding))
 
 
-def scenes(run: Run, folders: Mapping[str, Path], remove: Sequence[str], *, leave_out: bool) -> list[SourceScene]:
+def scenes(
+    run: Run, folders: Mapping[str, Path], remove: Sequence[str], *, leave_out: bool = False
+) -> list[SourceScene]:
     """All scenes of the map, those that it has already too; checked against one another."""
     started = time.perf_counter()
     kept = {} if run.into is None else _scenes_of_map(run.into)

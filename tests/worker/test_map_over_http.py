@@ -23,7 +23,7 @@ from tests.service.live_api import ApiProcess, api_process
 from tests.worker.service_world import TERMINAL, World, environment_of, kill, wait_until
 
 DRIVES, BROKEN = 7, 4
-UNITS, CAMERAS = 16, 4  # a drive so long that its positions place it
+UNITS, CAMERAS = 24, 4  # drives so long that their positions place them
 CUT_BYTES = 2000
 WITHIN_S = 1500.0  # on a machine that does other things too
 
