@@ -24,7 +24,8 @@ Floats = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
 MIN_UNITS = 2
-NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+BETWEEN_NAMES = "~"  # in what is called after two scenes: no name has it, and URLs and shells take it as it is
 NEEDED = (
     "report.json", "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply", "features.db",
     "model/images.bin", "model/points3D.bin",
@@ -46,7 +47,7 @@ def name_scenes(scenes: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
         named = [(Path(folder).resolve().name, Path(folder)) for folder in scenes]
     result: dict[str, Path] = {}
     for name, folder in named:
-        if not NAME.match(name):
+        if not NAME.fullmatch(name):
             raise InputError(
                 f"{name!r} cannot be the name of a scene",
                 remedy="Use letters, digits, '_', '.' and '-': NAME=FOLDER gives a scene another name.",

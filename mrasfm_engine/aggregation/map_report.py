@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,11 +24,13 @@ from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.export_map import MapContent
 from mrasfm_engine.io.export_pictures import png_of
+from mrasfm_engine.io.export_scene import PICTURES
 from mrasfm_engine.io.findings import warning
 
 Floats = NDArray[np.float64]
 
 CONNECTED, BY_POSITIONS = "connected", "placed by positions"
+BEFORE, AFTER = "before", "after"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +96,7 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
     return MapContent(
         scene=scene,
         scene_of_unit=[result.scenes[k].name for k in result.assembly.scene_of_unit],
-        document=map_document(result),
+        document=map_document(result, pictures),
         calibrations={s.name: s.calibration for s in result.scenes},
         pictures=pictures,
         scenes={s.name: (s.fingerprint, *s.pack()) for s in result.scenes},
@@ -108,15 +110,15 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
     )
 
 
-def map_document(result: MapResult) -> dict[str, Any]:
-    """`map.json`."""
+def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]:
+    """`map.json`; `pictures` are the names of those that there are."""
     scenes = result.scenes
     return {
         "version": 1,
         "reference": scenes[result.association.reference].name,
         "order": [scenes[k].name for chain in result.chains[:1] for k in chain.scenes],
         "scenes": [_scene(result, k) for k in range(len(scenes))],
-        "seams": [_seam(result, number) for number in range(len(result.seams))],
+        "seams": [_seam(result, number, pictures) for number in range(len(result.seams))],
         "unconnected": result.unconnected,
         "joint": [
             {"iterations": r.iterations, "observations": r.observations, "termination": str(r.termination)}
@@ -151,7 +153,7 @@ def _scene(result: MapResult, k: int) -> dict[str, Any]:
     }
 
 
-def _seam(result: MapResult, number: int) -> dict[str, Any]:
+def _seam(result: MapResult, number: int, pictures: Collection[str]) -> dict[str, Any]:
     seam = result.seams[number]
     closing = next((c for chain in result.chains for c in chain.closings if c.seam == number), None)
     document: dict[str, Any] = {"a": seam.a, "b": seam.b, "accepted": seam.accepted}
@@ -167,6 +169,9 @@ def _seam(result: MapResult, number: int) -> dict[str, Any]:
             "in_chain": any(number in chain.seams for chain in result.chains),
             "adjusted_by_m": _moved(result, seam),
         }
+    shown = {when: name for when in (BEFORE, AFTER) if (name := _picture_name(seam, when)) in pictures}
+    if shown:
+        document["pictures"] = {when: f"{PICTURES}/{name}" for when, name in shown.items()}
     if closing is not None:
         document["closes_loop"] = {"shift_m": closing.shift_m, "turn_deg": closing.turn_deg, "seams": closing.length}
     return document
@@ -188,10 +193,14 @@ def map_pictures(run: stages.Run, result: MapResult) -> dict[str, bytes]:
         if run.cancel():
             raise CancelledError
         for when, picture in _seam_pictures(result, seam).items():
-            pictures[f"seam-{seam.a}-{seam.b}-{when}.png"] = png_of(picture)
+            pictures[_picture_name(seam, when)] = png_of(picture)
         run.progress("pictures", done, len(shown))
     run.ended("pictures", started, pictures=len(pictures))
     return pictures
+
+
+def _picture_name(seam: Seam, when: str) -> str:
+    return f"seam-{stages.seam_name(seam.a, seam.b)}-{when}.png"
 
 
 def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
@@ -219,7 +228,7 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
         centre,
         side,
     )  # fmt: skip
-    return {"before": before, "after": after}
+    return {BEFORE: before, AFTER: after}
 
 
 def _points_of(result: MapResult, k: int) -> Floats:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine import __version__
 from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
-from mrasfm_engine.aggregation.load import read_scene
+from mrasfm_engine.aggregation.load import BETWEEN_NAMES, read_scene
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
@@ -161,12 +161,7 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
         )
     for k, scene in enumerate(found):
         for other in found[:k]:
-            # Recordings may all begin at zero and number their files alike, but not be at the same places as well.
-            same_drive = all(
-                getattr(scene.manifest, part) == getattr(other.manifest, part)
-                for part in ("frames", "gnss", "rough_poses")
-            )
-            if scene.fingerprint == other.fingerprint or same_drive:
+            if _of_one_drive(scene, other):
                 raise InputError(
                     f"scenes {other.name} and {scene.name} are of the same drive",
                     remedy="Give each drive once.",
@@ -201,6 +196,17 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
                 f"Reconstruct them with {__version__} if the map is worse than expected.",
             )
         )
+
+
+def _of_one_drive(a: SourceScene, b: SourceScene) -> bool:
+    """Whether two scenes were made of the same recording, perhaps under other settings."""
+    if a.fingerprint == b.fingerprint:
+        return True
+    if a.manifest.frames != b.manifest.frames or a.manifest.gnss != b.manifest.gnss:
+        return False
+    # Clocks that begin at zero and numbered files are those of many drives: where they were tells them apart.
+    rough_a, rough_b = (None if s.manifest.rough_poses is None else s.manifest.rough_poses.poses for s in (a, b))
+    return a.manifest.gnss is not None or rough_a == rough_b
 
 
 def _require_one(found: Sequence[SourceScene], name: str, code: str, what: str, remedy: str) -> None:
@@ -273,8 +279,8 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
 
 
 def seam_name(a: str, b: str) -> str:
-    """Of a seam's files."""
-    return f"{a}--{b}"
+    """Of a seam's files: of no other two scenes, whatever they are called."""
+    return f"{a}{BETWEEN_NAMES}{b}"
 
 
 def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:

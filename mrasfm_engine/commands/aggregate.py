@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
+from mrasfm_engine.commands.named_path import split_name
 from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, progress_bars
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
@@ -54,9 +55,8 @@ def _named(words: list[str]) -> dict[str, Path]:
     """Scenes by name; a folder without one has its own."""
     result: dict[str, Path] = {}
     for word in words:
-        name, equals, folder = word.partition("=")
-        path = Path(folder if equals else word)
-        name = name if equals else path.resolve().name
+        given, path = split_name(word)
+        name = path.resolve().name if given is None else given
         if name in result:
             raise InputError(
                 f"two scenes are called {name!r}: {result[name]} and {path}",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from mrasfm_engine.commands.named_path import split_name
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.evaluation.seams import SeamErrors, compare_seam
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_trajectories, match_timestamps
@@ -53,7 +54,8 @@ def evaluate_map(folder: Path, words: list[str]) -> tuple[dict[str, Any], Table]
 
 
 def _truths(poses: MapPoses, words: list[str]) -> dict[str, Trajectory]:
-    named = dict(word.split("=", 1) for word in words if "=" in word)
+    given = [split_name(word) for word in words]
+    named = {name: file for name, file in given if name is not None}
     if named and len(named) != len(words):
         raise InputError(
             "--truth has SCENE=FILE and files without a scene, or a scene twice",
@@ -61,12 +63,13 @@ def _truths(poses: MapPoses, words: list[str]) -> dict[str, Trajectory]:
         )
     for name in named:
         if name not in poses.trajectories:
+            known = ", ".join(sorted(poses.trajectories))
             raise InputError(
                 f"--truth names {name}, which the map does not have",
-                remedy=f"Its scenes are {', '.join(sorted(poses.trajectories))}.",
+                remedy=f"Its scenes are {known}. Give a file whose name has '=' as ./FILE.",
             )
     if named:
-        return {name: read_tum(Path(file)) for name, file in named.items()}
+        return {name: read_tum(file) for name, file in named.items()}
     if len(words) != 1:
         raise InputError(
             f"--truth has {len(words)} files", remedy="Give one file for all drives, or SCENE=FILE once for each."
@@ -74,10 +77,10 @@ def _truths(poses: MapPoses, words: list[str]) -> dict[str, Trajectory]:
     times = np.concatenate([t.timestamps_us for t in poses.trajectories.values()])
     if len(np.unique(times)) != len(times):
         raise InputError(
-            f"drives of the map have timestamps in common, so that {words[0]} could be of any of them",
+            f"drives of the map have timestamps in common, so that {given[0][1]} could be of any of them",
             remedy="Give --truth SCENE=FILE for each drive.",
         )
-    return dict.fromkeys(poses.trajectories, read_tum(Path(words[0])))
+    return dict.fromkeys(poses.trajectories, read_tum(given[0][1]))
 
 
 def _matched(poses: MapPoses, truths: dict[str, Trajectory], folder: Path) -> dict[str, tuple[Floats, Floats]]:

@@ -166,3 +166,6 @@ def _check_documents(content: MapContent, folder: Path) -> None:
         with checking(folder / name):
             document = json.loads((folder / name).read_text(encoding="utf-8"))
             require(isinstance(document, dict), folder / name, "it is no JSON object")
+    for seam in content.document["seams"]:
+        for path in seam.get("pictures", {}).values():
+            require((folder / path).is_file(), folder / MAP_FILE, f"it names {path}, which is not there")

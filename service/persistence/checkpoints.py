@@ -51,7 +51,7 @@ class MapShelf:
         """Of the scenes of a map, ids by name, under some settings."""
         under = settings_sha256(settings)
         slots = {
-            f"seam-{a}--{b}.npz": hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
+            f"seam-{a}~{b}.npz": hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
             for a, first in scenes.items()
             for b, second in scenes.items()
             if a != b

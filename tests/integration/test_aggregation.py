@@ -53,7 +53,7 @@ def test_accuracy_and_files(street: Path, two: Path, mrasfm: Run) -> None:
     expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration", "frame.json", "map.json", "pictures"}
     assert {p.name for p in two.iterdir()} == {*expected, "scenes", "seams", "report.json", ".stages"}
     assert {p.name for p in (two / "pictures").iterdir()} == {
-        f"seam-drive_0-drive_1-{when}.png" for when in ("before", "after")
+        f"seam-drive_0~drive_1-{when}.png" for when in ("before", "after")
     }
     assert leftovers(two.parent) == []
     model = pycolmap.Reconstruction(str(two / "model"))

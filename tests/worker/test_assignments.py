@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import permutations
 from pathlib import Path
 
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from mrasfm_engine.aggregation.stages import seam_name
 from schemas.api.jobs import JobKind
 from service.persistence import jobs
 from service.persistence.artifacts import ArtifactStore
+from service.persistence.checkpoints import MapShelf
 from service.persistence.database import Database
 from service.settings import Settings
 from worker.assignments import assignment_of
@@ -27,3 +30,11 @@ def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> 
     with pytest.raises(OperationalError):
         _ = assignment.shelf
     database.close()
+
+
+def test_stages_of_pairs_of_scenes_are_called_as_the_engine_calls_them() -> None:
+    """And each pair's by another name, whatever its scenes are called."""
+    scenes = {name: f"scn_{number}" for number, name in enumerate(("a", "a--b", "b--c", "c"))}
+    shelf = MapShelf.of("map_1", "prj_1", scenes=scenes, settings={})
+    assert set(shelf.slots) == {f"seam-{seam_name(a, b)}.npz" for a, b in permutations(scenes, 2)}
+    assert len(shelf.slots) == len(set(shelf.slots.values())) == 12

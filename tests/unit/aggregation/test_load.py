@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from export_example import make_scene
 
-from mrasfm_engine.aggregation.load import name_scenes, read_scene
+from mrasfm_engine.aggregation.load import BETWEEN_NAMES, name_scenes, read_scene
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.export_scene import write_scene
@@ -69,3 +69,7 @@ def test_names() -> None:
         name_scenes([Path("/a/x"), Path("/b/x")])
     with pytest.raises(InputError, match="cannot be the name"):
         name_scenes({"../x": Path("/a/x")})
+    with pytest.raises(InputError, match="cannot be the name"):
+        name_scenes({"x\n": Path("/a/x")})
+    with pytest.raises(InputError, match="cannot be the name"):
+        name_scenes({f"a{BETWEEN_NAMES}b": Path("/a/x")})
