@@ -105,7 +105,7 @@ def test_what_cannot_be_in_a_map(street: Path, two: Path, tmp_path: Path, mrasfm
     assert "of the same drive" in refused(scene, f"again={scene}", *out)
     assert "does not exist" in refused(scene, tmp_path / "nowhere", *out)
     assert "is a map" in refused(scene, two, *out)
-    assert "is no map" in refused("--into", scene, other)
+    assert "holds a scene" in refused("--into", scene, other)
     assert "has a scene called drive_0 already" in refused("--into", two, scene)
     assert "not in the map" in refused("--into", two, "--remove", "nobody")
     assert "twice" in refused("--into", two, "--remove", "drive_1", "--remove", "drive_1")

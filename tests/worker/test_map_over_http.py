@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -91,7 +90,8 @@ def test_seven_drives_become_one_version(
     assert (version.summary.scenes, version.summary.connected, version.unconnected) == (DRIVES - 1, DRIVES - 1, [])
     assert version.summary.registered_units == (DRIVES - 1) * UNITS
     (failed,) = version.failed
-    assert (failed.drive_id, failed.name) == (drive_ids[BROKEN], name_of(folders[BROKEN]))
+    assert failed.drive_id == drive_ids[BROKEN]
+    assert f"-{BROKEN}-" in failed.name, "as the drive is called, in letters that a file's name may have"
     assert "jpg" in failed.problem.detail
     for file in wanted(version):
         assert_downloads(plain, file)
@@ -103,10 +103,6 @@ def test_seven_drives_become_one_version(
 def sent(client: Client, folder: Path) -> str:
     drive = DriveFolder.read(folder)
     return upload_drive(client, drive, state=UploadState(drive, client.url)).drive_id
-
-
-def name_of(folder: Path) -> str:
-    return str(json.loads((folder / "drive.json").read_text())["name"])
 
 
 def kill_at_work(world: World, worker: int, job: JobResource) -> str:
