@@ -95,18 +95,17 @@ class CalibrationPrior:
         cameras = np.flatnonzero(layout.camera_slot >= 0)
         own, own_sigma = self._own(r, sigma)
         w = 1.0 / (1.0 + (own**2).sum(1) / self.loss_scale**2)
-        gauge = self._gauge()
-        mean = gauge @ r
-        h, g = extra.cameras, extra.camera_gradient
-        for axis in range(6):
-            rows = CAMERA_DOF * layout.camera_slot[cameras] + axis
-            scaled = 1.0 / own_sigma[cameras, axis]
-            h[rows, rows] += w[cameras] * scaled**2
-            g[rows] += w[cameras] * scaled * own[cameras, axis]
-            scaled = 1.0 / sigma[cameras, axis]
-            j = np.sqrt(GAUGE_STIFFNESS) * gauge[cameras] * scaled
-            h[np.ix_(rows, rows)] += np.outer(j, j)
-            g[rows] += j * np.sqrt(GAUGE_STIFFNESS) * mean[axis]
+        gauge = np.sqrt(GAUGE_STIFFNESS) * self._gauge()
+        step = np.tile(np.eye(6), (len(cameras), 1, 1))
+        step[:, :3, :3] = se3.inverse_left_jacobian((r * sigma)[cameras, :3])
+        rows = (CAMERA_DOF * layout.camera_slot[cameras])[:, None] + np.arange(6)
+        j = step / own_sigma[cameras, :, None]
+        j_w = np.swapaxes(w[cameras, None, None] * j, 1, 2)
+        extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
+        extra.camera_gradient[rows] += (j_w @ own[cameras, :, None])[:, :, 0]
+        together = np.concatenate(gauge[cameras, None, None] * step / sigma[cameras, :, None], axis=1)  # (6, 6 cameras)
+        extra.cameras[np.ix_(rows.ravel(), rows.ravel())] += together.T @ together
+        extra.camera_gradient[rows.ravel()] += together.T @ (gauge @ r)
 
 
 def robust_gauge_weights(whitened: Floats) -> Floats:

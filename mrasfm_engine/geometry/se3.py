@@ -123,17 +123,26 @@ def exp_se3(twist: ArrayLike) -> Floats:
     return transform(exp_so3(w), (left_jacobian @ xi[..., 3:, None])[..., 0])
 
 
+def inverse_left_jacobian(rotation_vector: ArrayLike) -> Floats:
+    """Derivatives (..., 3, 3) of log(exp(omega) exp(v)) by omega at zero, for rotation vectors v (..., 3) below pi.
+
+    Source: Barfoot, "State Estimation for Robotics" (2017), section 7.1.
+    """
+    v = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    k = skew(v)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    c = np.where(small, 1.0 / 12, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    result: Floats = np.eye(3) - 0.5 * k + c * (k @ k)
+    return result
+
+
 def log_se3(a_from_b: ArrayLike) -> Floats:
     """Twists (..., 6) of transforms (..., 4, 4), the inverse of `exp_se3`; angles below pi."""
     m = np.asarray(a_from_b, dtype=np.float64)
     w = log_so3(m[..., :3, :3])
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    k = skew(w)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    c = np.where(small, 1.0 / 12, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
-    inverse_jacobian = np.eye(3) - 0.5 * k + c * (k @ k)
-    return np.concatenate([w, (inverse_jacobian @ m[..., :3, 3:])[..., 0]], axis=-1)
+    return np.concatenate([w, (inverse_left_jacobian(w) @ m[..., :3, 3:])[..., 0]], axis=-1)
 
 
 def rotation_angle_deg(rotation: ArrayLike) -> Floats:

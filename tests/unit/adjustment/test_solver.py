@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from small_problems import Case, make_case, perturbed, position_errors_m, rotation_errors_deg
 
-from mrasfm_engine.adjustment.ceres_reference import solve_with_ceres
 from mrasfm_engine.adjustment.priors import CalibrationPrior, FocalPrior
 from mrasfm_engine.adjustment.problem import Layout, Observations
 from mrasfm_engine.adjustment.solver import Problem, SolverOptions, Termination, solve
-from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
 from mrasfm_engine.scene.state import State
 
 FIRST_FIXED = [False] + [True] * 7
@@ -239,55 +237,6 @@ def test_pitfall_2_scale_comes_from_the_rig() -> None:
     way = np.linalg.norm(solution.unit_position_m[-1] - solution.unit_position_m[0])
     true_way = np.linalg.norm(case.truth.unit_position_m[-1] - case.truth.unit_position_m[0])
     assert way / true_way == pytest.approx(2.0, rel=1e-3)
-
-
-KINDS = ([PERSPECTIVE] * 3, [RADIAL, PERSPECTIVE, RADIAL], [FISHEYE] * 3)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_optimum_is_that_of_ceres(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    kinds = KINDS[seed % 3]
-    free_units = [u > 0 and rng.random() < 0.8 for u in range(6)]
-    free_cameras = [False, bool(seed & 1), bool(seed & 2)]
-    case = make_case(units=6, kinds=kinds, free_units=free_units, free_cameras=free_cameras)
-    o = case.problem.observations
-    noisy = o.xy_px + rng.normal(scale=0.7, size=o.xy_px.shape)
-    outlier = rng.random(len(noisy)) < 0.03
-    noisy[outlier] += rng.uniform(-40, 40, (int(outlier.sum()), 2))
-    start = perturbed(
-        case.truth, rng, units=np.flatnonzero(free_units).tolist(), cameras=np.flatnonzero(free_cameras).tolist(),
-        unit_m=0.03, unit_deg=0.1, camera_deg=0.1, point_m=0.05,
-    )  # fmt: skip
-    fixed = rng.random(o.num_points) < 0.2
-    start.points_m[fixed] = case.truth.points_m[fixed]
-    problem = replace(
-        case.problem,
-        state=start,
-        observations=replace(o, xy_px=noisy, fixed=fixed),
-        options=SolverOptions(max_iterations=300, function_tolerance=1e-12, decrement_tolerance=0.0),
-    )
-    solution, report = solve(problem)
-    _, their_report = solve_with_ceres(problem)
-    assert report.final_cost < 0.9 * report.initial_cost
-    assert report.parameters == their_report.parameters
-    # From afar either may leave a point on the wrong side of an outlier. Ceres finds no place that is clearly better,
-    assert report.final_cost <= their_report.final_cost * (1 + 1e-3)
-    # and none at all where it starts from ours.
-    theirs, their_report = solve_with_ceres(replace(problem, state=solution))
-    assert their_report.final_cost == pytest.approx(report.final_cost, rel=1e-5)
-    assert position_errors_m(solution, theirs).max() < 1e-3
-    assert 1e-4 < position_errors_m(solution, case.truth).max() < 0.1
-
-
-def test_what_colmap_cannot_say_is_refused() -> None:
-    case = drive()
-    with pytest.raises(ValueError, match="other terms"):
-        solve_with_ceres(replace(case.problem, terms=[calibration_prior(case.truth)]))
-    with pytest.raises(ValueError, match="one camera of a rig"):
-        solve_with_ceres(drive(free_cameras=[True] * 6).problem)
-    with pytest.raises(ValueError, match="fx and fy"):
-        solve_with_ceres(drive(free_cameras=[False] + [True] * 5, free_focal=True).problem)
 
 
 def test_fixed_points_stay_and_hold_the_poses() -> None:

@@ -1,4 +1,4 @@
-"""Units that move as one: derivatives against differences of the cost, and the solution against Ceres."""
+"""Units that move as one: derivatives against differences of the cost."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from small_problems import Case, make_case, perturbed, position_errors_m, rotation_errors_deg
 
-from mrasfm_engine.adjustment.ceres_reference import solve_with_ceres
-from mrasfm_engine.adjustment.problem import Layout
 from mrasfm_engine.adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.adjustment.unit_sets import UnitSets
 from mrasfm_engine.geometry import se3
@@ -75,48 +73,6 @@ def test_sets_find_back_and_stay_rigid(case: Case) -> None:
     for a, b in ((3, 4), (3, 5), (6, 7)):
         before, after = (se3.inverse(s.world_from_rig[a]) @ s.world_from_rig[b] for s in (case.truth, solution))
         assert np.abs(before - after).max() < 1e-12
-
-
-def test_like_ceres_with_the_set_as_a_rig() -> None:
-    """A set is a rig with a camera for every image: Ceres solves that as one unit."""
-    of_unit = np.array([-1, -1, -1, 0, 0])
-    case = make_case(units=5, free_units=(of_unit >= 0).tolist(), noise_px=0.3)
-    tight = SolverOptions(function_tolerance=1e-12, decrement_tolerance=1e-14)
-    problem = replace(case.problem, sets=UnitSets(of_unit=of_unit, count=1), options=tight)
-    turn = se3.transform(se3.exp_so3([0.01, -0.02, 0.03]), [0.2, -0.1, 0.15])
-    poses = case.truth.world_from_rig
-    poses[3:] = turn @ poses[3:]
-    start = replace(
-        case.truth, unit_rotation=poses[:, :3, :3].copy(), unit_position_m=poses[:, :3, 3].copy(),
-        points_m=case.truth.points_m + np.random.default_rng(3).normal(size=case.truth.points_m.shape) * 0.02,
-    )  # fmt: skip
-    solution, report = solve(replace(problem, state=start))
-    reference, ceres = solve_with_ceres(as_one_rig(replace(problem, state=start, sets=None)))
-    assert abs(report.final_cost - ceres.final_cost) < 1e-5 * ceres.final_cost
-    off = se3.inverse(reference.world_from_rig[3]) @ solution.world_from_rig[3]
-    assert 0 < np.abs(off - np.eye(4)).max() < 1e-4
-
-
-def as_one_rig(problem: Problem) -> Problem:
-    """Units 3 and 4 as one unit that carries the cameras of both."""
-    o, state, cameras = problem.observations, problem.state, len(problem.camera_kind)
-    carried = [se3.inverse(state.world_from_rig[3]) @ state.world_from_rig[u] @ state.rig_from_cam for u in (3, 4)]
-    rig_from_cam = np.concatenate([state.rig_from_cam, *carried])
-    camera = np.where(o.unit >= 3, o.camera + cameras * (o.unit - 2), o.camera)
-    return replace(
-        problem,
-        state=replace(
-            state,
-            unit_rotation=state.unit_rotation[:4],
-            unit_position_m=state.unit_position_m[:4],
-            camera_rotation=rig_from_cam[:, :3, :3].copy(),
-            camera_position_m=rig_from_cam[:, :3, 3].copy(),
-            camera_params=np.tile(state.camera_params, (3, 1)),
-        ),
-        camera_kind=np.tile(problem.camera_kind, 3),
-        observations=replace(o, unit=np.minimum(o.unit, 3), camera=camera),
-        layout=Layout.of(np.array([False, False, False, True]), np.zeros(3 * cameras, dtype=np.bool_)),
-    )
 
 
 def test_covariance_grows_with_the_noise(case: Case) -> None:
