@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mrasfm_engine.adjustment.ceres_reference import CeresProblem
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 # Residuals (n,) of some blocks, and their derivatives in each of them: (n, 6) of poses, (n, size) of all else.
 Function = Callable[[list[Floats]], tuple[Floats, list[Floats]]]
@@ -95,6 +96,8 @@ def _residuals(term: priors.Term, handed: CeresProblem) -> Iterator[Residuals]:
     match term:
         case priors.CalibrationPrior():
             return _calibration(term, handed)
+        case priors.CameraPosePrior():
+            return _camera_poses(term, handed)
         case priors.FocalPrior():
             return _focal_lengths(term, handed)
         case priors.PositionPrior():
@@ -129,18 +132,18 @@ def _position(blocks: list[Floats], *, antenna: Floats, measured: Floats, sigma:
 
 
 def _upright(term: priors.UprightPrior, handed: CeresProblem) -> Iterator[Residuals]:
-    """Heights of the rig's left and forward axis, over sines of sigma; all units together count as one measurement."""
+    """Heights of the rig's left and forward axis, over sigma; all units together count as one measurement."""
     sigma = np.array([term.sigma_roll_rad, term.sigma_pitch_rad]) * np.sqrt(len(term.unit))
     for u in term.unit.tolist():
         if handed.problem.layout.unit_slot[u] >= 0:
             axes = handed.reference_from_unit[u][:3, [1, 0]].T
-            yield Residuals(function=partial(_heights, axes=axes, sigma=sigma), count=2, blocks=[handed.unit_pose(u)])
+            yield Residuals(function=partial(_heights, axes=axes, up=term.up, sigma=sigma), count=2, blocks=[handed.unit_pose(u)])
 
 
-def _heights(blocks: list[Floats], *, axes: Floats, sigma: Floats) -> tuple[Floats, list[Floats]]:
-    up = _matrix(blocks[0])[0][:, 2]
-    derivative = np.column_stack([np.cross(up, axes), np.zeros((2, 3))])  # d (axis . R z) = omega . (R z x axis)
-    return axes @ up / sigma, [derivative / sigma[:, None]]
+def _heights(blocks: list[Floats], *, axes: Floats, up: Floats, sigma: Floats) -> tuple[Floats, list[Floats]]:
+    turned = _matrix(blocks[0])[0] @ up
+    derivative = np.column_stack([np.cross(turned, axes), np.zeros((2, 3))])  # d (axis . R up) = omega . (R up x axis)
+    return axes @ turned / sigma, [derivative / sigma[:, None]]
 
 
 def _focal_lengths(term: priors.FocalPrior, handed: CeresProblem) -> Iterator[Residuals]:
@@ -159,34 +162,50 @@ def _focal_length(blocks: list[Floats], *, given: float, sigma: float) -> tuple[
 
 def _calibration(term: priors.CalibrationPrior, handed: CeresProblem) -> Iterator[Residuals]:
     """Every free camera's correction over its sigmas, and the weighted mean of all cameras' as the gauge."""
-    layout, count = handed.problem.layout, len(term.rotation)
-    free = np.flatnonzero(layout.camera_slot >= 0)
     sigma = np.repeat(np.column_stack([term.sigma_rotation_rad, term.sigma_translation_m]), 3, axis=1)
-    given = se3.transform(term.rotation, term.position_m)
-    correction = partial(_correction, rig_from_reference=handed.rig_from_reference)
-    for c in free.tolist():
-        held = np.zeros(6, dtype=np.bool_) if term.held is None else term.held[c]
-        own_sigma = np.where(held, priors.HELD_SHARE * sigma[c], sigma[c])
-        yield Residuals(
-            function=partial(_weighted_sum, given=given[[c]], weight=1.0 / own_sigma[None], correction=correction),
-            count=6,
-            blocks=[handed.camera_pose(c)],
-            loss_scale=term.loss_scale,
-        )
+    held = np.zeros(sigma.shape, dtype=np.bool_) if term.held is None else term.held
+    count = len(sigma)
     share = np.ones(count) if term.gauge_weights is None else term.gauge_weights
-    weight = np.sqrt(priors.GAUGE_STIFFNESS * count) * (share / share.sum())[:, None] / sigma
-    fixed = np.flatnonzero(layout.camera_slot < 0)
-    offset = np.zeros(6)
-    for c in fixed.tolist():
-        offset += weight[c] * _difference(handed.problem.state.rig_from_cam[c], given[c])
+    return _rig(
+        handed,
+        cameras=np.arange(count),
+        given=se3.transform(term.rotation, term.position_m),
+        own_weight=1.0 / np.where(held, priors.HELD_SHARE * sigma, sigma),
+        gauge_weight=np.sqrt(priors.GAUGE_STIFFNESS * count) * (share / share.sum())[:, None] / sigma,
+        loss_scale=term.loss_scale,
+    )
+
+
+def _camera_poses(term: priors.CameraPosePrior, handed: CeresProblem) -> Iterator[Residuals]:
+    """The same of one rig's cameras, with sigmas of their own for every direction."""
+    return _rig(
+        handed,
+        cameras=term.camera,
+        given=se3.transform(term.rotation, term.position_m),
+        own_weight=1.0 / term.sigma,
+        gauge_weight=np.sqrt(priors.GAUGE_STIFFNESS / len(term.camera)) / term.sigma,
+        loss_scale=term.loss_scale,
+    )
+
+
+def _rig(
+    handed: CeresProblem, *, cameras: Ints, given: Floats, own_weight: Floats, gauge_weight: Floats, loss_scale: float
+) -> Iterator[Residuals]:
+    """Corrections of a rig's free cameras by themselves, weighted by direction (n, 6), and their sum with all others'."""
+    slot = handed.problem.layout.camera_slot[cameras]
+    correction = partial(_correction, rig_from_reference=handed.rig_from_reference)
+    free, blocks, offset = np.flatnonzero(slot >= 0), [], np.zeros(6)
+    for k in np.flatnonzero(slot < 0).tolist():
+        offset += gauge_weight[k] * _difference(handed.problem.state.rig_from_cam[cameras[k]], given[k])
+    for k in free.tolist():
+        blocks.append(handed.camera_pose(int(cameras[k])))
+        function = partial(_weighted_sum, given=given[[k]], weight=own_weight[[k]], correction=correction)
+        yield Residuals(function=function, count=6, blocks=[blocks[-1]], loss_scale=loss_scale)
     if len(free):
-        yield Residuals(
-            function=partial(
-                _weighted_sum, given=given[free], weight=weight[free], correction=correction, offset=offset
-            ),
-            count=6,
-            blocks=[handed.camera_pose(c) for c in free.tolist()],
+        function = partial(
+            _weighted_sum, given=given[free], weight=gauge_weight[free], correction=correction, offset=offset
         )
+        yield Residuals(function=function, count=6, blocks=blocks)
 
 
 def _weighted_sum(

@@ -94,18 +94,39 @@ class CalibrationPrior:
         r, sigma = self._whitened(state)
         cameras = np.flatnonzero(layout.camera_slot >= 0)
         own, own_sigma = self._own(r, sigma)
-        w = 1.0 / (1.0 + (own**2).sum(1) / self.loss_scale**2)
-        gauge = np.sqrt(GAUGE_STIFFNESS) * self._gauge()
-        step = np.tile(np.eye(6), (len(cameras), 1, 1))
-        step[:, :3, :3] = se3.inverse_left_jacobian((r * sigma)[cameras, :3])
-        rows = (CAMERA_DOF * layout.camera_slot[cameras])[:, None] + np.arange(6)
-        j = step / own_sigma[cameras, :, None]
-        j_w = np.swapaxes(w[cameras, None, None] * j, 1, 2)
-        extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
-        extra.camera_gradient[rows] += (j_w @ own[cameras, :, None])[:, :, 0]
-        together = np.concatenate(gauge[cameras, None, None] * step / sigma[cameras, :, None], axis=1)  # (6, 6 cameras)
-        extra.cameras[np.ix_(rows.ravel(), rows.ravel())] += together.T @ together
-        extra.camera_gradient[rows.ravel()] += together.T @ (gauge @ r)
+        step = _derivatives_of_corrections(r * sigma)
+        rows = _rows_of(layout, cameras)
+        _add_own(extra, rows, (step / own_sigma[:, :, None])[cameras], own[cameras], self.loss_scale)
+        _add_gauge(extra, rows, (step / sigma[:, :, None])[cameras], self._gauge()[cameras], self._gauge() @ r)
+
+
+def _rows_of(layout: Layout, cameras: Ints) -> Ints:
+    """Where the poses of free cameras stand (n, 6) among the cameras' unknowns."""
+    return (CAMERA_DOF * layout.camera_slot[cameras])[:, None] + np.arange(6)
+
+
+def _derivatives_of_corrections(corrections: Floats) -> Floats:
+    """Of rotation vectors and translations (n, 6) by steps of their cameras (n, 6, 6)."""
+    step = np.tile(np.eye(6), (len(corrections), 1, 1))
+    step[:, :3, :3] = se3.inverse_left_jacobian(corrections[:, :3])
+    return step
+
+
+def _add_own(extra: Extra, rows: Ints, j: Floats, r: Floats, loss_scale: float) -> None:
+    """Add every camera's own residuals (n, 6) with derivatives (n, 6, 6), and a Cauchy loss over all six."""
+    w = 1.0 / (1.0 + (r**2).sum(1) / loss_scale**2)
+    j_w = np.swapaxes(w[:, None, None] * j, 1, 2)
+    extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
+    extra.camera_gradient[rows] += (j_w @ r[:, :, None])[:, :, 0]
+
+
+def _add_gauge(extra: Extra, rows: Ints, j: Floats, weights: Floats, mean: Floats) -> None:
+    """Add the weighted mean (6,) of residuals, to which cameras (n,) contribute with derivatives (n, 6, 6)."""
+    if not len(rows):
+        return
+    together = np.concatenate(np.sqrt(GAUGE_STIFFNESS) * weights[:, None, None] * j, axis=1)  # (6, 6 n)
+    extra.cameras[np.ix_(rows.ravel(), rows.ravel())] += together.T @ together
+    extra.camera_gradient[rows.ravel()] += np.sqrt(GAUGE_STIFFNESS) * together.T @ mean
 
 
 def robust_gauge_weights(whitened: Floats) -> Floats:
@@ -122,6 +143,46 @@ def robust_gauge_weights(whitened: Floats) -> Floats:
     usual = max(float(np.median(distance)), 1e-3)
     result: Floats = 1.0 / (1.0 + (distance / (GAUGE_USUAL * usual)) ** 8)
     return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPosePrior:
+    """Keeps the cameras of one rig near where an earlier adjustment found them, direction by direction.
+
+    Residuals of a camera: rotation vector of R R_found' and t - t_found over their sigmas, in rig axes, with a Cauchy
+    loss over all six. The gauge between cameras and units is as in `CalibrationPrior`: the cameras' mean residual is
+    held at zero.
+    """
+
+    camera: Ints  # (n,) all cameras of the rig
+    rotation: Floats  # (n, 3, 3)
+    position_m: Floats  # (n, 3)
+    sigma: Floats  # (n, 6) rotation (rad), translation (m)
+    loss_scale: float = 3.0
+
+    def _residuals(self, state: State) -> Floats:
+        turn = se3.log_so3(state.camera_rotation[self.camera] @ np.swapaxes(self.rotation, 1, 2))
+        moved = state.camera_position_m[self.camera] - self.position_m
+        result: Floats = np.concatenate([turn, moved], axis=1) / self.sigma
+        return result
+
+    def _gauge(self) -> Floats:
+        return np.full(len(self.camera), len(self.camera) ** -0.5)
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        r, s2 = self._residuals(state), self.loss_scale**2
+        own = 0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum()
+        return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        r, gauge = self._residuals(state), self._gauge()
+        free = np.flatnonzero(layout.camera_slot[self.camera] >= 0)
+        rows = _rows_of(layout, self.camera[free])
+        j = (_derivatives_of_corrections(r * self.sigma) / self.sigma[:, :, None])[free]
+        _add_own(extra, rows, j, r[free], self.loss_scale)
+        _add_gauge(extra, rows, j, gauge[free], gauge @ r)
 
 
 @dataclass(frozen=True, kw_only=True)

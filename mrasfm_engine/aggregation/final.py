@@ -1,8 +1,9 @@
 """The last adjustment of a map: units vary on their own again, those at the seams or all of them.
 
 Scenes that moved as one each are as bent as they were. Where two overlap, their units now settle between what their own
-scene and what the other one says. Every drive keeps its calibration, and has its receiver's positions as a prior, with
-a constant error of its own that is estimated in turns with the units.
+scene and what the other one says. Every drive has a calibration of its own, which settles within what its scene left
+uncertain (see `calibrations`), and its receiver's positions as a prior, with a constant error of its own that is
+estimated in turns with the units.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from mrasfm_engine.adjustment.priors import Term, UprightPrior
 from mrasfm_engine.adjustment.problem import Layout
 from mrasfm_engine.adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.calibrations import calibration_priors
 from mrasfm_engine.aggregation.fine import joined_points_m, tracks_of
 from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.config import EngineConfig
@@ -88,15 +90,19 @@ def adjust_map(
     tracks = tracks_of(assembly, owners)
     joined = np.arange(tracks.count) <= int(owner.max(initial=-1))
     state = replace(state, points_m=joined_points_m(state, tracks))
+    cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     problem = Problem(
         state=state,
         camera_kind=assembly.camera_kind,
         observations=assembly.observations(tracks.rows, tracks.point, tracks.count),
-        layout=Layout.of(np.zeros(len(assembly.registered), dtype=np.bool_), _no_cameras(assembly)),
+        layout=Layout.of(np.zeros(len(assembly.registered), dtype=np.bool_), cameras),
         options=_options(config),
         motion=assembly.motion,
     )
     free = _free_units(assembly, problem, joined, config)
+    calibrations = calibration_priors(assembly, state, free, config.adjustment)
+    for prior in calibrations:
+        cameras[prior.camera] = True
     reports: list[Report] = []
     positions = {k: with_bias(p, state) for k, p in positions.items()}
     for _ in range(ROUNDS if free.any() else 0):
@@ -104,8 +110,8 @@ def adjust_map(
         seen[problem.observations.point[free[problem.observations.unit]]] = True
         part = replace(
             problem.of_points(seen),
-            layout=Layout.of(free, _no_cameras(assembly)),
-            terms=_terms(assembly, positions, free),
+            layout=Layout.of(free, cameras),
+            terms=[*_terms(assembly, positions, free), *calibrations],
         )
         solution, report = solve_with_chosen_points(
             part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
@@ -115,6 +121,8 @@ def adjust_map(
         points[seen] = solution.points_m
         problem = replace(problem, state=replace(solution, points_m=points))
         positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
+    if cameras.any():  # what only fixed units see follows their calibration
+        problem = replace(problem, state=problem.with_points_settled(problem.state))
     model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
     return FinalResult(
         model=model,
@@ -124,10 +132,6 @@ def adjust_map(
         dropped_observations=observations,
         dropped_points=points_dropped,
     )
-
-
-def _no_cameras(assembly: Assembly) -> Bools:
-    return np.zeros(len(assembly.camera_kind), dtype=np.bool_)
 
 
 def _options(config: EngineConfig) -> SolverOptions:

@@ -93,6 +93,8 @@ def read_scene(folder: Path, name: str) -> SourceScene:
             documents=(frame, poses, calibration, report),
             place=(ecef_from_local, common_world),
         )
+    with _damaged(folder / "calibration.json", name):
+        _ = scene.certainty_of_cameras
     if scene.unit_registered.sum() < MIN_UNITS or not len(scene.points_m):
         raise InputError(
             f"scene {name} has {int(scene.unit_registered.sum())} registered units and {len(scene.points_m)} points",

@@ -22,6 +22,7 @@ from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.export_calibration import settled_document
 from mrasfm_engine.io.export_map import MapContent
 from mrasfm_engine.io.export_pictures import png_of
 from mrasfm_engine.io.export_scene import PICTURES
@@ -97,7 +98,7 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
         scene=scene,
         scene_of_unit=[result.scenes[k].name for k in result.assembly.scene_of_unit],
         document=map_document(result, pictures),
-        calibrations={s.name: s.calibration for s in result.scenes},
+        calibrations={s.name: _calibration(result, k) for k, s in enumerate(result.scenes)},
         pictures=pictures,
         scenes={s.name: (s.fingerprint, *s.pack()) for s in result.scenes},
         seams={
@@ -108,6 +109,13 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
             for seam in result.found_seams
         },
     )
+
+
+def _calibration(result: MapResult, k: int) -> dict[str, Any]:
+    scene, first = result.scenes[k], int(result.assembly.first_camera[k])
+    rig_from_cam = result.final.model.state.rig_from_cam[first:]
+    names = [camera.name for camera in scene.drive.cameras]
+    return settled_document(scene.calibration, dict(zip(names, rig_from_cam, strict=False)))
 
 
 def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.final import MapModel
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import geodesy
-from mrasfm_engine.scene.drive import Drive, matrix_from_pose
+from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.scene.semantics import majority_class
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
@@ -40,7 +40,7 @@ def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Sc
         image_registered=np.concatenate([s.image_registered for s in assembly.scenes]),
         world_from_rig=poses,
         sigma_position_m=np.concatenate([s.sigma_position_m for s in assembly.scenes]),
-        calibration=[_calibration(camera) for s in assembly.scenes for camera in s.drive.cameras],
+        calibration=calibrations(assembly, model),
         points_m=model.state.points_m,
         point_colors=np.round(mean_color / counts[:, None]).astype(np.uint8),
         point_error_px=np.bincount(point, model.errors_px, minlength=count) / counts,
@@ -77,17 +77,21 @@ def _joined_drive(assembly: Assembly) -> Drive:
     return Drive(assembly.scenes[0].drive.root, manifest)
 
 
-def _calibration(camera: Camera) -> CameraCalibration:
-    """As refined in its scene; how well is told by the scene's own document."""
+def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]:
+    """Of all cameras of all drives, as the map has them; how certain they are their scenes say."""
+    cameras = [camera for scene in assembly.scenes for camera in scene.drive.cameras]
     unknown = np.full(3, np.nan)
-    return CameraCalibration(
-        rig_from_cam=matrix_from_pose(camera.rig_from_cam),
-        params=np.array(camera.params),
-        sigma_rotation_deg=unknown,
-        sigma_translation_m=unknown,
-        sigma_focal_px=float("nan"),
-        observed=np.zeros(6, dtype=np.bool_),
-    )
+    return [
+        CameraCalibration(
+            rig_from_cam=rig_from_cam,
+            params=np.array(camera.params),
+            sigma_rotation_deg=unknown,
+            sigma_translation_m=unknown,
+            sigma_focal_px=float("nan"),
+            observed=np.zeros(6, dtype=np.bool_),
+        )
+        for camera, rig_from_cam in zip(cameras, model.state.rig_from_cam, strict=True)
+    ]
 
 
 def _features(assembly: Assembly) -> list[ImageFeatures]:

@@ -102,6 +102,21 @@ class SourceScene:
         """Positions (r, 3) of the registered units in the scene's frame."""
         return self.world_from_rig[self.unit_registered, :3, 3]
 
+    @cached_property
+    def certainty_of_cameras(self) -> tuple[Floats, Bools] | None:
+        """Sigmas (c, 6) of `rig_from_cam`, rotation (rad) and translation (m) in rig axes, and which of these directions
+        the drive observed; None where the calibration was not refined.
+        """
+        if self.calibration.get("adjusted") is not True:
+            return None
+        found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
+        sigma = [[*np.radians(c["sigma"]["rotation_deg"]), *c["sigma"]["translation_m"]] for c in found]
+        observed = [[*c["observed"]["rotation"], *c["observed"]["translation"]] for c in found]
+        sigmas, known = np.array(sigma, dtype=np.float64), np.array(observed, dtype=np.bool_)
+        if not sigmas.shape == known.shape == (len(found), 6) or not ((sigmas > 0) & np.isfinite(sigmas)).all():
+            raise ValueError("sigmas of its cameras are not six positive numbers each")
+        return sigmas, known
+
     @property
     def midpoint_m(self) -> Floats:
         """The middle of the trajectory (3,): half of the way along it."""

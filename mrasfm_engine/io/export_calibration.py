@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, Scene
-from schemas import CAMERA_MODELS, Camera
+from schemas import CAMERA_MODELS, Camera, Pose
+
+Floats = NDArray[np.float64]
 
 OBSERVED, ONLY_PRIOR = "observed", "only the prior"
 
@@ -46,6 +50,36 @@ def _common(verdict: CalibrationVerdict) -> dict[str, Any]:
     }
 
 
+def settled_document(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
+    """A scene's `calibration.json` after its cameras have settled in a map: `refined` and `difference` are the map's.
+
+    `since_scene` is by how much that is another pose than the scene found, and absent where nothing moved; everything
+    else is as the scene found it.
+    """
+    return {**document, "cameras": {k: _settled(c, rig_from_cam[k]) for k, c in document["cameras"].items()}}
+
+
+def _settled(camera: Mapping[str, Any], rig_from_cam: Floats) -> dict[str, Any]:
+    given, found = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("given", "refined"))
+    if np.array_equal(found, rig_from_cam):
+        return dict(camera)
+    return {
+        **camera,
+        "refined": {**camera["refined"], "rig_from_cam": pose_from_matrix(rig_from_cam).model_dump()},
+        "difference": {**camera["difference"], **_difference(given, rig_from_cam)},
+        "since_scene": _difference(found, rig_from_cam),
+    }
+
+
+def _difference(given: Floats, refined: Floats) -> dict[str, Any]:
+    rotation = np.degrees(se3.log_so3(refined[:3, :3] @ given[:3, :3].T))
+    return {
+        "rotation_vector_deg": rotation.tolist(),
+        "rotation_deg": float(np.linalg.norm(rotation)),
+        "translation_m": (refined[:3, 3] - given[:3, 3]).tolist(),
+    }
+
+
 def verdict_in_words(refined: CameraCalibration) -> list[str]:
     """Of the six directions of a camera: what its value rests on."""
     return [OBSERVED if observed else ONLY_PRIOR for observed in refined.observed]
@@ -54,7 +88,6 @@ def verdict_in_words(refined: CameraCalibration) -> list[str]:
 def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
     given = matrix_from_pose(camera.rig_from_cam)
     names = CAMERA_MODELS[camera.model]
-    rotation = np.degrees(se3.log_so3(refined.rig_from_cam[:3, :3] @ given[:3, :3].T))
     focal = [k for k, name in enumerate(names) if name in ("f", "fx", "fy")]
     words = verdict_in_words(refined)
     sigma = {
@@ -72,10 +105,8 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
             "rig_from_cam": pose_from_matrix(refined.rig_from_cam).model_dump(),
             "params": refined.params.tolist(),
         },
-        "difference": {
-            "rotation_vector_deg": rotation.tolist(),
-            "rotation_deg": float(np.linalg.norm(rotation)),
-            "translation_m": (refined.rig_from_cam[:3, 3] - given[:3, 3]).tolist(),
+        "difference": _difference(given, refined.rig_from_cam)
+        | {
             "focal_px": float(np.mean([refined.params[k] - camera.params[k] for k in focal])),
         },
         "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},

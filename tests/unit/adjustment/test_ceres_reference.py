@@ -11,7 +11,7 @@ import pytest
 from small_problems import make_case, perturbed, project
 
 from mrasfm_engine.adjustment.ceres_reference import CeresProblem, solve_with_ceres
-from mrasfm_engine.adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.adjustment.priors import CalibrationPrior, CameraPosePrior, FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.adjustment.problem import Layout, ShotMotion
 from mrasfm_engine.adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.adjustment.unit_sets import UnitSets
@@ -92,7 +92,9 @@ def focal_prior(truth: State, rng: Rng) -> FocalPrior:
 
 
 def upright_prior() -> UprightPrior:
-    return UprightPrior(unit=np.arange(UNITS), sigma_roll_rad=0.001, sigma_pitch_rad=0.003)
+    """Up is not quite the world's z axis."""
+    up = se3.exp_so3([0.01, -0.02, 0.0])[:, 2]
+    return UprightPrior(unit=np.arange(UNITS), sigma_roll_rad=0.001, sigma_pitch_rad=0.003, up=up)
 
 
 def images_alone(rng: Rng) -> Problem:
@@ -133,6 +135,19 @@ def fixed_cameras_share_the_gauge(rng: Rng) -> Problem:
     return started(problem, rng, terms=[replace(prior, gauge_weights=np.array([1.0, 0.7, 0.4]))])
 
 
+def poses_of_cameras(rng: Rng) -> Problem:
+    """Two of three vary, held direction by direction, and all together, by what was found before."""
+    problem = problem_at_truth(rng, units=[False] + [True] * 5, cameras=[True, False, True])
+    found = perturbed(problem.state, rng, cameras=range(CAMERAS), camera_deg=0.05, camera_m=0.005, point_m=0.0)
+    prior = CameraPosePrior(
+        camera=np.arange(CAMERAS),
+        rotation=found.camera_rotation,
+        position_m=found.camera_position_m,
+        sigma=np.column_stack([np.radians(rng.uniform(0.01, 0.1, (CAMERAS, 3))), rng.uniform(1e-3, 1e-2, (CAMERAS, 3))]),
+    )
+    return started(problem, rng, terms=[prior])
+
+
 def focal_lengths(rng: Rng) -> Problem:
     """Two units are fixed, and give the scale where cameras are free."""
     cameras = [False, True, bool(rng.random() < 0.5)]
@@ -153,7 +168,8 @@ def two_receivers(rng: Rng) -> Problem:
     terms: list[Term] = [upright_prior()]
     for units, off_m in ((range(3), [2.0, -1.0, 0.5]), (range(3, 6), [-1.0, 1.0, 3.0])):
         prior = position_prior(problem.state, rng, units=units, off_m=off_m)
-        positions = with_bias(DrivePositions(prior=prior, bias_m=np.zeros(3)), problem.state)
+        known = DrivePositions(measured=prior, prior=prior, bias_m=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
+        positions = with_bias(known, problem.state)
         assert 0 < np.linalg.norm(positions.bias_m - off_m) < 0.1
         terms.append(positions.prior)
     return started(problem, rng, terms=terms)
@@ -203,6 +219,7 @@ KINDS: tuple[Callable[[Rng], Problem], ...] = (
     calibration_with_held_directions,
     one_wrong_camera,
     fixed_cameras_share_the_gauge,
+    poses_of_cameras,
     focal_lengths,
     positions,
     two_receivers,

@@ -9,6 +9,7 @@ from small_problems import Case, make_case, moved, numeric_gradient, perturbed, 
 from mrasfm_engine.adjustment import priors
 from mrasfm_engine.adjustment.priors import (
     CalibrationPrior,
+    CameraPosePrior,
     FocalPrior,
     PositionPrior,
     Term,
@@ -73,6 +74,34 @@ def check_gradient(term: Term, case: Case, state: State, *, rtol: float = 1e-5) 
 def check_curvature(residuals: np.ndarray, h: np.ndarray, rtol: float = 1e-4) -> None:
     """The Gauss-Newton matrix against J'J of numeric residual derivatives (rows, n)."""
     np.testing.assert_allclose(h, residuals.T @ residuals, rtol=rtol, atol=rtol * np.abs(h).max())
+
+
+def test_camera_pose_prior_holds_each_direction_by_its_own_sigma_and_the_gauge_by_their_mean() -> None:
+    """Camera 1 is of another rig, and the last does not vary."""
+    case, state = free_case()
+    chosen = np.array([0, 2, 3, 4])
+    rng = np.random.default_rng(3)
+    sigma = np.column_stack([np.radians(rng.uniform(0.02, 2.0, (4, 3))), rng.uniform(0.001, 0.05, (4, 3))])
+    prior = CameraPosePrior(
+        camera=chosen,
+        rotation=case.truth.camera_rotation[chosen],
+        position_m=case.truth.camera_position_m[chosen],
+        sigma=sigma,
+    )
+    h = check_gradient(prior, case, state)
+    other = int(case.problem.layout.camera_offsets(np.array([1]))[0])
+    assert np.abs(h[other : other + 7]).max() == 0
+    assert prior.cost(case.truth) < 1e-20
+    at_truth = added(prior, case.truth, case.problem.layout)[0]
+    rows = case.problem.layout.camera_offsets(chosen[:3])[:, None] + np.arange(6)
+    stiff = 1.0 + priors.GAUGE_STIFFNESS / 4
+    np.testing.assert_allclose(np.diag(at_truth)[rows], stiff / sigma[:3] ** 2)
+    # Corrections that cancel cost what they are, the same correction of all is held.
+    step = np.zeros(case.problem.layout.size)
+    step[rows[0]], step[rows[1]] = sigma[0], -sigma[1]
+    assert step @ at_truth @ step == pytest.approx(12)
+    step[rows[1]] = sigma[1]
+    assert step @ at_truth @ step > 1e5
 
 
 @pytest.mark.parametrize("lever_arm_m", [[0.0, 0.0, 0.0], [-0.8, 0.3, 1.9]])

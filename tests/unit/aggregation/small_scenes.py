@@ -15,9 +15,10 @@ from mrasfm_engine.aggregation.matching import CrossMatches
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import geodesy, se3
+from mrasfm_engine.io.export_calibration import ONLY_PRIOR
 from mrasfm_engine.io.export_scene import write_scene
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
-from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
+from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.synthetic.rigs import mounts, true_cameras
 from mrasfm_engine.synthetic.simulate import poses_along, simulate_observations
 from schemas import Gnss, GnssSample, RoughPose, RoughTrajectory
@@ -61,6 +62,7 @@ class Driven:
     street_from_rig: np.ndarray  # (u, 4, 4)
     point_of_street: np.ndarray  # (p,) which one each of the scene's points is
     folder: Path
+    seed: int
 
 
 def drive_along(
@@ -79,12 +81,14 @@ def drive_along(
     offset_ms: Sequence[int] | None = None,
     common_world: str | None = None,
     missing_units: Sequence[int] = (),
+    cameras_off_deg: float | None = None,
     seed: int = 0,
 ) -> Driven:
     """Drive, write the scene, and read it as an aggregation does.
 
     `bias_m` is the receiver's constant error, `bend_m` by how much the scene's ends are bent aside, `scale` its lengths
-    in true ones, `offset_ms` when each camera takes its image after its unit's time.
+    in true ones, `offset_ms` when each camera takes its image after its unit's time. With `cameras_off_deg` the scene
+    refined its calibration, and is so uncertain about rotations, and so far off.
     """
     rng = np.random.default_rng(1000 + seed)
     rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=rng)
@@ -128,6 +132,9 @@ def drive_along(
     unit_from_image[:, :3, 3] *= scale
     poses[~registered] = np.nan
 
+    if cameras_off_deg is not None:
+        turn = np.radians(cameras_off_deg) * np.random.default_rng(seed).normal(size=(cameras, 3))
+        rig_in_scene[:, :3, :3] = se3.exp_so3(turn - turn.mean(0)) @ rig_in_scene[:, :3, :3]
     drive = make_drive(
         rig_in_scene,
         params,
@@ -156,14 +163,21 @@ def drive_along(
             CameraCalibration(
                 rig_from_cam=pose,
                 params=p,
-                sigma_rotation_deg=np.full(3, 0.1),
+                sigma_rotation_deg=np.full(3, cameras_off_deg or 0.1),
                 sigma_translation_m=np.full(3, 0.01),
                 sigma_focal_px=1.0,
-                observed=np.ones(6, dtype=np.bool_),
+                observed=np.repeat([True, False], 3),
             )
             for pose, p in zip(rig_in_scene, params, strict=True)
         ],
         points_m=scale * points,
+        calibration_verdict=CalibrationVerdict(
+            adjusted=cameras_off_deg is not None,
+            reason="",
+            scale_observed=False,
+            scale_rests_on=ONLY_PRIOR,
+            sigma_scale=np.nan,
+        ),
         point_colors=np.full((len(points), 3), 128, np.uint8),
         point_error_px=np.full(len(points), noise_px),
         observation_point=row[order],
@@ -182,6 +196,7 @@ def drive_along(
         street_from_rig=street_from_rig,
         point_of_street=kept,
         folder=folder,
+        seed=seed,
     )
 
 

@@ -9,13 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from small_scenes import CONFIG, PLACE, Driven, Street, configured, drive_along, in_assembly, make_street, shared_points
+from small_scenes import (
+    CONFIG,
+    PLACE,
+    SIZE_PX,
+    Driven,
+    Street,
+    configured,
+    drive_along,
+    in_assembly,
+    make_street,
+    shared_points,
+)
 
 from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.calibrations import calibration_priors
 from mrasfm_engine.aggregation.association import coarse_transform
 from mrasfm_engine.aggregation.final import FinalResult, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.synthetic.rigs import true_cameras
 
 BEND_M = 0.08
 BIAS_M = ((0.5, -0.3, 0.2), (-0.4, 0.6, -0.3))
@@ -146,7 +159,7 @@ def test_all_without_any_positions(two: list[Driven], untouched: FinalResult) ->
 
 
 @pytest.mark.parametrize("which", ["none", "overlap", "all"])
-def test_every_drive_keeps_its_calibration_and_points_that_are_one_become_one(
+def test_every_drive_has_its_calibration_and_points_that_are_one_become_one(
     two: list[Driven], untouched: FinalResult, which: str
 ) -> None:
     result = untouched if which == "none" else adjusted(two, which)
@@ -205,6 +218,58 @@ def test_images_that_are_not_simultaneous_stay_where_they_are_in_their_units(
         shots = result.model.state.unit_from_shot
         np.testing.assert_allclose(shots[: len(two[0].source.image_unit)], np.tile(np.eye(4), (28, 1, 1)), atol=1e-12)
         np.testing.assert_allclose(shots[28:], moving.source.unit_from_image, atol=1e-12)
+
+
+def camera_errors_deg(result: FinalResult, drives: Sequence[Driven]) -> np.ndarray:
+    """How far every camera is turned from its true pose, all of a drive together where they fit best."""
+    found, errors = result.model.state.camera_rotation.reshape(len(drives), -1, 3, 3), []
+    for k in range(len(drives)):
+        rig = true_cameras(4, width=SIZE_PX[0], height=SIZE_PX[1], rng=np.random.default_rng(1000 + drives[k].seed))
+        truth = np.stack([camera.rig_from_cam[:3, :3] for camera in rig])
+        turn = se3.log_so3(found[k] @ np.swapaxes(truth, 1, 2))
+        errors.append(np.degrees(np.linalg.norm(turn - turn.mean(0), axis=1)))
+    return np.concatenate(errors)
+
+
+@pytest.mark.parametrize("which", ["overlap", "all"])
+def test_calibrations_settle_as_far_as_scenes_left_them_uncertain(street: Street, folder: Path, which: str) -> None:
+    """What short drives say of their cameras is wrong in each its own way; held, it would bend and scale the map."""
+    drives = [
+        drive_along(street, folder / f"{which}{k}", WAYS[k], cameras_off_deg=0.15, bias_m=BIAS_M[k], seed=20 + k)
+        for k in range(2)
+    ]
+    before, after = adjusted(drives, "none"), adjusted(drives, which)
+    assert np.median(camera_errors_deg(before, drives)) > 0.1
+    assert 0 < np.median(camera_errors_deg(after, drives)) < 0.4 * np.median(camera_errors_deg(before, drives))
+    moved = after.model.state.camera_position_m - before.model.state.camera_position_m
+    assert 0 < np.abs(moved).max() < 0.003  # nothing was observed of where cameras sit
+    certain = [
+        replace(d, source=replace(d.source, calibration=d.source.calibration | {"adjusted": False})) for d in drives
+    ]
+    held = adjusted(certain, which)
+    np.testing.assert_array_equal(held.model.state.rig_from_cam, before.model.state.rig_from_cam)
+    assert 0 < mean_error_m(after, drives) < 0.7 * mean_error_m(held, drives)
+    assert np.median(after.model.errors_px) < np.median(held.model.errors_px)
+
+
+def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(street: Street, folder: Path) -> None:
+    drives = [drive_along(street, folder / f"said{k}", WAYS[k], cameras_off_deg=0.1, seed=30 + k) for k in range(2)]
+    assembly = Assembly(scenes=[d.source for d in drives])
+    state = assembly.state(np.stack([d.street_from_scene for d in drives]))
+    first = np.arange(len(assembly.registered)) < 3  # of the first drive's 7 units
+
+    def sigmas(free: np.ndarray) -> list[np.ndarray]:
+        found = calibration_priors(assembly, state, free, CONFIG.adjustment)
+        assert [prior.camera.tolist() for prior in found] == [[0, 1, 2, 3], [4, 5, 6, 7]][: len(found)]
+        return [prior.sigma for prior in found]
+
+    (some,), every = sigmas(first), sigmas(assembly.registered)
+    np.testing.assert_allclose(some[:, :3], np.radians(0.1) * np.sqrt(7 / 4), rtol=1e-6)
+    for sigma in every:
+        np.testing.assert_allclose(sigma[:, :3], np.radians(CONFIG.adjustment.sigma_rotation_deg))
+        np.testing.assert_allclose(sigma[:, 3:], 0.02 * CONFIG.adjustment.sigma_translation_m)
+    assert len(every) == 2
+    assert sigmas(~assembly.registered) == []
 
 
 def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:

@@ -52,6 +52,14 @@ def test_damage_is_said_by_name(folder: Path) -> None:
     with pytest.raises(InputError, match=r"scene one: .* is damaged"):
         read_scene(folder, "one")
     (folder / "model" / "points3D.bin").write_bytes(data)
+    calibration = json.loads((folder / "calibration.json").read_text()) | {"adjusted": True}
+    for wrong in (float("nan"), 0.0, "x"):
+        broken = json.loads(json.dumps(calibration))
+        next(iter(broken["cameras"].values()))["sigma"]["rotation_deg"][1] = wrong
+        (folder / "calibration.json").write_text(json.dumps(broken))
+        with pytest.raises(InputError, match=r"scene one: .*calibration.json is damaged"):
+            read_scene(folder, "one")
+    (folder / "calibration.json").write_text(json.dumps(calibration))
     frame = json.loads((folder / "frame.json").read_text())
     (folder / "frame.json").write_text(json.dumps({**frame, "version": 9}))
     with pytest.raises(InputError, match="is of version 9") as raised:

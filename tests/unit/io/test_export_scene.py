@@ -27,20 +27,22 @@ from export_example import (
 )
 
 from mrasfm_engine.errors import MrasfmError, StorageError
-from mrasfm_engine.geometry import geodesy
+from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io import (
     export_pictures,
     export_ply,
     feature_database,
     publishing,
 )
-from mrasfm_engine.io.export_calibration import calibration_document
+from mrasfm_engine.io.export_calibration import calibration_document, settled_document
 from mrasfm_engine.io.export_check import check_features
 from mrasfm_engine.io.export_scene import write_scene
 from mrasfm_engine.io.feature_database import write_features, write_matches
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
+from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.scene.scene import CalibrationVerdict, ImageFeatures, Scene
+from schemas import Pose
 from schemas.drive import MAX_IMAGE_SIDE_PX
 
 
@@ -462,3 +464,27 @@ def test_our_own_pictures_may_be_longer_than_camera_images() -> None:
     np.testing.assert_array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], picture)
     with pytest.raises(MrasfmError, match="cannot be made a PNG"):
         export_pictures.png_of(picture[:0])
+
+
+def test_a_calibration_that_settled_in_a_map(scene: Scene) -> None:
+    document = calibration_document(scene)
+    names = list(document["cameras"])
+    poses = {name: refined.rig_from_cam.copy() for name, refined in zip(names, scene.calibration, strict=True)}
+    found = {name: matrix_from_pose(Pose(**document["cameras"][name]["refined"]["rig_from_cam"])) for name in names}
+    assert settled_document(document, found) == document
+    turn = se3.exp_so3(np.radians([0.0, 0.3, 0.0]))
+    poses[names[0]] = se3.transform(turn @ found[names[0]][:3, :3], found[names[0]][:3, 3] + [0.01, 0.0, 0.0])
+    settled = settled_document(document, found | {names[0]: poses[names[0]]})
+    assert {name for name in names if settled["cameras"][name] != document["cameras"][name]} == {names[0]}
+    camera, before = settled["cameras"][names[0]], document["cameras"][names[0]]
+    assert camera["since_scene"]["rotation_vector_deg"] == pytest.approx([0.0, 0.3, 0.0], abs=1e-9)
+    assert camera["since_scene"]["translation_m"] == pytest.approx([0.01, 0.0, 0.0], abs=1e-12)
+    new, given = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("refined", "given"))
+    np.testing.assert_allclose(new, poses[names[0]], atol=1e-12)
+    change = camera["difference"]
+    turned = se3.exp_so3(np.radians(change["rotation_vector_deg"])) @ given[:3, :3]
+    np.testing.assert_allclose(turned, new[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(given[:3, 3] + change["translation_m"], new[:3, 3], atol=1e-12)
+    kept = ("sigma", "observed", "given", "verdict")
+    assert {key: camera[key] for key in kept} == {key: before[key] for key in kept}
+    assert change["focal_px"] == before["difference"]["focal_px"]

@@ -1,0 +1,63 @@
+"""What a map's last adjustment knows of every drive's calibration.
+
+Each drive has its own. A short one tells little of it, and the shape of its scene leans on that little: two scenes with
+calibrations a tenth of a degree off each their own way cannot both be rigid where they share points, and what gives way
+is scale. So calibrations settle with the units, as far as their scene left them uncertain.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.adjustment.priors import CameraPosePrior
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.config import AdjustmentConfig
+from mrasfm_engine.scene.state import State
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+HELD_SHARE = 0.02  # of its sigma that a direction may move which its drive did not observe
+
+
+def calibration_priors(
+    assembly: Assembly, state: State, free_units: Bools, config: AdjustmentConfig
+) -> list[CameraPosePrior]:
+    """What scenes say of their cameras, one prior for each drive whose calibration may settle.
+
+    They are the drives whose scenes refined it and that have units that vary. A scene's certainty rests on all its
+    units; observations of those that vary count in the adjustment anyway, so only the others' share is kept.
+
+    Parameters
+    ----------
+    state
+        With the calibrations that the scenes found.
+    free_units
+        Units (u,) that vary.
+    """
+    priors = []
+    for k, scene in enumerate(assembly.scenes):
+        units = assembly.scene_of_unit == k
+        vary = (free_units & units).sum() / max((assembly.registered & units).sum(), 1)
+        if not vary or scene.certainty_of_cameras is None:
+            continue
+        sigma, observed = scene.certainty_of_cameras
+        cameras = scene.drive.cameras
+        given = np.column_stack(
+            [
+                np.radians([camera.sigma_rotation_deg or config.sigma_rotation_deg for camera in cameras]),
+                [camera.sigma_translation_m or config.sigma_translation_m for camera in cameras],
+            ]
+        ).repeat(3, axis=1)
+        known = np.minimum(sigma / np.sqrt(max(1.0 - vary, 1e-12)), given)
+        number = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
+        priors.append(
+            CameraPosePrior(
+                camera=number,
+                rotation=state.camera_rotation[number],
+                position_m=state.camera_position_m[number],
+                sigma=np.where(observed, known, HELD_SHARE * given),
+            )
+        )
+    return priors
