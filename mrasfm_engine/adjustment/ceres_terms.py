@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 # Residuals (n,) of some blocks, and their derivatives in each of them: (n, 6) of poses, (n, size) of all else.
 Function = Callable[[list[Floats]], tuple[Floats, list[Floats]]]
@@ -170,7 +171,8 @@ def _calibration(term: priors.CalibrationPrior, handed: CeresProblem) -> Iterato
         handed,
         cameras=np.arange(count),
         given=se3.transform(term.rotation, term.position_m),
-        own_weight=1.0 / np.where(held, priors.HELD_SHARE * sigma, sigma),
+        sigma=sigma,
+        held=held,
         gauge_weight=np.sqrt(priors.GAUGE_STIFFNESS * count) * (share / share.sum())[:, None] / sigma,
         loss_scale=term.loss_scale,
     )
@@ -182,16 +184,24 @@ def _camera_poses(term: priors.CameraPosePrior, handed: CeresProblem) -> Iterato
         handed,
         cameras=term.camera,
         given=se3.transform(term.rotation, term.position_m),
-        own_weight=1.0 / term.sigma,
+        sigma=term.sigma,
+        held=term.held,
         gauge_weight=np.sqrt(priors.GAUGE_STIFFNESS / len(term.camera)) / term.sigma,
         loss_scale=term.loss_scale,
     )
 
 
 def _rig(
-    handed: CeresProblem, *, cameras: Ints, given: Floats, own_weight: Floats, gauge_weight: Floats, loss_scale: float
+    handed: CeresProblem,
+    *,
+    cameras: Ints,
+    given: Floats,
+    sigma: Floats,
+    held: Bools,
+    gauge_weight: Floats,
+    loss_scale: float,
 ) -> Iterator[Residuals]:
-    """Corrections of a rig's free cameras by themselves, weighted by direction (n, 6), and their sum with all others'."""
+    """Corrections of a rig's free cameras by themselves, over their sigmas (n, 6), and their sum with all others'."""
     slot = handed.problem.layout.camera_slot[cameras]
     correction = partial(_correction, rig_from_reference=handed.rig_from_reference)
     free, blocks, offset = np.flatnonzero(slot >= 0), [], np.zeros(6)
@@ -199,8 +209,10 @@ def _rig(
         offset += gauge_weight[k] * _difference(handed.problem.state.rig_from_cam[cameras[k]], given[k])
     for k in free.tolist():
         blocks.append(handed.camera_pose(int(cameras[k])))
-        function = partial(_weighted_sum, given=given[[k]], weight=own_weight[[k]], correction=correction)
-        yield Residuals(function=function, count=6, blocks=[blocks[-1]], loss_scale=loss_scale)
+        for directions, share, loss in ((~held[k], 1.0, loss_scale), (held[k], priors.HELD_SHARE, None)):
+            weight = np.where(directions, 1.0 / (share * sigma[k]), 0.0)[None]
+            function = partial(_weighted_sum, given=given[[k]], weight=weight, correction=correction)
+            yield Residuals(function=function, count=6, blocks=[blocks[-1]], loss_scale=loss)
     if len(free):
         function = partial(
             _weighted_sum, given=given[free], weight=gauge_weight[free], correction=correction, offset=offset

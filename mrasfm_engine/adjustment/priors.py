@@ -44,7 +44,7 @@ class CalibrationPrior:
     """Keeps `rig_from_cam` near what was given, and holds the gauge between cameras and units.
 
     Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes, with a
-    Cauchy loss. Moving all cameras by one transform and all units by its inverse changes no image: the weighted mean
+    Cauchy loss over those that are not held: what is held comes back from wherever it has got. Moving all cameras by one transform and all units by its inverse changes no image: the weighted mean
     correction of all cameras is held at zero. The weights stay fixed during a solve, so that the gauge is linear; they
     are renewed from the corrections between solves, see `robust_gauge_weights`.
     """
@@ -72,10 +72,11 @@ class CalibrationPrior:
 
     def _own(self, whitened: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Every camera's own residuals, without the gauge, and the sigmas in them."""
-        if self.held is None:
-            return whitened, sigma
-        share = np.where(self.held, HELD_SHARE, 1.0)
+        share = np.where(self._held(), HELD_SHARE, 1.0)
         return whitened / share, sigma * share
+
+    def _held(self) -> Bools:
+        return np.zeros((len(self.rotation), 6), dtype=np.bool_) if self.held is None else self.held
 
     def _gauge(self) -> Floats:
         w = np.ones(len(self.rotation)) if self.gauge_weights is None else self.gauge_weights
@@ -85,8 +86,7 @@ class CalibrationPrior:
     def cost(self, state: State) -> float:
         """See `Term`."""
         r, sigma = self._whitened(state)
-        s2 = self.loss_scale**2
-        own = 0.5 * s2 * np.log1p((self._own(r, sigma)[0] ** 2).sum(1) / s2).sum()
+        own = _cost_of_own(self._own(r, sigma)[0], self._held(), self.loss_scale)
         return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
@@ -96,7 +96,8 @@ class CalibrationPrior:
         own, own_sigma = self._own(r, sigma)
         step = _derivatives_of_corrections(r * sigma)
         rows = _rows_of(layout, cameras)
-        _add_own(extra, rows, (step / own_sigma[:, :, None])[cameras], own[cameras], self.loss_scale)
+        weights = _weights_of_own(own, self._held(), self.loss_scale)[cameras]
+        _add_own(extra, rows, (step / own_sigma[:, :, None])[cameras], own[cameras], weights)
         _add_gauge(extra, rows, (step / sigma[:, :, None])[cameras], self._gauge()[cameras], self._gauge() @ r)
 
 
@@ -112,10 +113,23 @@ def _derivatives_of_corrections(corrections: Floats) -> Floats:
     return step
 
 
-def _add_own(extra: Extra, rows: Ints, j: Floats, r: Floats, loss_scale: float) -> None:
-    """Add every camera's own residuals (n, 6) with derivatives (n, 6, 6), and a Cauchy loss over all six."""
-    w = 1.0 / (1.0 + (r**2).sum(1) / loss_scale**2)
-    j_w = np.swapaxes(w[:, None, None] * j, 1, 2)
+def _cost_of_own(r: Floats, held: Bools, loss_scale: float) -> float:
+    """Of cameras' own residuals (n, 6): a Cauchy loss over those of a camera that are not held, and squares of others."""
+    s2 = loss_scale**2
+    loose, firm = ((np.where(mask, r, 0.0) ** 2).sum(1) for mask in (~held, held))
+    return float(0.5 * (s2 * np.log1p(loose / s2) + firm).sum())
+
+
+def _weights_of_own(r: Floats, held: Bools, loss_scale: float) -> Floats:
+    """The loss's weights (n, 6)."""
+    loose = (np.where(held, 0.0, r) ** 2).sum(1, keepdims=True)
+    result: Floats = np.where(held, 1.0, 1.0 / (1.0 + loose / loss_scale**2))
+    return result
+
+
+def _add_own(extra: Extra, rows: Ints, j: Floats, r: Floats, weights: Floats) -> None:
+    """Add every camera's own residuals (n, 6) with derivatives (n, 6, 6) and weights (n, 6)."""
+    j_w = np.swapaxes(weights[:, :, None] * j, 1, 2)
     extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
     extra.camera_gradient[rows] += (j_w @ r[:, :, None])[:, :, 0]
 
@@ -150,7 +164,7 @@ class CameraPosePrior:
     """Keeps the cameras of one rig near where an earlier adjustment found them, direction by direction.
 
     Residuals of a camera: rotation vector of R R_found' and t - t_found over their sigmas, in rig axes, with a Cauchy
-    loss over all six. The gauge between cameras and units is as in `CalibrationPrior`: the cameras' mean residual is
+    loss over those that are not held. The gauge between cameras and units is as in `CalibrationPrior`: the cameras' mean residual is
     held at zero.
     """
 
@@ -158,30 +172,36 @@ class CameraPosePrior:
     rotation: Floats  # (n, 3, 3)
     position_m: Floats  # (n, 3)
     sigma: Floats  # (n, 6) rotation (rad), translation (m)
+    held: Bools  # (n, 6) directions that hardly vary: their residuals are multiplied
     loss_scale: float = 3.0
 
-    def _residuals(self, state: State) -> Floats:
+    def _whitened(self, state: State) -> Floats:
         turn = se3.log_so3(state.camera_rotation[self.camera] @ np.swapaxes(self.rotation, 1, 2))
         moved = state.camera_position_m[self.camera] - self.position_m
         result: Floats = np.concatenate([turn, moved], axis=1) / self.sigma
         return result
+
+    def _share(self) -> Floats:
+        return np.where(self.held, HELD_SHARE, 1.0)
 
     def _gauge(self) -> Floats:
         return np.full(len(self.camera), len(self.camera) ** -0.5)
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        r, s2 = self._residuals(state), self.loss_scale**2
-        own = 0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum()
+        r = self._whitened(state)
+        own = _cost_of_own(r / self._share(), self.held, self.loss_scale)
         return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        r, gauge = self._residuals(state), self._gauge()
+        r, gauge = self._whitened(state), self._gauge()
         free = np.flatnonzero(layout.camera_slot[self.camera] >= 0)
         rows = _rows_of(layout, self.camera[free])
         j = (_derivatives_of_corrections(r * self.sigma) / self.sigma[:, :, None])[free]
-        _add_own(extra, rows, j, r[free], self.loss_scale)
+        own = r / self._share()
+        weights = _weights_of_own(own, self.held, self.loss_scale)
+        _add_own(extra, rows, j / self._share()[free, :, None], own[free], weights[free])
         _add_gauge(extra, rows, j, gauge[free], gauge @ r)
 
 

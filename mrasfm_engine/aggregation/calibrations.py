@@ -18,9 +18,6 @@ from mrasfm_engine.scene.state import State
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-HELD_SHARE = 0.02  # of its sigma that a direction may move which its drive did not observe
-
-
 def calibration_priors(
     assembly: Assembly, state: State, free_units: Bools, config: AdjustmentConfig
 ) -> list[CameraPosePrior]:
@@ -57,7 +54,8 @@ def calibration_priors(
                 camera=number,
                 rotation=state.camera_rotation[number],
                 position_m=state.camera_position_m[number],
-                sigma=np.where(observed, known, HELD_SHARE * given),
+                sigma=np.where(observed, known, given),
+                held=~observed,
             )
         )
     return priors

@@ -138,12 +138,13 @@ def fixed_cameras_share_the_gauge(rng: Rng) -> Problem:
 def poses_of_cameras(rng: Rng) -> Problem:
     """Two of three vary, held direction by direction, and all together, by what was found before."""
     problem = problem_at_truth(rng, units=[False] + [True] * 5, cameras=[True, False, True])
-    found = perturbed(problem.state, rng, cameras=range(CAMERAS), camera_deg=0.05, camera_m=0.005, point_m=0.0)
+    found = perturbed(problem.state, rng, cameras=range(CAMERAS), camera_deg=0.02, camera_m=0.002, point_m=0.0)
     prior = CameraPosePrior(
         camera=np.arange(CAMERAS),
         rotation=found.camera_rotation,
         position_m=found.camera_position_m,
         sigma=np.column_stack([np.radians(rng.uniform(0.01, 0.1, (CAMERAS, 3))), rng.uniform(1e-3, 1e-2, (CAMERAS, 3))]),
+        held=rng.random((CAMERAS, 6)) < 0.3,
     )
     return started(problem, rng, terms=[prior])
 

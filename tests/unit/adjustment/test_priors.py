@@ -87,7 +87,9 @@ def test_camera_pose_prior_holds_each_direction_by_its_own_sigma_and_the_gauge_b
         rotation=case.truth.camera_rotation[chosen],
         position_m=case.truth.camera_position_m[chosen],
         sigma=sigma,
+        held=np.zeros((4, 6), dtype=np.bool_),
     )
+    check_gradient(replace(prior, held=rng.random((4, 6)) < 0.4), case, state)
     h = check_gradient(prior, case, state)
     other = int(case.problem.layout.camera_offsets(np.array([1]))[0])
     assert np.abs(h[other : other + 7]).max() == 0
@@ -225,6 +227,20 @@ def test_calibration_prior_of_held_directions(monkeypatch: pytest.MonkeyPatch) -
     pull = np.diagonal(h)[18:24]
     assert held[0, 3:].tolist() == [True, False, False]
     assert 0.9 / 0.02**2 < pull[3] / pull[4] < 1.1 / 0.02**2
+
+
+def test_what_is_held_comes_back_from_wherever_it_has_got() -> None:
+    """A camera that images of a short drive have made slide 0.3 m ahead is no outlier that its prior gives up."""
+    case = make_case(units=UNITS, cameras=CAMERAS, points=120, free_units=[False] * UNITS, free_cameras=[True] * CAMERAS)
+    given = case.truth.camera_position_m.copy()
+    given[2, 0] -= 0.3
+    prior = replace(calibration_prior(case.truth), position_m=given).with_weights(case.truth)
+    doubtful = replace(case.problem.options, sigma_px=2.0)
+    loose, _ = solve(replace(case.problem, terms=[prior], options=doubtful))
+    assert loose.camera_position_m[2, 0] > given[2, 0] + 0.2
+    held = np.repeat([[False, True]], 3, axis=1).repeat(CAMERAS, axis=0)
+    solution, _ = solve(replace(case.problem, state=loose, terms=[replace(prior, held=held)], options=doubtful))
+    assert np.abs(solution.camera_position_m - given).max() < 0.01
 
 
 def test_calibration_priors_gauge() -> None:

@@ -261,13 +261,14 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
     def sigmas(free: np.ndarray) -> list[np.ndarray]:
         found = calibration_priors(assembly, state, free, CONFIG.adjustment)
         assert [prior.camera.tolist() for prior in found] == [[0, 1, 2, 3], [4, 5, 6, 7]][: len(found)]
+        assert all((prior.held == np.repeat([False, True], 3)).all() for prior in found)
         return [prior.sigma for prior in found]
 
     (some,), every = sigmas(first), sigmas(assembly.registered)
     np.testing.assert_allclose(some[:, :3], np.radians(0.1) * np.sqrt(7 / 4), rtol=1e-6)
     for sigma in every:
         np.testing.assert_allclose(sigma[:, :3], np.radians(CONFIG.adjustment.sigma_rotation_deg))
-        np.testing.assert_allclose(sigma[:, 3:], 0.02 * CONFIG.adjustment.sigma_translation_m)
+        np.testing.assert_allclose(sigma[:, 3:], CONFIG.adjustment.sigma_translation_m)
     assert len(every) == 2
     assert sigmas(~assembly.registered) == []
 
