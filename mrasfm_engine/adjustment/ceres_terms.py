@@ -138,7 +138,9 @@ def _upright(term: priors.UprightPrior, handed: CeresProblem) -> Iterator[Residu
     for u in term.unit.tolist():
         if handed.problem.layout.unit_slot[u] >= 0:
             axes = handed.reference_from_unit[u][:3, [1, 0]].T
-            yield Residuals(function=partial(_heights, axes=axes, up=term.up, sigma=sigma), count=2, blocks=[handed.unit_pose(u)])
+            yield Residuals(
+                function=partial(_heights, axes=axes, up=term.up, sigma=sigma), count=2, blocks=[handed.unit_pose(u)]
+            )
 
 
 def _heights(blocks: list[Floats], *, axes: Floats, up: Floats, sigma: Floats) -> tuple[Floats, list[Floats]]:

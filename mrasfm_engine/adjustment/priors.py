@@ -44,9 +44,10 @@ class CalibrationPrior:
     """Keeps `rig_from_cam` near what was given, and holds the gauge between cameras and units.
 
     Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes, with a
-    Cauchy loss over those that are not held: what is held comes back from wherever it has got. Moving all cameras by one transform and all units by its inverse changes no image: the weighted mean
-    correction of all cameras is held at zero. The weights stay fixed during a solve, so that the gauge is linear; they
-    are renewed from the corrections between solves, see `robust_gauge_weights`.
+    Cauchy loss over those that are not held: what is held comes back from wherever it has got. Moving all cameras by
+    one transform and all units by its inverse changes no image: the weighted mean correction of all cameras is held at
+    zero. The weights stay fixed during a solve, so that the gauge is linear; they are renewed from the corrections
+    between solves, see `robust_gauge_weights`.
     """
 
     rotation: Floats  # (c, 3, 3) given
@@ -114,7 +115,7 @@ def _derivatives_of_corrections(corrections: Floats) -> Floats:
 
 
 def _cost_of_own(r: Floats, held: Bools, loss_scale: float) -> float:
-    """Of cameras' own residuals (n, 6): a Cauchy loss over those of a camera that are not held, and squares of others."""
+    """Of cameras' own residuals (n, 6): a Cauchy loss over those of a camera that are not held, squares of the rest."""
     s2 = loss_scale**2
     loose, firm = ((np.where(mask, r, 0.0) ** 2).sum(1) for mask in (~held, held))
     return float(0.5 * (s2 * np.log1p(loose / s2) + firm).sum())
@@ -164,8 +165,8 @@ class CameraPosePrior:
     """Keeps the cameras of one rig near where an earlier adjustment found them, direction by direction.
 
     Residuals of a camera: rotation vector of R R_found' and t - t_found over their sigmas, in rig axes, with a Cauchy
-    loss over those that are not held. The gauge between cameras and units is as in `CalibrationPrior`: the cameras' mean residual is
-    held at zero.
+    loss over those that are not held. The gauge between cameras and units is as in `CalibrationPrior`: the cameras'
+    mean residual is held at zero.
     """
 
     camera: Ints  # (n,) all cameras of the rig

@@ -18,6 +18,7 @@ from mrasfm_engine.scene.state import State
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+
 def calibration_priors(
     assembly: Assembly, state: State, free_units: Bools, config: AdjustmentConfig
 ) -> list[CameraPosePrior]:

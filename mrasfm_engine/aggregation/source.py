@@ -104,8 +104,8 @@ class SourceScene:
 
     @cached_property
     def certainty_of_cameras(self) -> tuple[Floats, Bools] | None:
-        """Sigmas (c, 6) of `rig_from_cam`, rotation (rad) and translation (m) in rig axes, and which of these directions
-        the drive observed; None where the calibration was not refined.
+        """Sigmas (c, 6) of `rig_from_cam`, rotation (rad) and translation (m) in rig axes, and which of them the drive
+        observed; None where the calibration was not refined.
         """
         if self.calibration.get("adjusted") is not True:
             return None

@@ -11,7 +11,14 @@ import pytest
 from small_problems import make_case, perturbed, project
 
 from mrasfm_engine.adjustment.ceres_reference import CeresProblem, solve_with_ceres
-from mrasfm_engine.adjustment.priors import CalibrationPrior, CameraPosePrior, FocalPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.adjustment.priors import (
+    CalibrationPrior,
+    CameraPosePrior,
+    FocalPrior,
+    PositionPrior,
+    Term,
+    UprightPrior,
+)
 from mrasfm_engine.adjustment.problem import Layout, ShotMotion
 from mrasfm_engine.adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.adjustment.unit_sets import UnitSets
@@ -143,7 +150,9 @@ def poses_of_cameras(rng: Rng) -> Problem:
         camera=np.arange(CAMERAS),
         rotation=found.camera_rotation,
         position_m=found.camera_position_m,
-        sigma=np.column_stack([np.radians(rng.uniform(0.01, 0.1, (CAMERAS, 3))), rng.uniform(1e-3, 1e-2, (CAMERAS, 3))]),
+        sigma=np.column_stack(
+            [np.radians(rng.uniform(0.01, 0.1, (CAMERAS, 3))), rng.uniform(1e-3, 1e-2, (CAMERAS, 3))]
+        ),
         held=rng.random((CAMERAS, 6)) < 0.3,
     )
     return started(problem, rng, terms=[prior])

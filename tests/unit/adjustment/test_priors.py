@@ -231,7 +231,9 @@ def test_calibration_prior_of_held_directions(monkeypatch: pytest.MonkeyPatch) -
 
 def test_what_is_held_comes_back_from_wherever_it_has_got() -> None:
     """A camera that images of a short drive have made slide 0.3 m ahead is no outlier that its prior gives up."""
-    case = make_case(units=UNITS, cameras=CAMERAS, points=120, free_units=[False] * UNITS, free_cameras=[True] * CAMERAS)
+    case = make_case(
+        units=UNITS, cameras=CAMERAS, points=120, free_units=[False] * UNITS, free_cameras=[True] * CAMERAS
+    )
     given = case.truth.camera_position_m.copy()
     given[2, 0] -= 0.3
     prior = replace(calibration_prior(case.truth), position_m=given).with_weights(case.truth)

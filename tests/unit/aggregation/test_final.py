@@ -23,8 +23,8 @@ from small_scenes import (
 )
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.calibrations import calibration_priors
 from mrasfm_engine.aggregation.association import coarse_transform
+from mrasfm_engine.aggregation.calibrations import calibration_priors
 from mrasfm_engine.aggregation.final import FinalResult, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.geometry import se3
