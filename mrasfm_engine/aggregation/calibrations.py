@@ -18,6 +18,8 @@ from mrasfm_engine.scene.state import State
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+MAX_PAIRS = 1_000_000  # of cameras and units that vary: the solver couples each with each, in 336 bytes a pair
+
 
 def calibration_priors(
     assembly: Assembly, state: State, free_units: Bools, config: AdjustmentConfig
@@ -25,7 +27,8 @@ def calibration_priors(
     """What scenes say of their cameras, one prior for each drive whose calibration may settle.
 
     They are the drives whose scenes refined it and that have units that vary. A scene's certainty rests on all its
-    units; observations of those that vary count in the adjustment anyway, so only the others' share is kept.
+    units; observations of those that vary count in the adjustment anyway, so only the others' share is kept. In a map
+    of very many drives calibrations stay as their scenes found them.
 
     Parameters
     ----------
@@ -59,4 +62,5 @@ def calibration_priors(
                 held=~observed,
             )
         )
-    return priors
+    pairs = sum(len(prior.camera) for prior in priors) * int(free_units.sum())
+    return priors if pairs <= MAX_PAIRS else []

@@ -55,6 +55,7 @@ class FinalResult:
     positions: dict[int, DrivePositions]  # by scene
     reports: tuple[Report, ...]
     free_units: int
+    free_cameras: int
     dropped_observations: int
     dropped_points: int
 
@@ -129,6 +130,7 @@ def adjust_map(
         positions=positions,
         reports=tuple(reports),
         free_units=int(free.sum()),
+        free_cameras=int(cameras.sum()),
         dropped_observations=observations,
         dropped_points=points_dropped,
     )

@@ -186,6 +186,7 @@ def _final(
         "adjustment",
         started,
         free_units=final.free_units,
+        free_cameras=final.free_cameras,
         iterations=[r.iterations for r in final.reports],
         points=len(final.model.state.points_m),
         joined_points=int(final.model.joined.sum()),

@@ -22,6 +22,7 @@ from small_scenes import (
     shared_points,
 )
 
+from mrasfm_engine.aggregation import calibrations
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
 from mrasfm_engine.aggregation.calibrations import calibration_priors
@@ -239,6 +240,7 @@ def test_calibrations_settle_as_far_as_scenes_left_them_uncertain(street: Street
         for k in range(2)
     ]
     before, after = adjusted(drives, "none"), adjusted(drives, which)
+    assert (before.free_cameras, after.free_cameras) == (0, 8)
     assert np.median(camera_errors_deg(before, drives)) > 0.1
     assert 0 < np.median(camera_errors_deg(after, drives)) < 0.4 * np.median(camera_errors_deg(before, drives))
     moved = after.model.state.camera_position_m - before.model.state.camera_position_m
@@ -252,7 +254,9 @@ def test_calibrations_settle_as_far_as_scenes_left_them_uncertain(street: Street
     assert np.median(after.model.errors_px) < np.median(held.model.errors_px)
 
 
-def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(street: Street, folder: Path) -> None:
+def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
+    street: Street, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drives = [drive_along(street, folder / f"said{k}", WAYS[k], cameras_off_deg=0.1, seed=30 + k) for k in range(2)]
     assembly = Assembly(scenes=[d.source for d in drives])
     state = assembly.state(np.stack([d.street_from_scene for d in drives]))
@@ -271,6 +275,10 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
         np.testing.assert_allclose(sigma[:, 3:], CONFIG.adjustment.sigma_translation_m)
     assert len(every) == 2
     assert sigmas(~assembly.registered) == []
+    monkeypatch.setattr(calibrations, "MAX_PAIRS", 8 * 14)
+    assert len(sigmas(assembly.registered)) == 2
+    monkeypatch.setattr(calibrations, "MAX_PAIRS", 8 * 14 - 1)
+    assert sigmas(assembly.registered) == []
 
 
 def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:
