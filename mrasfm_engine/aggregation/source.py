@@ -105,11 +105,12 @@ class SourceScene:
     @cached_property
     def certainty_of_cameras(self) -> tuple[Floats, Bools] | None:
         """Sigmas (c, 6) of `rig_from_cam`, rotation (rad) and translation (m) in rig axes, and which of them the drive
-        observed; None where the calibration was not refined.
+        observed; None where the calibration was not refined, or how certain it is is not known.
         """
-        if self.calibration.get("adjusted") is not True:
-            return None
         found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
+        known_of_all = all({"rotation_deg", "translation_m"} <= camera["sigma"].keys() for camera in found)
+        if self.calibration.get("adjusted") is not True or not known_of_all:
+            return None
         sigma = [[*np.radians(c["sigma"]["rotation_deg"]), *c["sigma"]["translation_m"]] for c in found]
         observed = [[*c["observed"]["rotation"], *c["observed"]["translation"]] for c in found]
         sigmas, known = np.array(sigma, dtype=np.float64), np.array(observed, dtype=np.bool_)

@@ -53,13 +53,20 @@ def test_damage_is_said_by_name(folder: Path) -> None:
         read_scene(folder, "one")
     (folder / "model" / "points3D.bin").write_bytes(data)
     calibration = json.loads((folder / "calibration.json").read_text()) | {"adjusted": True}
+    for camera in calibration["cameras"].values():
+        camera["sigma"] = {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
     for wrong in (float("nan"), 0.0, "x"):
         broken = json.loads(json.dumps(calibration))
         next(iter(broken["cameras"].values()))["sigma"]["rotation_deg"][1] = wrong
         (folder / "calibration.json").write_text(json.dumps(broken))
         with pytest.raises(InputError, match=r"scene one: .*calibration.json is damaged"):
             read_scene(folder, "one")
+    unknown = json.loads(json.dumps(calibration))
+    next(iter(unknown["cameras"].values()))["sigma"] = {}
+    (folder / "calibration.json").write_text(json.dumps(unknown))
+    assert read_scene(folder, "one").certainty_of_cameras is None
     (folder / "calibration.json").write_text(json.dumps(calibration))
+    assert read_scene(folder, "one").certainty_of_cameras is not None
     frame = json.loads((folder / "frame.json").read_text())
     (folder / "frame.json").write_text(json.dumps({**frame, "version": 9}))
     with pytest.raises(InputError, match="is of version 9") as raised:
