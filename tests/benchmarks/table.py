@@ -34,7 +34,7 @@ class Figure:
 
     @property
     def passed(self) -> bool:
-        return self.most is None or (math.isfinite(self.value) and self.above < self.value <= self.most)
+        return self.most is None or bool(math.isfinite(self.value) and self.above < self.value <= self.most)
 
     @property
     def bound(self) -> str:
@@ -72,6 +72,6 @@ def save(figures: Sequence[Figure], path: Path, about: dict[str, Any]) -> None:
     rows = [{**asdict(f), "passed": f.passed if f.bounded else None} for f in figures]
     for row in rows:
         for key in ("value", "most"):
-            row[key] = row[key] if row[key] is not None and math.isfinite(row[key]) else None
+            row[key] = float(row[key]) if row[key] is not None and math.isfinite(row[key]) else None
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({**about, "figures": rows}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
