@@ -24,6 +24,10 @@ from mrasfm_engine.geometry import se3
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+# Of the pair that the incremental mapper begins with. Cameras that look ahead have few that reach COLMAP's 16 deg, and
+# where its own relaxation finds none either, it begins again with this.
+SMALL_INITIAL_ANGLE_DEG = 4.0
+
 
 class Mapper(StrEnum):
     """Which of COLMAP's mappers, and what it is told about the calibration it gets."""
@@ -41,7 +45,8 @@ class PeerResult:
     Attributes
     ----------
     seconds
-        Of mapping alone, from the database to the model; NaN where there is no model.
+        Of mapping alone, from the database to the model; NaN where there is no model. Of a search for an initial pair
+        that finds none, only what follows it.
     registered_images
         Of the largest model, where there are several.
     world_from_rig
@@ -119,7 +124,12 @@ def _map(progress: Progress, folder: Path, mapper: Mapper, threads: int) -> Peer
     if mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
         models = pycolmap.global_mapping(database, folder, out, _global_options(mapper, threads))
     else:
-        models = pycolmap.incremental_mapping(database, folder, out, _incremental_options(mapper, threads))
+        options = _incremental_options(mapper, threads)
+        models = pycolmap.incremental_mapping(database, folder, out, options)
+        if not models:
+            options.mapper.init_min_tri_angle = SMALL_INITIAL_ANGLE_DEG
+            started = time.perf_counter()  # the search in vain is not held against it
+            models = pycolmap.incremental_mapping(database, folder, out, options)
     seconds = time.perf_counter() - started
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     return PeerResult(
