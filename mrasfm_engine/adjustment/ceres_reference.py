@@ -166,6 +166,8 @@ class CeresProblem:
         add_terms = _ceres_terms().add_terms
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, self.reconstruction)
         for c in np.flatnonzero(self.problem.layout.camera_slot >= 0).tolist() if self.reference is None else ():
+            if not adjuster.problem.has_parameter_block(self.camera_pose(c)):
+                raise ValueError(f"no image of camera {c} observes anything: COLMAP does not vary it")
             adjuster.problem.set_parameter_block_variable(self.camera_pose(c))
         self.residuals += add_terms(self, adjuster.problem)
         return adjuster

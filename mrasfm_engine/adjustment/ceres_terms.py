@@ -188,7 +188,9 @@ def _camera_poses(term: priors.CameraPosePrior, handed: CeresProblem) -> Iterato
         given=se3.transform(term.rotation, term.position_m),
         sigma=term.sigma,
         held=term.held,
-        gauge_weight=np.sqrt(priors.GAUGE_STIFFNESS / len(term.camera)) / term.sigma,
+        gauge_weight=np.tile(
+            np.sqrt(priors.GAUGE_STIFFNESS / len(term.camera)) / term.sigma.max(0), (len(term.camera), 1)
+        ),
         loss_scale=term.loss_scale,
     )
 

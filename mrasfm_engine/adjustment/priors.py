@@ -99,7 +99,9 @@ class CalibrationPrior:
         rows = _rows_of(layout, cameras)
         weights = _weights_of_own(own, self._held(), self.loss_scale)[cameras]
         _add_own(extra, rows, (step / own_sigma[:, :, None])[cameras], own[cameras], weights)
-        _add_gauge(extra, rows, (step / sigma[:, :, None])[cameras], self._gauge()[cameras], self._gauge() @ r)
+        gauge = self._gauge()
+        shares = gauge[cameras, None].repeat(6, axis=1)
+        _add_gauge(extra, rows, (step / sigma[:, :, None])[cameras], shares, gauge @ r)
 
 
 def _rows_of(layout: Layout, cameras: Ints) -> Ints:
@@ -136,10 +138,10 @@ def _add_own(extra: Extra, rows: Ints, j: Floats, r: Floats, weights: Floats) ->
 
 
 def _add_gauge(extra: Extra, rows: Ints, j: Floats, weights: Floats, mean: Floats) -> None:
-    """Add the weighted mean (6,) of residuals, to which cameras (n,) contribute with derivatives (n, 6, 6)."""
+    """Add the mean (6,) of residuals, in which cameras have weights (n, 6) and derivatives (n, 6, 6)."""
     if not len(rows):
         return
-    together = np.concatenate(np.sqrt(GAUGE_STIFFNESS) * weights[:, None, None] * j, axis=1)  # (6, 6 n)
+    together = np.concatenate(np.sqrt(GAUGE_STIFFNESS) * weights[:, :, None] * j, axis=1)  # (6, 6 n)
     extra.cameras[np.ix_(rows.ravel(), rows.ravel())] += together.T @ together
     extra.camera_gradient[rows.ravel()] += np.sqrt(GAUGE_STIFFNESS) * together.T @ mean
 
@@ -165,8 +167,8 @@ class CameraPosePrior:
     """Keeps the cameras of one rig near where an earlier adjustment found them, direction by direction.
 
     Residuals of a camera: rotation vector of R R_found' and t - t_found over their sigmas, in rig axes, with a Cauchy
-    loss over those that are not held. The gauge between cameras and units is as in `CalibrationPrior`: the cameras'
-    mean residual is held at zero.
+    loss over those that are not held. The gauge between cameras and units: the cameras' mean correction is held at
+    zero. It is a plain mean, in which no camera stands for the rig because more is known of it.
     """
 
     camera: Ints  # (n,) all cameras of the rig
@@ -186,13 +188,15 @@ class CameraPosePrior:
         return np.where(self.held, HELD_SHARE, 1.0)
 
     def _gauge(self) -> Floats:
-        return np.full(len(self.camera), len(self.camera) ** -0.5)
+        """Weights (n, 6) of whitened corrections in their mean, which is in parts of the largest sigma."""
+        result: Floats = self.sigma / self.sigma.max(0) / np.sqrt(len(self.camera))
+        return result
 
     def cost(self, state: State) -> float:
         """See `Term`."""
         r = self._whitened(state)
         own = _cost_of_own(r / self._share(), self.held, self.loss_scale)
-        return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
+        return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() * r).sum(0) ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
@@ -203,7 +207,7 @@ class CameraPosePrior:
         own = r / self._share()
         weights = _weights_of_own(own, self.held, self.loss_scale)
         _add_own(extra, rows, j / self._share()[free, :, None], own[free], weights[free])
-        _add_gauge(extra, rows, j, gauge[free], gauge @ r)
+        _add_gauge(extra, rows, j, gauge[free], (gauge * r).sum(0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,8 @@ is scale. So calibrations settle with the units, as far as their scene left them
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +20,7 @@ from mrasfm_engine.scene.state import State
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-MAX_PAIRS = 1_000_000  # of cameras and units that vary: the solver couples each with each, in 336 bytes a pair
+MAX_COUPLINGS = 500_000  # of cameras that vary with units and with one another: the solver holds some 400 bytes of each
 
 
 def calibration_priors(
@@ -28,7 +30,7 @@ def calibration_priors(
 
     They are the drives whose scenes refined it and that have units that vary. A scene's certainty rests on all its
     units; observations of those that vary count in the adjustment anyway, so only the others' share is kept. In a map
-    of very many drives calibrations stay as their scenes found them.
+    of very many drives calibrations stay as their scenes found them, as they do where the settings hold them.
 
     Parameters
     ----------
@@ -37,6 +39,8 @@ def calibration_priors(
     free_units
         Units (u,) that vary.
     """
+    if not config.refine_calibration:
+        return []
     priors = []
     for k, scene in enumerate(assembly.scenes):
         units = assembly.scene_of_unit == k
@@ -62,5 +66,10 @@ def calibration_priors(
                 held=~observed,
             )
         )
-    pairs = sum(len(prior.camera) for prior in priors) * int(free_units.sum())
-    return priors if pairs <= MAX_PAIRS else []
+    return priors if couplings(priors, free_units) <= MAX_COUPLINGS else []
+
+
+def couplings(priors: Sequence[CameraPosePrior], free_units: Bools) -> int:
+    """How many pairs of a camera that varies and a unit, or another camera, the solver has to hold."""
+    cameras = sum(len(prior.camera) for prior in priors)
+    return cameras * (int(free_units.sum()) + cameras)

@@ -122,8 +122,7 @@ def adjust_map(
         points[seen] = solution.points_m
         problem = replace(problem, state=replace(solution, points_m=points))
         positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
-    if cameras.any():  # what only fixed units see follows their calibration
-        problem = replace(problem, state=problem.with_points_settled(problem.state))
+    problem = _fixed_units_settled(problem, free, cameras)
     model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
     return FinalResult(
         model=model,
@@ -134,6 +133,21 @@ def adjust_map(
         dropped_observations=observations,
         dropped_points=points_dropped,
     )
+
+
+def _fixed_units_settled(problem: Problem, free_units: Bools, free_cameras: Bools) -> Problem:
+    """The problem with points that only fixed units see where these units' calibration has got; all others stay."""
+    o, varied = problem.observations, np.zeros(problem.observations.num_points, dtype=np.bool_)
+    varied[o.point[free_units[o.unit]]] = True
+    follow = np.zeros_like(varied)
+    follow[o.point[free_cameras[o.camera]]] = True
+    follow &= ~varied
+    if not follow.any():
+        return problem
+    part = problem.of_points(follow)
+    points = problem.state.points_m.copy()
+    points[follow] = part.with_points_settled(part.state).points_m
+    return replace(problem, state=replace(problem.state, points_m=points))
 
 
 def _options(config: EngineConfig) -> SolverOptions:

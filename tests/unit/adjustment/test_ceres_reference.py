@@ -335,6 +335,13 @@ def test_a_term_that_ceres_cannot_have_is_refused() -> None:
         solve_with_ceres(replace(problem, observations=replace(o, unit=np.minimum(o.unit, UNITS - 2))))
 
 
+def test_a_free_camera_that_observes_nothing_is_refused() -> None:
+    problem = calibration(np.random.default_rng(0))
+    o = problem.observations
+    with pytest.raises(ValueError, match="camera 2 observes"):
+        solve_with_ceres(replace(problem, observations=replace(o, camera=np.minimum(o.camera, 1))))
+
+
 def test_terms_are_left_to_one_thread() -> None:
     """Ceres' other threads would wait for ever for the interpreter's lock."""
     problem = positions(np.random.default_rng(0))

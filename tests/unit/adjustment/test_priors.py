@@ -96,13 +96,13 @@ def test_camera_pose_prior_holds_each_direction_by_its_own_sigma_and_the_gauge_b
     assert prior.cost(case.truth) < 1e-20
     at_truth = added(prior, case.truth, case.problem.layout)[0]
     rows = case.problem.layout.camera_offsets(chosen[:3])[:, None] + np.arange(6)
-    stiff = 1.0 + priors.GAUGE_STIFFNESS / 4
-    np.testing.assert_allclose(np.diag(at_truth)[rows], stiff / sigma[:3] ** 2)
+    stiff = 1.0 / sigma[:3] ** 2 + priors.GAUGE_STIFFNESS / 4 / sigma.max(0) ** 2
+    np.testing.assert_allclose(np.diag(at_truth)[rows], stiff)
     # Corrections that cancel cost what they are, the same correction of all is held.
-    step = np.zeros(case.problem.layout.size)
-    step[rows[0]], step[rows[1]] = sigma[0], -sigma[1]
-    assert step @ at_truth @ step == pytest.approx(12)
-    step[rows[1]] = sigma[1]
+    step, turn = np.zeros(case.problem.layout.size), sigma[:2].max(0)
+    step[rows[0]], step[rows[1]] = turn, -turn
+    assert step @ at_truth @ step == pytest.approx(((turn / sigma[:2]) ** 2).sum())
+    step[rows[1]] = turn
     assert step @ at_truth @ step > 1e5
 
 

@@ -26,7 +26,7 @@ from mrasfm_engine.aggregation import calibrations
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
 from mrasfm_engine.aggregation.calibrations import calibration_priors
-from mrasfm_engine.aggregation.final import FinalResult, adjust_map, all_points
+from mrasfm_engine.aggregation.final import FinalResult, MapModel, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.rigs import true_cameras
@@ -254,6 +254,36 @@ def test_calibrations_settle_as_far_as_scenes_left_them_uncertain(street: Street
     assert np.median(after.model.errors_px) < np.median(held.model.errors_px)
 
 
+def test_points_that_only_fixed_units_see_follow_their_calibration(folder: Path) -> None:
+    """Only the first drive's calibration was refined: points of the second one stay where none of its units vary."""
+    long = make_street(length_m=260.0, points=4000, seed=4)
+    drives = [
+        drive_along(long, folder / f"ends{k}", np.arange(s, s + 100.0, 4.0), bias_m=BIAS_M[k], seed=40 + k, **extra)
+        for k, (s, extra) in enumerate(((0.0, {"cameras_off_deg": 0.15}), (120.0, {})))
+    ]
+    assembly = Assembly(scenes=[d.source for d in drives])
+    before, after = adjusted(drives, "none").model, adjusted(drives, "overlap").model
+    fixed = (before.state.unit_position_m == after.state.unit_position_m).all(1)
+    assert fixed[[0, -1]].all()
+    assert 4 < fixed.sum() < len(fixed) - 4
+    unit = assembly.image_unit[assembly.keypoint_image]
+
+    def seen_by_fixed(model: MapModel, scene: int) -> np.ndarray:
+        """Points (of all scenes') of a scene in the model that no unit sees that varies."""
+        varied = np.unique(model.point[~fixed[unit[model.rows]]])
+        mine = np.flatnonzero((assembly.scene_of_point == scene) & (model.owner >= 0))
+        return mine[~np.isin(model.owner[mine], varied)]
+
+    for scene in range(2):
+        points = np.intersect1d(seen_by_fixed(before, scene), seen_by_fixed(after, scene))
+        assert len(points) > 50
+        moved = [model.state.points_m[model.owner[points]] for model in (before, after)]
+        assert (np.abs(moved[1] - moved[0]).max(1) > 0).mean() == (1.0 if scene == 0 else 0.0)
+        rows = [np.isin(model.point, model.owner[points]) for model in (before, after)]
+        errors = [np.median(model.errors_px[row]) for model, row in zip((before, after), rows, strict=True)]
+        assert errors[1] < 0.9 * errors[0] if scene == 0 else errors[1] == pytest.approx(errors[0], abs=0.01)
+
+
 def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
     street: Street, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,10 +305,13 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
         np.testing.assert_allclose(sigma[:, 3:], CONFIG.adjustment.sigma_translation_m)
     assert len(every) == 2
     assert sigmas(~assembly.registered) == []
-    monkeypatch.setattr(calibrations, "MAX_PAIRS", 8 * 14)
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8))
     assert len(sigmas(assembly.registered)) == 2
-    monkeypatch.setattr(calibrations, "MAX_PAIRS", 8 * 14 - 1)
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8) - 1)
     assert sigmas(assembly.registered) == []
+    held = CONFIG.adjustment.model_copy(update={"refine_calibration": False})
+    monkeypatch.undo()
+    assert calibration_priors(assembly, state, assembly.registered, held) == []
 
 
 def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:
