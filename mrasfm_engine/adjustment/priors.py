@@ -60,8 +60,7 @@ class CalibrationPrior:
 
     def corrections(self, state: State) -> Floats:
         """Rotation vectors (rad) and translations (m) of all cameras (c, 6) from given to current, in rig axes."""
-        turn = se3.log_so3(state.camera_rotation @ np.swapaxes(self.rotation, 1, 2))
-        return np.concatenate([turn, state.camera_position_m - self.position_m], axis=1)
+        return _corrections(state.camera_rotation, state.camera_position_m, self.rotation, self.position_m)
 
     def with_weights(self, state: State) -> CalibrationPrior:
         """This prior with the gauge's weights renewed from the corrections of a state."""
@@ -71,79 +70,62 @@ class CalibrationPrior:
         sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
         return self.corrections(state) / sigma, sigma
 
-    def _own(self, whitened: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Every camera's own residuals, without the gauge, and the sigmas in them."""
-        share = np.where(self._held(), HELD_SHARE, 1.0)
-        return whitened / share, sigma * share
-
     def _held(self) -> Bools:
         return np.zeros((len(self.rotation), 6), dtype=np.bool_) if self.held is None else self.held
 
     def _gauge(self) -> Floats:
         w = np.ones(len(self.rotation)) if self.gauge_weights is None else self.gauge_weights
-        result: Floats = w / w.sum() * np.sqrt(len(w))
-        return result
+        return np.repeat((w / w.sum() * np.sqrt(len(w)))[:, None], 6, axis=1)
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        r, sigma = self._whitened(state)
-        own = _cost_of_own(self._own(r, sigma)[0], self._held(), self.loss_scale)
-        return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() @ r) ** 2).sum())
+        return _cost_of_rig(self._whitened(state)[0], self._held(), self._gauge(), self.loss_scale)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         r, sigma = self._whitened(state)
-        cameras = np.flatnonzero(layout.camera_slot >= 0)
-        own, own_sigma = self._own(r, sigma)
-        step = _derivatives_of_corrections(r * sigma)
-        rows = _rows_of(layout, cameras)
-        weights = _weights_of_own(own, self._held(), self.loss_scale)[cameras]
-        _add_own(extra, rows, (step / own_sigma[:, :, None])[cameras], own[cameras], weights)
-        gauge = self._gauge()
-        shares = gauge[cameras, None].repeat(6, axis=1)
-        _add_gauge(extra, rows, (step / sigma[:, :, None])[cameras], shares, gauge @ r)
+        cameras = np.arange(len(r))
+        _add_rig(layout, extra, cameras, r, sigma=sigma, held=self._held(), gauge=self._gauge(), loss=self.loss_scale)
 
 
-def _rows_of(layout: Layout, cameras: Ints) -> Ints:
-    """Where the poses of free cameras stand (n, 6) among the cameras' unknowns."""
-    return (CAMERA_DOF * layout.camera_slot[cameras])[:, None] + np.arange(6)
+def _corrections(rotation: Floats, position_m: Floats, from_rotation: Floats, from_position_m: Floats) -> Floats:
+    """Rotation vectors (rad) and translations (m) of cameras (n, 6) to poses in the rig, in its axes."""
+    turn = se3.log_so3(rotation @ np.swapaxes(from_rotation, 1, 2))
+    return np.concatenate([turn, position_m - from_position_m], axis=1)
 
 
-def _derivatives_of_corrections(corrections: Floats) -> Floats:
-    """Of rotation vectors and translations (n, 6) by steps of their cameras (n, 6, 6)."""
-    step = np.tile(np.eye(6), (len(corrections), 1, 1))
-    step[:, :3, :3] = se3.inverse_left_jacobian(corrections[:, :3])
-    return step
+def _cost_of_rig(r: Floats, held: Bools, gauge: Floats, loss_scale: float) -> float:
+    """Of a rig's corrections over their sigmas (n, 6), and of their mean, in which they have weights gauge (n, 6).
 
-
-def _cost_of_own(r: Floats, held: Bools, loss_scale: float) -> float:
-    """Of cameras' own residuals (n, 6): a Cauchy loss over those of a camera that are not held, squares of the rest."""
+    Of a camera's own there is a Cauchy loss over those that are not held, and squares of the rest.
+    """
     s2 = loss_scale**2
     loose, firm = ((np.where(mask, r, 0.0) ** 2).sum(1) for mask in (~held, held))
-    return float(0.5 * (s2 * np.log1p(loose / s2) + firm).sum())
+    own = 0.5 * (s2 * np.log1p(loose / s2) + firm / HELD_SHARE**2).sum()
+    return float(own + 0.5 * GAUGE_STIFFNESS * ((gauge * r).sum(0) ** 2).sum())
 
 
-def _weights_of_own(r: Floats, held: Bools, loss_scale: float) -> Floats:
-    """The loss's weights (n, 6)."""
+def _add_rig(
+    layout: Layout, extra: Extra, cameras: Ints, r: Floats, *, sigma: Floats, held: Bools, gauge: Floats, loss: float
+) -> None:
+    """Add what belongs to `_cost_of_rig`, of cameras (n,) with corrections r over sigma (n, 6) each."""
+    step = np.tile(np.eye(6), (len(r), 1, 1))  # derivatives of corrections by steps of their cameras
+    step[:, :3, :3] = se3.inverse_left_jacobian((r * sigma)[:, :3])
+    free = np.flatnonzero(layout.camera_slot[cameras] >= 0)
+    rows = (CAMERA_DOF * layout.camera_slot[cameras[free]])[:, None] + np.arange(6)
+    j = (step / sigma[:, :, None])[free]
+
     loose = (np.where(held, 0.0, r) ** 2).sum(1, keepdims=True)
-    result: Floats = np.where(held, 1.0, 1.0 / (1.0 + loose / loss_scale**2))
-    return result
-
-
-def _add_own(extra: Extra, rows: Ints, j: Floats, r: Floats, weights: Floats) -> None:
-    """Add every camera's own residuals (n, 6) with derivatives (n, 6, 6) and weights (n, 6)."""
+    weights = np.where(held, HELD_SHARE**-2, 1.0 / (1.0 + loose / loss**2))[free]
     j_w = np.swapaxes(weights[:, :, None] * j, 1, 2)
     extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
-    extra.camera_gradient[rows] += (j_w @ r[:, :, None])[:, :, 0]
+    extra.camera_gradient[rows] += (j_w @ r[free, :, None])[:, :, 0]
 
-
-def _add_gauge(extra: Extra, rows: Ints, j: Floats, weights: Floats, mean: Floats) -> None:
-    """Add the mean (6,) of residuals, in which cameras have weights (n, 6) and derivatives (n, 6, 6)."""
-    if not len(rows):
+    if not len(free):
         return
-    together = np.concatenate(np.sqrt(GAUGE_STIFFNESS) * weights[:, :, None] * j, axis=1)  # (6, 6 n)
+    together = np.concatenate(np.sqrt(GAUGE_STIFFNESS) * gauge[free, :, None] * j, axis=1)  # (6, 6 free)
     extra.cameras[np.ix_(rows.ravel(), rows.ravel())] += together.T @ together
-    extra.camera_gradient[rows.ravel()] += np.sqrt(GAUGE_STIFFNESS) * together.T @ mean
+    extra.camera_gradient[rows.ravel()] += np.sqrt(GAUGE_STIFFNESS) * together.T @ (gauge * r).sum(0)
 
 
 def robust_gauge_weights(whitened: Floats) -> Floats:
@@ -179,13 +161,8 @@ class CameraPosePrior:
     loss_scale: float = 3.0
 
     def _whitened(self, state: State) -> Floats:
-        turn = se3.log_so3(state.camera_rotation[self.camera] @ np.swapaxes(self.rotation, 1, 2))
-        moved = state.camera_position_m[self.camera] - self.position_m
-        result: Floats = np.concatenate([turn, moved], axis=1) / self.sigma
-        return result
-
-    def _share(self) -> Floats:
-        return np.where(self.held, HELD_SHARE, 1.0)
+        found = state.camera_rotation[self.camera], state.camera_position_m[self.camera]
+        return _corrections(*found, self.rotation, self.position_m) / self.sigma
 
     def _gauge(self) -> Floats:
         """Weights (n, 6) of whitened corrections in their mean, which is in parts of the largest sigma."""
@@ -194,20 +171,13 @@ class CameraPosePrior:
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        r = self._whitened(state)
-        own = _cost_of_own(r / self._share(), self.held, self.loss_scale)
-        return float(own + 0.5 * GAUGE_STIFFNESS * ((self._gauge() * r).sum(0) ** 2).sum())
+        return _cost_of_rig(self._whitened(state), self.held, self._gauge(), self.loss_scale)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        r, gauge = self._whitened(state), self._gauge()
-        free = np.flatnonzero(layout.camera_slot[self.camera] >= 0)
-        rows = _rows_of(layout, self.camera[free])
-        j = (_derivatives_of_corrections(r * self.sigma) / self.sigma[:, :, None])[free]
-        own = r / self._share()
-        weights = _weights_of_own(own, self.held, self.loss_scale)
-        _add_own(extra, rows, j / self._share()[free, :, None], own[free], weights[free])
-        _add_gauge(extra, rows, j, gauge[free], (gauge * r).sum(0))
+        r = self._whitened(state)
+        gauge, loss = self._gauge(), self.loss_scale
+        _add_rig(layout, extra, self.camera, r, sigma=self.sigma, held=self.held, gauge=gauge, loss=loss)
 
 
 @dataclass(frozen=True, kw_only=True)

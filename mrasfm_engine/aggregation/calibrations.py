@@ -7,8 +7,6 @@ is scale. So calibrations settle with the units, as far as their scene left them
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,10 +64,5 @@ def calibration_priors(
                 held=~observed,
             )
         )
-    return priors if couplings(priors, free_units) <= MAX_COUPLINGS else []
-
-
-def couplings(priors: Sequence[CameraPosePrior], free_units: Bools) -> int:
-    """How many pairs of a camera that varies and a unit, or another camera, the solver has to hold."""
-    cameras = sum(len(prior.camera) for prior in priors)
-    return cameras * (int(free_units.sum()) + cameras)
+    settling = sum(len(prior.camera) for prior in priors)
+    return priors if settling * (int(free_units.sum()) + settling) <= MAX_COUPLINGS else []

@@ -104,11 +104,11 @@ def adjust_map(
     calibrations = calibration_priors(assembly, state, free, config.adjustment)
     for prior in calibrations:
         cameras[prior.camera] = True
+    o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
+    seen[o.point[free[o.unit]]] = True
     reports: list[Report] = []
     positions = {k: with_bias(p, state) for k, p in positions.items()}
     for _ in range(ROUNDS if free.any() else 0):
-        seen = np.zeros(tracks.count, dtype=np.bool_)
-        seen[problem.observations.point[free[problem.observations.unit]]] = True
         part = replace(
             problem.of_points(seen),
             layout=Layout.of(free, cameras),
@@ -122,7 +122,7 @@ def adjust_map(
         points[seen] = solution.points_m
         problem = replace(problem, state=replace(solution, points_m=points))
         positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
-    problem = _fixed_units_settled(problem, free, cameras)
+    problem = _others_settled(problem, seen, cameras)
     model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
     return FinalResult(
         model=model,
@@ -135,11 +135,9 @@ def adjust_map(
     )
 
 
-def _fixed_units_settled(problem: Problem, free_units: Bools, free_cameras: Bools) -> Problem:
-    """The problem with points that only fixed units see where these units' calibration has got; all others stay."""
-    o, varied = problem.observations, np.zeros(problem.observations.num_points, dtype=np.bool_)
-    varied[o.point[free_units[o.unit]]] = True
-    follow = np.zeros_like(varied)
+def _others_settled(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:
+    """The problem with points where calibrations that vary have got, but for those (p,) that varied with units."""
+    o, follow = problem.observations, np.zeros_like(varied)
     follow[o.point[free_cameras[o.camera]]] = True
     follow &= ~varied
     if not follow.any():
