@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
@@ -114,17 +115,17 @@ class Settings(BaseSettings):
         """The artifact store's URL."""
         return self.artifacts_url or "file://" + quote(str(self.data_dir.resolve() / "artifacts"))
 
-    @property
+    @cached_property
     def spool_dir(self) -> Path:
         """Where bytes from outside wait until they are checked."""
         return self.data_dir.resolve() / "spool"
 
-    @property
+    @cached_property
     def uploads_dir(self) -> Path:
         """Where the bytes of resumable uploads gather until all are there; of the spool's file system."""
         return self.data_dir.resolve() / "uploads"
 
-    @property
+    @cached_property
     def scratch_dir(self) -> Path:
         """Where stages work."""
         return self.data_dir.resolve() / "scratch"

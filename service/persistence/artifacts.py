@@ -97,9 +97,8 @@ class ArtifactStore:
         os.chmod(path, 0o440)
         os.utime(path, ns=(content_mtime_ns(sha256),) * 2)
         target = self._root / key
-        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         try:
-            path.replace(target)
+            _move(path, target)
         except OSError as error:
             if error.errno != errno.EXDEV:
                 raise
@@ -261,6 +260,14 @@ def _open(url: str, settings: Settings, patience: Mapping[str, Any], retries: Ma
             options["endpoint"] = settings.s3_endpoint
             client["allow_http"] = settings.s3_endpoint.startswith("http://")
     return from_url(url, **options)
+
+
+def _move(path: Path, target: Path) -> None:
+    try:
+        os.replace(path, target)
+    except FileNotFoundError:  # the first in its folder
+        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        os.replace(path, target)
 
 
 def _sync(path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from fastapi import BackgroundTasks, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security import HTTPBearer
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
@@ -27,10 +27,8 @@ from service.routes.paging import MAX_LIMIT
 
 log = logging.getLogger("mrasfm.api")
 
-_bearer = HTTPBearer(auto_error=False, description="An API key: `Authorization: Bearer mrasfm_...`")
-
-
-# Dependencies that do not wait are coroutines: FastAPI would send each to a thread of its own.
+# Dependencies that do not wait are coroutines: FastAPI would send each to a thread of its own. None asks for another:
+# FastAPI solves one anew wherever it is named, and an upload of small files is mostly that.
 async def get_context(request: Request) -> Context:
     """The process's resources."""
     context: Context = request.app.state.context
@@ -47,34 +45,40 @@ class Caller:
     project_id: str
 
 
-async def get_caller(
-    context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-) -> Caller:
-    """Who calls.
+class _ApiKey(HTTPBearer):
+    """FastAPI's, so that the OpenAPI page says which key a route needs; what it gives is the key's owner."""
 
-    Raises
-    ------
-    ServiceError
-        401 without a valid key.
-    """
-    project_id = None
-    if credentials is not None:
-        secret = credentials.credentials
-        project_id = context.keys.remembered(secret) or await run_in_threadpool(context.keys.look_up, secret)
-    if project_id is None:
-        given = "the API key is not valid" if credentials is not None else "the request carries no API key"
-        raise ServiceError(
-            401,
-            "unauthorized",
-            "No valid API key",
-            given,
-            remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",
-            headers={"WWW-Authenticate": 'Bearer realm="mrasfm"'},
-        )
-    return Caller(project_id)
+    async def __call__(self, request: Request) -> Caller:  # type: ignore[override]
+        """Who calls.
+
+        Raises
+        ------
+        ServiceError
+            401 without a valid key.
+        """
+        context = await get_context(request)
+        credentials = await super().__call__(request)
+        project_id = None
+        if credentials is not None:
+            secret = credentials.credentials
+            project_id = context.keys.remembered(secret) or await run_in_threadpool(context.keys.look_up, secret)
+        if project_id is None:
+            given = "the API key is not valid" if credentials is not None else "the request carries no API key"
+            raise ServiceError(
+                401,
+                "unauthorized",
+                "No valid API key",
+                given,
+                remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",
+                headers={"WWW-Authenticate": 'Bearer realm="mrasfm"'},
+            )
+        return Caller(project_id)
 
 
-CallerDep = Annotated[Caller, Depends(get_caller)]
+_api_key = _ApiKey(
+    auto_error=False, scheme_name="HTTPBearer", description="An API key: `Authorization: Bearer mrasfm_...`"
+)
+CallerDep = Annotated[Caller, Depends(_api_key)]
 
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items a page")]
 Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the page before")]

@@ -89,9 +89,15 @@ class SpoolWriter:
         self._lock = threading.Lock()
         self.path = folder / (secrets.token_hex(16) + _SUFFIX)
         with full_disk_is_507():
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-            self._descriptor: int | None = os.open(self.path, flags, 0o600)
+            self._descriptor: int | None = self._open()
+
+    def _open(self) -> int:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        try:
+            return os.open(self.path, flags, 0o600)
+        except FileNotFoundError:  # the first of all
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            return os.open(self.path, flags, 0o600)
 
     def write(self, *parts: Part) -> None:
         """Append; nothing happens after `discard`."""
@@ -182,13 +188,12 @@ async def receive_into(
     ServiceError
         413 `too-large`, 400 `wrong-length`, 422 `wrong-digest` or 507 `disk-full`.
     """
-    if expected_bytes is not None:
-        if expected_bytes > max_bytes:
-            raise _too_large(f"{expected_bytes}", max_bytes)
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        require_space(folder, expected_bytes, min_free_bytes=min_free_bytes)
+    if expected_bytes is not None and expected_bytes > max_bytes:
+        raise _too_large(f"{expected_bytes}", max_bytes)
     writer = BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
     try:
+        if expected_bytes is not None:
+            require_space(folder, expected_bytes, min_free_bytes=min_free_bytes)
         received_bytes = batched_bytes = 0
         batch: list[bytes] = []
         async for chunk in stream:
