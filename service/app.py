@@ -11,20 +11,21 @@ from importlib.metadata import version
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from obstore.exceptions import BaseError
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from schemas.api.problems import MEDIA_TYPE, ProblemItem
+from schemas.api.problems import ProblemItem
+from service.body_rules import BodyRules
 from service.context import Context
 from service.errors import ServiceError, store_unavailable
 from service.metrics import Metrics
 from service.openapi import allowed_methods, openapi_page
 from service.persistence import uploads as upload_records
 from service.persistence.tables import now_us
+from service.problem_response import problem_response
 from service.readiness import Readiness
 from service.request_log import RequestLog
 from service.routes import aggregations, drives, files, jobs, maps, operations, reconstructions, scenes, uploads
@@ -79,6 +80,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(operations.metrics_route(metrics))
     add_documentation(app)
     _answer_errors(app)
+    app.add_middleware(BodyRules, idle_s=settings.upload_idle_seconds)
     app.add_middleware(RequestLog, metrics=metrics, failed=_failed)
     app.openapi = lambda: openapi_page(app)  # type: ignore[method-assign]
     return app
@@ -186,9 +188,3 @@ def _disk_full() -> ServiceError:
         "the service has no space left to store this",
         remedy="Nothing was stored. The operator has to free space; then repeat the request.",
     )
-
-
-def problem_response(error: ServiceError) -> JSONResponse:
-    """An error as RFC 9457 has it."""
-    body = error.problem.model_dump(mode="json", exclude_defaults=True)
-    return JSONResponse(body, status_code=error.status, headers=error.headers, media_type=MEDIA_TYPE)

@@ -61,7 +61,7 @@ class Settings(BaseSettings):
     min_free_disk_bytes: Annotated[int, Field(ge=0)] = 1_000_000_000  # below, uploads are refused (507)
     max_concurrent_writes: Count = 8  # uploads that write to disk at one time; the others wait their turn
     upload_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 24.0  # a resumable upload that nobody goes on with ends
-    upload_idle_seconds: Seconds = 60.0  # a resumable upload's request that sends nothing ends; what came is kept
+    upload_idle_seconds: Seconds = 60.0  # a request of whose body nothing comes ends; resumable uploads keep what came
     poll_seconds: Seconds = 1.0  # how often an event stream looks for news
 
     # Quotas of a new project

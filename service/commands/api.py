@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 
 from service.settings import Settings
 
@@ -18,22 +19,15 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
-    import uvicorn
-
     from service.app import create_app
     from service.logs import configure
+    from service.server import allow_many_connections, server_of
 
     settings = Settings()
     configure(arguments.log_level)
-    uvicorn.run(
-        create_app(settings),
-        host=arguments.host or settings.host,
-        port=settings.port if arguments.port is None else arguments.port,
-        log_config=None,
-        access_log=False,  # the request log says more
-        timeout_graceful_shutdown=20,  # event streams would hold it up for ever
-        h11_max_incomplete_event_size=64_000,
-        timeout_keep_alive=30,
-        server_header=False,
-    )
-    return 0
+    allow_many_connections()
+    host, port = arguments.host or settings.host, settings.port if arguments.port is None else arguments.port
+    server = server_of(create_app(settings), host=host, port=port)
+    with suppress(KeyboardInterrupt):  # uvicorn raises it anew once it has stopped
+        server.run()
+    return 0 if server.started else 1

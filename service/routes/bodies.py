@@ -44,15 +44,8 @@ def json_body(
 
     async def read(request: Request) -> AsyncIterator[Body[Model]]:
         context: Context = request.app.state.context
-        bound = max_bytes(context.settings)
         async with AsyncExitStack() as turns:
-            if min(bound, int(request.headers.get("content-length", bound))) > LARGE_BYTES:
-                await turns.enter_async_context(context.large_bodies)
-                raw = await _read_in_time(request, bound)
-            else:
-                raw = await read_within(request, bound)
-            if len(raw) > LARGE_BYTES:
-                await turns.enter_async_context(context.large_documents)
+            raw = await _read(request, max_bytes(context.settings), context, turns)
             try:
                 value = await run_in_threadpool(parse_document, raw, model)
             except DocumentError as error:
@@ -62,10 +55,42 @@ def json_body(
     return read
 
 
-async def _read_in_time(request: Request, max_bytes: int) -> bytes:
+async def _read(request: Request, bound: int, context: Context, turns: AsyncExitStack) -> bytes:
+    """The request's body, which waits for its turns once it proves to be large.
+
+    Raises
+    ------
+    ServiceError
+        413 as soon as it is known to be larger than `bound`, 408 where a large one takes too long.
+    """
+    if int(request.headers.get("content-length", 0)) > bound:
+        raise _too_large(request.headers["content-length"], bound)
+    stream = request.stream()
+    parts = [part async for part in _until(stream, min(bound, LARGE_BYTES))]
+    if sum(map(len, parts)) > LARGE_BYTES:
+        # Only now: who announces a large body and sends none shall not hold up those who do.
+        await turns.enter_async_context(context.large_bodies)
+        parts += await _rest_in_time(stream, bound - sum(map(len, parts)))
+        await turns.enter_async_context(context.large_documents)
+    if sum(map(len, parts)) > bound:
+        raise _too_large(f"over {bound}", bound)
+    return b"".join(parts)
+
+
+async def _until(stream: AsyncIterator[bytes], enough_bytes: int) -> AsyncIterator[bytes]:
+    """Parts of a stream until there are more bytes than these, or no more."""
+    size_bytes = 0
+    async for part in stream:
+        yield part
+        size_bytes += len(part)
+        if size_bytes > enough_bytes:
+            return
+
+
+async def _rest_in_time(stream: AsyncIterator[bytes], bound: int) -> list[bytes]:
     try:
         with anyio.fail_after(_LARGE_WITHIN_S):
-            return await read_within(request, max_bytes)
+            return [part async for part in _until(stream, bound)]
     except TimeoutError:
         raise ServiceError(
             408,
@@ -74,25 +99,6 @@ async def _read_in_time(request: Request, max_bytes: int) -> bytes:
             f"the body was not here within {_LARGE_WITHIN_S:g} s",
             remedy="Repeat it over a faster connection, or split the drive.",
         ) from None
-
-
-async def read_within(request: Request, max_bytes: int) -> bytes:
-    """The request's body.
-
-    Raises
-    ------
-    ServiceError
-        413 as soon as it is known to be larger than `max_bytes`.
-    """
-    if int(request.headers.get("content-length", 0)) > max_bytes:
-        raise _too_large(request.headers["content-length"], max_bytes)
-    parts, size = [], 0
-    async for part in request.stream():
-        size += len(part)
-        if size > max_bytes:
-            raise _too_large(f"over {max_bytes}", max_bytes)
-        parts.append(part)
-    return b"".join(parts)
 
 
 def _too_large(size: str, max_bytes: int) -> ServiceError:

@@ -27,6 +27,7 @@ from service.routes.paging import MAX_LIMIT
 
 log = logging.getLogger("mrasfm.api")
 
+
 # Dependencies that do not wait are coroutines: FastAPI would send each to a thread of its own. None asks for another:
 # FastAPI solves one anew wherever it is named, and an upload of small files is mostly that.
 async def get_context(request: Request) -> Context:

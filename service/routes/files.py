@@ -24,7 +24,7 @@ from service.persistence.idempotency import Answer
 from service.persistence.tables import Blob, DriveFile
 from service.routes.bodies import Body, describe, describe_bytes, json_body
 from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, problems
-from service.routes.keeping import keep_archive, keep_file, require_open, require_wanted
+from service.routes.keeping import keep_archive, keep_file, require_room, require_wanted
 from service.routes.paging import cursor_of, position_of
 from service.uploads.digests import parse_digest
 from service.uploads.spool import receive, receive_into
@@ -33,6 +33,8 @@ router = APIRouter(prefix="/v1/drives/{drive_id}", tags=["files"])
 
 _DRAINED_BYTES = 16 << 20
 _ASK_FIRST_BYTES = 4 << 20  # from here on a file that is not wanted is refused before its bytes come
+# Of a body that is a whole file as it is, both are the same.
+_DIGEST_FIELDS = ("content-digest", "repr-digest")
 read_declaration = json_body(DeclareFiles, lambda settings: settings.max_json_bytes)
 
 ContentDigest = Annotated[
@@ -40,7 +42,8 @@ ContentDigest = Annotated[
     Header(
         alias="Content-Digest",
         max_length=2000,
-        description="`sha-256=:BASE64:` of the body (RFC 9530). Bytes with another digest are refused and discarded",
+        description="`sha-256=:BASE64:` of the body (RFC 9530). Bytes with another digest are refused and discarded. "
+        "`Repr-Digest` is taken too",
     ),
 ]
 Replace = Annotated[bool, Query(description="take the bytes although others are stored under this name")]
@@ -118,7 +121,7 @@ async def put_file(
     """Store one file of an open drive, whole or not at all. Sending the same bytes again changes nothing."""
     stream = request.stream()
     try:
-        announced = _announced(request, context, content_digest)
+        announced = _announced(request, context)
         size_bytes, sha256 = announced["expected_bytes"], announced["expected_sha256"]
         if size_bytes is None or size_bytes >= _ASK_FIRST_BYTES:
             of_file = partial(require_wanted, sha256=sha256, size_bytes=size_bytes)
@@ -162,12 +165,14 @@ async def put_archive(
     """Store all files of an archive in an open drive, or none of them. One folder around them is taken off."""
     stream = request.stream()
     try:
-        await run_in_threadpool(require_open, context, caller.project_id, drive_id)
+        announced = _announced(request, context)
+        room = partial(require_room, context, caller.project_id, drive_id, announced["expected_bytes"])
+        max_bytes = await run_in_threadpool(room)
         archive = await receive(
             stream,
             context.settings.spool_dir,
-            max_bytes=context.settings.max_archive_bytes,
-            **_announced(request, context, content_digest),
+            max_bytes=max_bytes,
+            **announced,
         )
     except ServiceError:
         await _drain(request, stream)
@@ -184,12 +189,21 @@ class _Announced(TypedDict):
     on_disk: anyio.CapacityLimiter
 
 
-def _announced(request: Request, context: Context, content_digest: str | None) -> _Announced:
+def _announced(request: Request, context: Context) -> _Announced:
     """What is known of a body before it comes, and how it may be written."""
+    if "content-range" in request.headers:
+        raise ServiceError(
+            400,
+            "partial-body",
+            "A part of a file",
+            "the request has a Content-Range, and a PUT stores whole files",
+            remedy="Send the whole file, or its parts as a resumable upload: POST /v1/drives/{id}/uploads.",
+        )
     length = request.headers.get("content-length")
+    digests = [line for name in _DIGEST_FIELDS for line in request.headers.getlist(name)]
     return {
         "expected_bytes": None if length is None else int(length),
-        "expected_sha256": parse_digest(content_digest),
+        "expected_sha256": parse_digest(*digests),
         "min_free_bytes": context.settings.min_free_disk_bytes,
         "on_disk": context.disk,
     }
@@ -198,14 +212,14 @@ def _announced(request: Request, context: Context, content_digest: str | None) -
 async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
     """Read on a little after a refusal: most clients look at the answer only once they have sent everything."""
     left = _DRAINED_BYTES
-    if int(request.headers.get("content-length", 0)) > left:
+    if int(request.headers.get("content-length", 0)) > left or "expect" in request.headers:  # it waits for our word
         return
     try:
         async for part in stream:
             left -= len(part)
             if left < 0:
                 return
-    except (ClientDisconnect, RuntimeError):  # RuntimeError: the stream has been read to its end
+    except (ClientDisconnect, ServiceError, RuntimeError):  # RuntimeError: the stream has been read to its end
         return
 
 

@@ -12,14 +12,16 @@ from schemas.api.drives import DriveFileResource, StoredFiles
 from schemas.parsing import DocumentError, parse_json
 from service.context import Context
 from service.errors import ServiceError
-from service.persistence import drives, slots
+from service.persistence import blobs, drives, slots
 from service.persistence.storing import storing
-from service.persistence.tables import Blob, DriveFile
+from service.persistence.tables import Blob, DriveFile, Project
 from service.routes.bodies import LARGE_BYTES
 from service.uploads.archive import unpack
 from service.uploads.archive_limits import ArchiveLimits
 from service.uploads.images import check_image
 from service.uploads.spool import Spooled
+
+_ENTRY_BYTES = 4096  # of an archive, around each file: headers, names twice, padding
 
 
 def require_wanted(
@@ -41,6 +43,29 @@ def require_open(context: Context, project_id: str, drive_id: str) -> None:
     """Refuse an archive that comes too late, before its bytes do."""
     with context.database.read() as session:
         drives.require_open(drives.get(session, project_id, drive_id))
+
+
+def require_room(context: Context, project_id: str, drive_id: str, size_bytes: int | None) -> int:
+    """How many bytes an archive may have; refuses one that comes too late, or is too large for the project's quota.
+
+    What the drive has already may come once more: a client that got no answer repeats its request.
+
+    Parameters
+    ----------
+    size_bytes
+        That it is announced to have, if it is.
+    """
+    bound = context.settings.max_archive_bytes
+    with context.database.read() as session:
+        drive = drives.get(session, project_id, drive_id)
+        drives.require_open(drive)
+        project = session.get_one(Project, project_id)
+        there = drives.stored_of(session, [drive_id])[drive_id]
+    left_bytes = max(0, project.max_bytes - project.used_bytes) + there.size_bytes
+    left_bytes += _ENTRY_BYTES * (drive.files_expected + 1)
+    if size_bytes is not None and left_bytes < size_bytes <= bound:
+        raise blobs.quota_full(project, size_bytes)
+    return min(bound, left_bytes)
 
 
 def keep_file(

@@ -111,7 +111,6 @@ class UploadWriting:
                     stream,
                     appender,
                     max_bytes=held.upload.size_bytes - offset,
-                    idle_s=settings.upload_idle_seconds,
                     on_disk=self._context.disk,
                 )
             except BaseException as error:

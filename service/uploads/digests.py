@@ -14,33 +14,33 @@ _MEMBER = re.compile(r"([a-z*][a-z0-9_.*-]*)=:([A-Za-z0-9+/]*={0,2}):(?:;[ ]*[a-
 _DIGEST_BYTES = 32
 
 
-def parse_digest(header: str | None) -> str | None:
-    """SHA-256 of a digest field, in hexadecimal; None where the field is missing or has other algorithms only.
+def parse_digest(*fields: str) -> str | None:
+    """SHA-256 of the lines of digest fields, in hexadecimal; None where there are none.
 
     Raises
     ------
     ServiceError
-        400 `malformed-digest`, if the field does not follow RFC 9530 or gives SHA-256 twice.
+        400 `malformed-digest`, if a line does not follow RFC 9530, if several give different values, or if none gives
+        SHA-256: to store the bytes unchecked is not what the sender has in mind.
 
     Examples
     --------
     >>> parse_digest("sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:")
     'e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855'
     """
-    if header is None:
-        return None
-    found: str | None = None
-    for part in header.split(","):
+    found: set[str] = set()
+    for part in ",".join(fields).split(",") if fields else ():
         member = _MEMBER.fullmatch(part.strip(" \t"))
         if member is None:
             raise _malformed(f"{part.strip()[:100]!r} is not of the form sha-256=:BASE64:")
         algorithm, value = member.groups()
-        if algorithm != _ALGORITHM:
-            continue
-        if found is not None:
-            raise _malformed("sha-256 is given twice")
-        found = _sha256(value)
-    return found
+        if algorithm == _ALGORITHM:
+            found.add(_sha256(value))
+    if len(found) > 1:
+        raise _malformed("it gives sha-256 more than once, with different values")
+    if fields and not found:
+        raise _malformed("it does not give sha-256")
+    return found.pop() if found else None
 
 
 def format_digest(sha256: str) -> str:
@@ -66,4 +66,5 @@ def _malformed(why: str) -> ServiceError:
         "Malformed digest",
         f"the digest field cannot be read: {why}",
         remedy="Send Content-Digest: sha-256=:BASE64: with the base64 of the 32 bytes, or leave it out.",
+        headers={"Want-Content-Digest": f"{_ALGORITHM}=10"},
     )

@@ -157,9 +157,7 @@ class Appender:
             self._ended = True
 
 
-async def append(
-    stream: AsyncIterator[bytes], appender: Appender, *, max_bytes: int, idle_s: float, on_disk: DiskLimiter
-) -> int:
+async def append(stream: AsyncIterator[bytes], appender: Appender, *, max_bytes: int, on_disk: DiskLimiter) -> int:
     """Write a request's body to the end of an upload, in constant memory and off the event loop.
 
     Returns
@@ -170,18 +168,14 @@ async def append(
     Raises
     ------
     ServiceError
-        413 where there are more than `max_bytes`, 408 where nothing came for a while, 507 where the disk is full.
-        What had come until then is written, but for the first.
+        413 where there are more than `max_bytes`, 507 where the disk is full, and what the stream raises. What had
+        come until then is written, but for the first.
     """
     writer: BatchWriter[int] = BatchWriter(appender, on_disk)
     batch: list[bytes] = []
     received_bytes = batched_bytes = 0
     try:
-        while True:
-            with anyio.fail_after(idle_s):
-                chunk = await anext(stream, None)
-            if chunk is None:
-                return await writer.finish(batch, _as_it_is)
+        async for chunk in stream:
             received_bytes += len(chunk)
             if received_bytes > max_bytes:
                 batch = []
@@ -191,13 +185,12 @@ async def append(
             if batched_bytes >= BATCH_BYTES:
                 await writer.write(batch)
                 batch, batched_bytes = [], 0
-    except BaseException as error:
+        return await writer.finish(batch, _as_it_is)
+    except BaseException:
         with anyio.CancelScope(shield=True):
             with suppress(ServiceError, OSError):  # what has come counts, where it can be written
                 await writer.finish(batch, _as_it_is)
             await writer.discard()
-        if isinstance(error, TimeoutError):
-            raise _silent(idle_s) from None
         raise
 
 
@@ -259,14 +252,4 @@ def _too_long(max_bytes: int) -> ServiceError:
         "Too large",
         f"the request has more than the {max_bytes} bytes that are missing",
         remedy="Send no more than Upload-Length says.",
-    )
-
-
-def _silent(idle_s: float) -> ServiceError:
-    return ServiceError(
-        408,
-        "too-slow",
-        "The request took too long",
-        f"no byte came for {idle_s:g} s; what came before is kept",
-        remedy="Ask for the offset and go on from there.",
     )

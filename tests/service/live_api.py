@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import uvicorn
 
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
@@ -29,6 +28,7 @@ from service.persistence.keys import create_key, create_project
 from service.persistence.map_inputs import inputs_of
 from service.persistence.storing import StoredFile, store_file
 from service.persistence.tables import Project, new_id
+from service.server import server_of
 from service.settings import Settings
 from tests.service.tiny_drive import TinyDrive, tiny_drive
 
@@ -236,8 +236,7 @@ def api_in_thread(settings: Settings) -> Iterator[Api]:
     """The API served by uvicorn in a thread of this process: a real socket, without the start of a process."""
     migrate(settings)
     app = create_app(settings)
-    config = uvicorn.Config(app, host=HOST, port=0, log_config=None, access_log=False, timeout_graceful_shutdown=2)
-    server = uvicorn.Server(config)
+    server = server_of(app, host=HOST, port=0, timeout_graceful_shutdown=2)
     thread = threading.Thread(target=server.run, name="api", daemon=True)
     thread.start()
     wait_until(lambda: server.started or not thread.is_alive(), "the API's start")

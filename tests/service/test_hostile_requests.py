@@ -353,6 +353,6 @@ def test_a_large_body_that_comes_too_slowly(client: Client, monkeypatch: pytest.
         f"POST /v1/drives HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {client.key}\r\nContent-Length: 9000000\r\n\r\n"
     )
     with socket.create_connection((host, port), timeout=30) as connection:
-        connection.sendall(head.encode() + b" " * 1000)
+        connection.sendall(head.encode() + b" " * (bodies.LARGE_BYTES + 1000))
         assert connection.recv(100).startswith(b"HTTP/1.1 408 ")
     wait_until(lambda: client.api.context.large_bodies.borrowed_tokens == 0, "the turn's end")

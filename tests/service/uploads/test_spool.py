@@ -297,17 +297,18 @@ EMPTY_BASE64 = "47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU="
 
 
 @pytest.mark.parametrize(
-    ("header", "digest"),
+    ("fields", "digest"),
     [
-        (None, None),
-        (f"sha-256=:{EMPTY_BASE64}:", EMPTY_SHA256),
-        (f"sha-256=:{EMPTY_BASE64.rstrip('=')}:", EMPTY_SHA256),
-        (f" md5=:AAAA:,\tsha-256=:{EMPTY_BASE64}:;q=1 , sha-512=:AAAA:", EMPTY_SHA256),
-        ("sha-512=:AAAA:", None),
+        ([], None),
+        ([f"sha-256=:{EMPTY_BASE64}:"], EMPTY_SHA256),
+        ([f"sha-256=:{EMPTY_BASE64.rstrip('=')}:"], EMPTY_SHA256),
+        ([f" md5=:AAAA:,\tsha-256=:{EMPTY_BASE64}:;q=1 , sha-512=:AAAA:"], EMPTY_SHA256),
+        (["sha-512=:AAAA:", f"sha-256=:{EMPTY_BASE64}:"], EMPTY_SHA256),
+        ([f"sha-256=:{EMPTY_BASE64}:", f"sha-256=:{EMPTY_BASE64}:"], EMPTY_SHA256),
     ],
 )
-def test_digest_fields(header: str | None, digest: str | None) -> None:
-    assert parse_digest(header) == digest
+def test_digest_fields(fields: list[str], digest: str | None) -> None:
+    assert parse_digest(*fields) == digest
 
 
 @pytest.mark.parametrize(
@@ -321,7 +322,8 @@ def test_digest_fields(header: str | None, digest: str | None) -> None:
         ("sha-256=:AAAA:", "32 bytes, not 3"),
         ("sha-256=:A:", "base64"),
         ("sha-256=:ä:", "form"),
-        (f"sha-256=:{EMPTY_BASE64}:, sha-256=:{EMPTY_BASE64}:", "twice"),
+        (f"sha-256=:{EMPTY_BASE64}:, sha-256=:{'A' * 43}=:", "different values"),
+        ("sha-512=:AAAA:", "does not give sha-256"),
         ("sha-256=:" + "A" * 100_000 + ":", "32 bytes"),
     ],
 )
