@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
@@ -33,11 +35,15 @@ class Metrics:
             registry=self.registry,
         )
         self.received_bytes = Counter("mrasfm_received_bytes", "Bytes of request bodies", registry=self.registry)
-        self.registry.register(_Records(database))
+        self._told = self.registry
+        if os.environ.get("PROMETHEUS_MULTIPROC_DIR"):  # what prometheus_client itself goes by
+            self._told = CollectorRegistry()
+            MultiProcessCollector(self._told)  # type: ignore[no-untyped-call]
+        self._told.register(_Records(database))
 
     def text(self) -> bytes:
-        """All metrics in Prometheus' text format."""
-        return generate_latest(self.registry)
+        """All metrics in Prometheus' text format, of all processes of this API."""
+        return generate_latest(self._told)
 
 
 class _Records(Collector):

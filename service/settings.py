@@ -53,6 +53,7 @@ class Settings(BaseSettings):
     # API
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    api_processes: Annotated[int, Field(ge=0, le=64)] = 0  # that take requests; 0: one a core, at most 2
     max_manifest_bytes: Bytes = 64_000_000
     max_json_bytes: Bytes = 8_000_000  # of every other JSON body
     max_file_bytes: Bytes = 256_000_000  # one image or mask

@@ -6,17 +6,16 @@ how the work ended; where there is none, the exit code or the signal does.
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import os
 import resource
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from service.parent_death import end_with_parent
 from worker.messages import ChildRequest
 
 EXIT_DONE = 0  # there is a result
@@ -24,13 +23,12 @@ EXIT_CRASHED = 70
 EXIT_OUT_OF_MEMORY = 71
 EXIT_ORPHANED = 72
 
-_PR_SET_PDEATHSIG = 1
 _OOM_SCORE = 500  # as if half of the machine's memory more were used: the kernel's choice before any supervisor
 
 
 def main(argv: Sequence[str]) -> int:
     """Do what the request asks; the exit code."""
-    _die_with_parent()
+    end_with_parent()
     request = ChildRequest.read(Path(argv[0]))
     if os.getppid() != request.parent_pid:
         return EXIT_ORPHANED  # it died before the kernel knew that this one should follow
@@ -50,12 +48,6 @@ def main(argv: Sequence[str]) -> int:
         traceback.print_exc()
         return EXIT_CRASHED
     return EXIT_DONE
-
-
-def _die_with_parent() -> None:
-    """Have the kernel kill this process when the thread that started it ends, however that happens."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
 def _be_expendable() -> None:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import suppress
+import os
+from functools import partial
+from typing import TYPE_CHECKING
 
 from service.settings import Settings
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,15 +24,23 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
-    from service.app import create_app
     from service.logs import configure
-    from service.server import allow_many_connections, server_of
+    from service.server import serve
 
     settings = Settings()
     configure(arguments.log_level)
-    allow_many_connections()
-    host, port = arguments.host or settings.host, settings.port if arguments.port is None else arguments.port
-    server = server_of(create_app(settings), host=host, port=port)
-    with suppress(KeyboardInterrupt):  # uvicorn raises it anew once it has stopped
-        server.run()
-    return 0 if server.started else 1
+    return serve(
+        partial(make_app, settings, arguments.log_level),
+        host=arguments.host or settings.host,
+        port=settings.port if arguments.port is None else arguments.port,
+        processes=settings.api_processes or min(2, os.cpu_count() or 1),
+    )
+
+
+def make_app(settings: Settings, log_level: str) -> FastAPI:
+    """The application, in the process that serves it."""
+    from service.app import create_app
+    from service.logs import configure
+
+    configure(log_level)
+    return create_app(settings)

@@ -268,6 +268,7 @@ class ApiProcess(Api):
         given = {
             "MRASFM_DATA_DIR": str(self.settings.data_dir),
             "MRASFM_POLL_SECONDS": "0.05",
+            "MRASFM_API_PROCESSES": "1",
             "MRASFM_MIN_FREE_DISK_BYTES": str(self.settings.min_free_disk_bytes),
         }
         command = [sys.executable, "-m", "service", "api", "--host", HOST, "--port", str(self.port)]
