@@ -10,7 +10,7 @@ from fastapi import APIRouter, BackgroundTasks, Depends, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.drives import EXAMPLE_MANIFEST, DriveResource, DriveState, PreflightResource
+from schemas.api.drives import DriveResource, DriveState, PreflightResource
 from schemas.api.resource import Finding, Page
 from schemas.drive import DriveManifest
 from service.context import Context
@@ -48,7 +48,7 @@ read_manifest = json_body(DriveManifest, lambda settings: settings.max_manifest_
     status_code=201,
     response_model=DriveResource,
     responses=problems(401, 408, 409, 413, 422, 429, 507),
-    openapi_extra=describe(DriveManifest, EXAMPLE_MANIFEST),
+    openapi_extra=describe(DriveManifest),
 )
 async def create_drive(
     once: OnceDep, caller: CallerDep, context: ContextDep, body: Annotated[Body[DriveManifest], Depends(read_manifest)]
@@ -182,7 +182,7 @@ def rejected(drive_id: str, findings: list[Finding]) -> ServiceError:
         "The check of the drive found errors",
         f"drive {drive_id}: {errors[0].what}{more}",
         remedy=errors[0].remedy,
-        findings=[finding.model_dump() for finding in findings],
+        findings=findings,
     )
 
 
