@@ -21,6 +21,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.config import JsonDict
 
 # Long lists end at their first bad item (FailFast): a million bad ones would take gigabytes to describe.
 
@@ -89,7 +90,7 @@ class Pose(_Model):
     """A rigid transform."""
 
     rotation_xyzw: Annotated[list[Finite], Field(min_length=4, max_length=4, description="unit quaternion x, y, z, w")]
-    translation_m: Vector3
+    translation_m: Vector3 = Field(description="x, y, z")
 
     @field_validator("rotation_xyzw")
     @classmethod
@@ -111,7 +112,7 @@ class Pose(_Model):
 class Camera(_Model):
     """One fixed camera of the rig."""
 
-    name: Name
+    name: Name = Field(description="unique in the rig")
     model: str = Field(description=f"COLMAP's camera model: one of {', '.join(CAMERA_MODELS)}")
     width: Annotated[int, Field(gt=0, le=MAX_IMAGE_SIDE_PX, strict=True, description="pixels")]
     height: Annotated[int, Field(gt=0, le=MAX_IMAGE_SIDE_PX, strict=True, description="pixels")]
@@ -175,7 +176,11 @@ def _check_params(params: list[float], *, model: str, width: int, height: int) -
 class Rig(_Model):
     """The vehicle's camera set."""
 
-    body_axes: BodyAxes = BodyAxes.FLU
+    body_axes: BodyAxes = Field(
+        BodyAxes.FLU,
+        description="directions of the rig's x, y, z: flu forward left up, rdf right down forward, frd forward right "
+        "down",
+    )
     cameras: Annotated[list[Camera], Field(min_length=1, max_length=MAX_CAMERAS)]
 
     @model_validator(mode="after")
@@ -198,7 +203,7 @@ class FrameImage(_Model):
 class Frame(_Model):
     """All images of one instant: a rigid unit."""
 
-    timestamp_us: TimestampUs
+    timestamp_us: TimestampUs = Field(description="when the unit is posed; later than the frame before")
     source_frame: Annotated[int, Field(ge=0, le=2**31 - 1, strict=True)] = Field(
         description="the frame's number in the recording it comes from; no two frames share one"
     )
@@ -210,12 +215,12 @@ class Frame(_Model):
 class GnssSample(_Model):
     """One position of the antenna's phase centre on WGS84."""
 
-    timestamp_us: TimestampUs
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
-    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
-    height_m: Annotated[float, Field(ge=-1000, le=20000)]
+    timestamp_us: TimestampUs = Field(description="on the clock of the images")
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] = Field(description="positive in the north")
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] = Field(description="positive in the east")
+    height_m: Annotated[float, Field(ge=-1000, le=20000)] = Field(description="above height_datum")
     sigma_horizontal_m: Positive = Field(description="standard deviation of each horizontal axis")
-    sigma_vertical_m: Positive
+    sigma_vertical_m: Positive = Field(description="standard deviation of the height")
 
 
 class Gnss(_Model):
@@ -226,7 +231,9 @@ class Gnss(_Model):
         description="what height_m counts from: 'ellipsoidal' (WGS84), or the EPSG code of a vertical datum",
     )
     antenna_in_rig_m: Vector3 = Field(description="position of the antenna in the rig frame (lever arm)")
-    samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES), FailFast()]
+    samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES), FailFast()] = Field(
+        description="in order of time; they need not coincide with frames"
+    )
 
     @field_validator("antenna_in_rig_m")
     @classmethod
@@ -239,16 +246,18 @@ class Gnss(_Model):
 class RoughPose(_Model):
     """Roughly where the vehicle was."""
 
-    timestamp_us: TimestampUs
-    world_from_rig: Pose
+    timestamp_us: TimestampUs = Field(description="on the clock of the images")
+    world_from_rig: Pose = Field(description="the rig's pose in the world frame")
 
 
 class RoughTrajectory(_Model):
     """A rough trajectory in any metric, gravity aligned (z up) world frame."""
 
-    poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES), FailFast()]
-    sigma_translation_m: Positive = 0.5
-    sigma_rotation_deg: Positive = 2.0
+    poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES), FailFast()] = Field(
+        description="in order of time"
+    )
+    sigma_translation_m: Positive = Field(0.5, description="standard deviation, per axis")
+    sigma_rotation_deg: Positive = Field(2.0, description="standard deviation, about each axis")
     common_world: Name | None = Field(
         None,
         description="name of the world frame, where other drives have rough poses in the same one: scenes of drives "
@@ -259,7 +268,9 @@ class RoughTrajectory(_Model):
 class LabelMap(_Model):
     """What the ids in the masks mean. Ids that are not listed are refused by name when a mask holds them."""
 
-    ids: dict[Annotated[int, Field(ge=0, le=255)], SemanticClass]
+    ids: dict[Annotated[int, Field(ge=0, le=255)], SemanticClass] = Field(
+        description="by id, which JSON writes as a string"
+    )
 
     @staticmethod
     def cityscapes() -> LabelMap:
@@ -270,16 +281,69 @@ class LabelMap(_Model):
         )
 
 
+# Small, and accepted as it is.
+EXAMPLE_MANIFEST: JsonDict = {
+    "version": 1,
+    "name": "ring-road-2026-05-04",
+    "rig": {
+        "cameras": [
+            {
+                "name": "front",
+                "model": "PINHOLE",
+                "width": 1280,
+                "height": 720,
+                "params": [910.0, 910.0, 640.0, 360.0],
+                "rig_from_cam": {"rotation_xyzw": [-0.5, 0.5, -0.5, 0.5], "translation_m": [1.6, 0.0, 1.4]},
+            }
+        ]
+    },
+    "frames": [
+        {"timestamp_us": 1777887000000000, "source_frame": 0, "images": {"front": {"file": "front/000000.png"}}},
+        {"timestamp_us": 1777887000100000, "source_frame": 1, "images": {"front": {"file": "front/000001.png"}}},
+    ],
+    "gnss": {
+        "height_datum": "ellipsoidal",
+        "antenna_in_rig_m": [0.2, 0.0, 1.6],
+        "samples": [
+            {
+                "timestamp_us": 1777887000000000,
+                "latitude_deg": 48.1374,
+                "longitude_deg": 11.5755,
+                "height_m": 566.2,
+                "sigma_horizontal_m": 0.4,
+                "sigma_vertical_m": 0.8,
+            },
+            {
+                "timestamp_us": 1777887000100000,
+                "latitude_deg": 48.13741,
+                "longitude_deg": 11.57552,
+                "height_m": 566.2,
+                "sigma_horizontal_m": 0.4,
+                "sigma_vertical_m": 0.8,
+            },
+        ],
+    },
+}
+
+
 class DriveManifest(_Model):
     """One recorded drive."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_MANIFEST]})
+
     version: Literal[1] = Field(1, description="of this contract")
-    name: Annotated[str, Field(min_length=1, max_length=200)]
-    rig: Rig
-    frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()]
-    gnss: Gnss | None = None
-    rough_poses: RoughTrajectory | None = None
-    label_map: LabelMap | None = None
+    name: Annotated[str, Field(min_length=1, max_length=200)] = Field(description="what results are called")
+    rig: Rig = Field(description="the vehicle's cameras")
+    frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()] = Field(
+        description="the instants, in order of time"
+    )
+    gnss: Gnss | None = Field(None, description="the receiver's positions")
+    rough_poses: RoughTrajectory | None = Field(None, description="roughly where the vehicle was")
+    label_map: LabelMap | None = Field(
+        None,
+        description="what the ids in masks mean; without it masks hold Cityscapes' train ids 0-18, and 19 for "
+        "unlabelled",
+    )
     notes: Annotated[list[Annotated[str, Field(max_length=2000)]], Field(max_length=100)] = Field(
         default_factory=list, description="what a reader of results should know of the source"
     )

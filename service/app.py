@@ -71,7 +71,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         context.database.close()
 
     app = FastAPI(
-        title="MRASfM", version=version("mrasfm"), description=_ABOUT, lifespan=lifespan, docs_url=None, redoc_url=None
+        title="MRASfM",
+        version=version("mrasfm"),
+        description=_ABOUT,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        generate_unique_id_function=lambda route: route.name,  # `create_drive`: what generated clients call it
     )
     app.state.context = context
     app.state.readiness = Readiness(context)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
+from schemas.api.resource import Finding
 
 
 class ServiceError(Exception):
@@ -38,7 +38,7 @@ class ServiceError(Exception):
         *,
         remedy: str,
         errors: Sequence[ProblemItem] = (),
-        findings: Sequence[Mapping[str, Any]] = (),
+        findings: Sequence[Finding] = (),
         headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(f"{detail} {remedy}")
@@ -52,7 +52,7 @@ class ServiceError(Exception):
             detail=detail,
             remedy=remedy,
             errors=list(errors),
-            findings=[dict(finding) for finding in findings],
+            findings=list(findings),
         )
 
 

@@ -16,6 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from schemas.api.resource import Finding
 from service.logs import log_fields
 from service.persistence import jobs
 from service.persistence.artifacts import ArtifactStore
@@ -204,7 +205,7 @@ class Runner:
             title=_TITLES.get(failed.code) or _FAILED[held.kind],
             detail=failed.what,
             remedy=failed.remedy,
-            findings=[dict(finding) for finding in failed.findings],
+            findings=[Finding.model_validate(finding) for finding in failed.findings],
             log_tail=failed.log_tail or None,
             stage=failed.stage or None,
             retryable=failed.retryable,

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, StringConstraints
 
 from schemas.api.jobs import DriveId, ReconstructionSettings
-from schemas.api.resource import RequestBody
+from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_MAP, EXAMPLE_OTHER_DRIVE, EXAMPLE_SCENE, RequestBody
 
 MAX_MEMBERS = 1000
 SceneId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
@@ -23,13 +23,13 @@ class AggregationRequest(RequestBody):
             "examples": [
                 {
                     "name": "crossing",
-                    "drives": ["drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c", "drv_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b"],
+                    "drives": [EXAMPLE_DRIVE, EXAMPLE_OTHER_DRIVE],
                     "settings": {"use_gnss": True},
                 },
                 {
-                    "map_id": "map_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
-                    "scenes": ["scn_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"],
-                    "remove": ["drv_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b"],
+                    "map_id": EXAMPLE_MAP,
+                    "scenes": [EXAMPLE_SCENE],
+                    "remove": [EXAMPLE_OTHER_DRIVE],
                     "require_all": True,
                 },
             ]
@@ -39,20 +39,17 @@ class AggregationRequest(RequestBody):
     drives: Annotated[list[DriveId], Field(max_length=MAX_MEMBERS)] = Field(
         default=[],
         description="committed drives; what is not reconstructed yet with these settings is reconstructed first",
-        examples=[["drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"]],
     )
     scenes: Annotated[list[SceneId], Field(max_length=MAX_MEMBERS)] = Field(
-        default=[],
-        description="scenes that are taken as they are",
-        examples=[["scn_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"]],
+        default=[], description="scenes that are taken as they are"
     )
     map_id: MapId | None = Field(
-        None, description="make a new version of this map from its current one; null: a new map", examples=[None]
+        None, description="make a new version of this map from its current one; null: a new map"
     )
     remove: Annotated[list[DriveId], Field(max_length=MAX_MEMBERS)] = Field(
         default=[], description="drives or scenes of the map's current version that the new one shall not have"
     )
-    name: MapName | None = Field(None, description="of a new map; by default after its drives", examples=["crossing"])
+    name: MapName | None = Field(None, description="of a new map; by default after its drives")
     settings: ReconstructionSettings = Field(
         default=ReconstructionSettings(), description="of the reconstructions, and of the aggregation where they apply"
     )

@@ -4,35 +4,24 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import ConfigDict, FailFast, Field
+from pydantic.config import JsonDict
 
-from schemas.api.resource import Finding, RequestBody, Resource, Sha256, Times
+from schemas.api.resource import (
+    EXAMPLE_DRIVE,
+    EXAMPLE_SHA256,
+    Finding,
+    RequestBody,
+    Resource,
+    Sha256,
+    Times,
+    example_of,
+)
 from schemas.drive import RelativePath
 
 MAX_DECLARED_FILES = 10_000
-
-EXAMPLE_MANIFEST: dict[str, Any] = {
-    "version": 1,
-    "name": "ring-road-2026-05-04",
-    "rig": {
-        "cameras": [
-            {
-                "name": "front",
-                "model": "PINHOLE",
-                "width": 1280,
-                "height": 720,
-                "params": [910.0, 910.0, 640.0, 360.0],
-                "rig_from_cam": {"rotation_xyzw": [-0.5, 0.5, -0.5, 0.5], "translation_m": [1.6, 0.0, 1.4]},
-            }
-        ]
-    },
-    "frames": [
-        {"timestamp_us": 1777887000000000, "source_frame": 0, "images": {"front": {"file": "front/000000.png"}}},
-        {"timestamp_us": 1777887000100000, "source_frame": 1, "images": {"front": {"file": "front/000001.png"}}},
-    ],
-}
 
 
 class DriveState(StrEnum):
@@ -65,7 +54,7 @@ class DriveResource(Times):
         json_schema_extra={
             "examples": [
                 {
-                    "id": "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
+                    "id": EXAMPLE_DRIVE,
                     "name": "ring-road-2026-05-04",
                     "state": "OPEN",
                     "cameras": 6,
@@ -87,15 +76,18 @@ class DriveResource(Times):
     id: str
     name: str = Field(description="as the manifest says")
     state: DriveState = Field(description="OPEN takes files; COMMITTED is frozen and can be reconstructed")
-    cameras: int
-    frames: int
-    has_gnss: bool
+    cameras: int = Field(description="of the rig")
+    frames: int = Field(description="instants: all cameras at once")
+    has_gnss: bool = Field(description="whether the manifest has positions of a receiver")
     files_expected: int = Field(description="files that the manifest names")
-    files_stored: int
-    bytes_stored: int
+    files_stored: int = Field(description="of them, those whose bytes are here")
+    bytes_stored: int = Field(description="of these files")
     preflight: PreflightState = Field(description=_PREFLIGHT_STATES)
-    preflight_job_id: str | None = None
-    committed_at: datetime | None = None
+    preflight_job_id: str | None = Field(None, description="the job that checks the images; null before the commit")
+    committed_at: datetime | None = Field(None, description="null while it is open")
+
+
+_FILE: JsonDict = {"path": "front/000000.png", "size_bytes": 1048576, "sha256": EXAMPLE_SHA256}
 
 
 class FileRole(StrEnum):
@@ -108,35 +100,41 @@ class FileRole(StrEnum):
 class DriveFileResource(Resource):
     """A file that a drive's manifest names."""
 
-    path: str
-    role: FileRole
-    stored: bool
-    size_bytes: int | None = None
-    sha256: Sha256 | None = None
+    model_config = ConfigDict(json_schema_extra={"examples": [{**_FILE, "role": "image", "stored": True}]})
+
+    path: str = Field(description="as the manifest names it")
+    role: FileRole = Field(description="a camera's image, or the semantic mask of one")
+    stored: bool = Field(description="whether its bytes are here")
+    size_bytes: int | None = Field(None, description="null where it is not stored")
+    sha256: Sha256 | None = Field(None, description="in hexadecimal; null where it is not stored")
 
 
 class FileDeclaration(RequestBody):
     """A file that a client has."""
 
-    path: RelativePath
+    model_config = ConfigDict(json_schema_extra={"examples": [_FILE]})
+
+    path: RelativePath = Field(description="as the manifest names it")
     size_bytes: Annotated[int, Field(ge=0, le=2**50)]
-    sha256: Sha256
+    sha256: Sha256 = Field(description="in hexadecimal, lower case")
 
 
 class DeclareFiles(RequestBody):
     """What a client has, to learn what it must send."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [{"files": [{"path": "front/000000.png", "size_bytes": 1048576, "sha256": "ab" * 32}]}]
-        }
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"files": [_FILE]}]})
 
-    files: Annotated[list[FileDeclaration], Field(min_length=1, max_length=MAX_DECLARED_FILES), FailFast()]
+    files: Annotated[list[FileDeclaration], Field(min_length=1, max_length=MAX_DECLARED_FILES), FailFast()] = Field(
+        description="all that the manifest names, or some of them in each of several requests"
+    )
 
 
 class DeclaredFiles(Resource):
     """What is stored already, here or under another name, and what must be sent."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"stored": ["front/000000.png"], "to_send": ["front/000001.png"]}]}
+    )
 
     stored: list[str] = Field(description="paths whose bytes are there: nothing to send")
     to_send: list[str] = Field(description="paths to upload")
@@ -145,9 +143,13 @@ class DeclaredFiles(Resource):
 class StoredFiles(Resource):
     """What an archive brought."""
 
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"stored": 228, "files_stored": 240, "files_expected": 240}]}
+    )
+
     stored: int = Field(description="files of the archive that are now in the drive")
     files_stored: int = Field(description="files that the drive now has")
-    files_expected: int
+    files_expected: int = Field(description="files that the manifest names")
 
 
 class PreflightResource(Resource):
@@ -159,14 +161,7 @@ class PreflightResource(Resource):
                 {
                     "state": "PASSED",
                     "job_id": "job_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b",
-                    "findings": [
-                        {
-                            "severity": "warning",
-                            "code": "gnss-gap",
-                            "what": "GNSS has no sample for 12.4 s from 103.200 s",
-                            "remedy": "Check the receiver; poses there rest on images alone.",
-                        }
-                    ],
+                    "findings": [example_of(Finding)],
                 }
             ]
         }
@@ -174,4 +169,4 @@ class PreflightResource(Resource):
 
     state: PreflightState = Field(description=_PREFLIGHT_STATES)
     job_id: str | None = Field(None, description="of the check of the images")
-    findings: list[Finding]
+    findings: list[Finding] = Field(description="of the manifest, and of the images once they were looked at")

@@ -7,9 +7,10 @@ from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, StringConstraints
+from pydantic.config import JsonDict
 
 from schemas.api.problems import Problem
-from schemas.api.resource import RequestBody, Resource, Times
+from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_JOB, RequestBody, Resource, Times
 
 DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
 
@@ -17,14 +18,16 @@ DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
 class ReconstructionSettings(RequestBody):
     """What of the engine a request may set; null leaves the engine's default."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"use_gnss": True}]})
+
     use_gnss: bool = Field(True, description="false ignores GNSS everywhere")
-    max_keypoints: Annotated[int, Field(ge=128, le=16384)] | None = Field(None, description="an image")
+    max_keypoints: Annotated[int, Field(ge=128, le=16384)] | None = Field(None, description="at most, of an image")
     max_side_px: Annotated[int, Field(ge=320, le=8192)] | None = Field(
-        None, description="larger images are extracted at reduced size"
+        None, description="pixels; larger images are extracted at reduced size"
     )
     refine_calibration: bool | None = Field(None, description="rig_from_cam, where the drive makes it observable")
     refine_focal: bool | None = Field(None, description="focal lengths, where rig_from_cam varies too")
-    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(None, description="of all that is drawn at random")
     extractor: Literal["sift", "superpoint", "aliked", "xfeat"] | None = Field(
         None, description="of keypoints; all but sift need a model on the workers"
     )
@@ -42,12 +45,10 @@ class ReconstructionRequest(RequestBody):
     """One drive to one scene."""
 
     model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [{"drive_id": "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c", "settings": {"use_gnss": True}}]
-        }
+        json_schema_extra={"examples": [{"drive_id": EXAMPLE_DRIVE, "settings": {"use_gnss": True}}]}
     )
 
-    drive_id: DriveId
+    drive_id: DriveId = Field(description="a committed drive")
     settings: ReconstructionSettings = ReconstructionSettings()
 
 
@@ -70,13 +71,35 @@ class JobState(StrEnum):
     CANCELLED = "CANCELLED"
 
 
+_PROGRESS: JsonDict = {
+    "stage": "matches",
+    "done": 410,
+    "total": 1902,
+    "unit": "pairs",
+    "percent": 33.5,
+    "eta_low_s": 120.0,
+    "eta_high_s": 260.0,
+    "reused_stages": ["features"],
+}
+_ATTEMPT: JsonDict = {
+    "attempt": 1,
+    "worker": "host:4711",
+    "started_at": "2026-05-04T09:31:02Z",
+    "finished_at": None,
+    "outcome": None,
+    "problem": None,
+}
+
+
 class JobProgress(Resource):
     """How far the current attempt is."""
 
-    stage: str | None = Field(None, examples=["matches"])
-    done: int | None = None
-    total: int | None = None
-    unit: str | None = Field(None, description="what done and total count", examples=["pairs"])
+    model_config = ConfigDict(json_schema_extra={"examples": [_PROGRESS]})
+
+    stage: str | None = Field(None, description="what is being done; null before the first")
+    done: int | None = Field(None, description="of the stage")
+    total: int | None = Field(None, description="of the stage")
+    unit: str | None = Field(None, description="what done and total count")
     percent: float = Field(
         description="of the whole job, with what an aggregation waits for; never falls within an attempt",
         ge=0,
@@ -90,22 +113,40 @@ class JobProgress(Resource):
 class JobAttempt(Resource):
     """One try at a job."""
 
-    attempt: int
-    worker: str
+    model_config = ConfigDict(json_schema_extra={"examples": [_ATTEMPT]})
+
+    attempt: int = Field(description="1 for the first, rising")
+    worker: str = Field(description="machine and process")
     started_at: datetime
-    finished_at: datetime | None = None
+    finished_at: datetime | None = Field(None, description="null while it runs")
     outcome: str | None = Field(None, description="succeeded, cancelled, released, or the code of a problem")
-    problem: Problem | None = None
+    problem: Problem | None = Field(None, description="why it failed")
 
 
 class JobMember(Resource):
     """A drive that an aggregation brings into its map."""
 
-    name: str = Field(description="of the scene in the map", examples=["ring-road-2026-05-04"])
-    drive_id: str = Field(examples=["drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"])
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "ring-road-2026-05-04",
+                    "drive_id": EXAMPLE_DRIVE,
+                    "job_id": EXAMPLE_JOB,
+                    "state": "RUNNING",
+                    "percent": 33.5,
+                    "scene_id": None,
+                    "problem": None,
+                }
+            ]
+        }
+    )
+
+    name: str = Field(description="of the scene in the map")
+    drive_id: str
     job_id: str | None = Field(None, description="the reconstruction that makes its scene; null: it was there")
-    state: JobState | None = Field(None, description="of that job; null where its record is gone", examples=["RUNNING"])
-    percent: float = Field(description="of that job", ge=0, le=100, examples=[33.5])
+    state: JobState | None = Field(None, description="of that job; null where its record is gone")
+    percent: float = Field(description="of that job", ge=0, le=100)
     scene_id: str | None = Field(None, description="its scene, once it is there")
     problem: Problem | None = Field(None, description="why there will be none")
 
@@ -117,31 +158,13 @@ class JobResource(Times):
         json_schema_extra={
             "examples": [
                 {
-                    "id": "job_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
+                    "id": EXAMPLE_JOB,
                     "kind": "RECONSTRUCTION",
-                    "drive_id": "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
+                    "drive_id": EXAMPLE_DRIVE,
                     "state": "RUNNING",
                     "settings": {"use_gnss": True},
-                    "progress": {
-                        "stage": "matches",
-                        "done": 410,
-                        "total": 1902,
-                        "unit": "pairs",
-                        "percent": 33.5,
-                        "eta_low_s": 120.0,
-                        "eta_high_s": 260.0,
-                        "reused_stages": [],
-                    },
-                    "attempts": [
-                        {
-                            "attempt": 1,
-                            "worker": "reconstructions@host",
-                            "started_at": "2026-05-04T09:31:02Z",
-                            "finished_at": None,
-                            "outcome": None,
-                            "problem": None,
-                        }
-                    ],
+                    "progress": _PROGRESS,
+                    "attempts": [_ATTEMPT],
                     "cancel_requested": False,
                     "heartbeat_at": "2026-05-04T09:33:40Z",
                     "problem": None,
@@ -160,7 +183,7 @@ class JobResource(Times):
     )
 
     id: str
-    kind: JobKind
+    kind: JobKind = Field(description="PREFLIGHT is the check of a drive's images, which its commit starts")
     drive_id: str | None = Field(None, description="null for an aggregation, which has members")
     state: JobState = Field(
         description="STALLED is RUNNING without a recent heartbeat: another worker will take over. An aggregation is "
@@ -168,14 +191,14 @@ class JobResource(Times):
     )
     settings: dict[str, Any] = Field(description="as asked")
     progress: JobProgress
-    attempts: list[JobAttempt]
-    cancel_requested: bool
-    heartbeat_at: datetime | None = None
+    attempts: list[JobAttempt] = Field(description="oldest first")
+    cancel_requested: bool = Field(description="a job that runs still has to stop")
+    heartbeat_at: datetime | None = Field(None, description="when its worker was last heard of; null before the first")
     problem: Problem | None = Field(None, description="why it failed")
     scene_id: str | None = Field(None, description="what it made")
     map_id: str | None = Field(None, description="of which an aggregation makes a version")
     map_version: int | None = Field(None, description="the version that it made")
     members: list[JobMember] = Field(default_factory=list, description="what an aggregation brings into its map")
     retry_of: str | None = Field(None, description="the job that this one repeats")
-    started_at: datetime | None = None
-    finished_at: datetime | None = None
+    started_at: datetime | None = Field(None, description="of the first attempt")
+    finished_at: datetime | None = Field(None, description="when it succeeded, failed or was cancelled")

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
 
 from pydantic import ConfigDict, Field
+from pydantic.config import JsonDict
 
 from schemas.api.problems import Problem
-from schemas.api.resource import RequestBody, Resource, Sha256, Times
+from schemas.api.resource import (
+    EXAMPLE_DRIVE,
+    EXAMPLE_JOB,
+    EXAMPLE_MAP,
+    EXAMPLE_OTHER_DRIVE,
+    EXAMPLE_SCENE,
+    EXAMPLE_SHA256,
+    RequestBody,
+    Resource,
+    Sha256,
+    Times,
+)
 
-_MAP = "map_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
-_DRIVE = "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
-_JOB = "job_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
-_SUMMARY: dict[str, Any] = {
+_SUMMARY: JsonDict = {
     "registered_units": 80,
     "units": 80,
     "registered_images": 480,
@@ -26,38 +34,61 @@ _SUMMARY: dict[str, Any] = {
     "connected": 2,
     "seams": 1,
 }
+_SCENE: JsonDict = {
+    "name": "ring-road-2026-05-04",
+    "drive_id": EXAMPLE_DRIVE,
+    "scene_id": EXAMPLE_SCENE,
+    "connected": True,
+}
+_OTHER_SCENE: JsonDict = {
+    "name": "ring-road-2026-05-05",
+    "drive_id": EXAMPLE_OTHER_DRIVE,
+    "scene_id": "scn_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b",
+    "connected": True,
+}
+_FILE: JsonDict = {
+    "path": "points.ply",
+    "size_bytes": 2740993,
+    "sha256": EXAMPLE_SHA256,
+    "media_type": "application/octet-stream",
+    "url": f"/v1/maps/{EXAMPLE_MAP}/versions/1/files/points.ply",
+}
 
 
 class MapSummary(Resource):
     """The figures of a map's version that a reader wants first; all are in its report and `map.json`."""
 
-    registered_units: int = Field(description="rigid units with a pose, of all scenes", examples=[80])
-    units: int = Field(examples=[80])
-    registered_images: int = Field(examples=[480])
-    images: int = Field(examples=[480])
-    points: int = Field(examples=[101234])
-    georeferenced: bool = Field(description="whether frame.json ties the map to the earth", examples=[True])
-    warnings: int = Field(description="findings of the report", examples=[0])
-    engine_version: str = Field(examples=["0.2.0"])
-    scenes: int = Field(description="that are in it, connected or not", examples=[2])
-    connected: int = Field(description="of them, those that images tie to the map", examples=[2])
-    seams: int = Field(description="accepted connections of two scenes; map.json has their quality", examples=[1])
+    model_config = ConfigDict(json_schema_extra={"examples": [_SUMMARY]})
+
+    registered_units: int = Field(description="rigid units, one a frame, with a pose, of all scenes")
+    units: int = Field(description="of all drives")
+    registered_images: int = Field(description="images with a pose, of all scenes")
+    images: int = Field(description="of all drives")
+    points: int = Field(description="triangulated points of the map")
+    georeferenced: bool = Field(description="whether frame.json ties the map to the earth")
+    warnings: int = Field(description="findings of the report")
+    engine_version: str = Field(description="that made it")
+    scenes: int = Field(description="that are in it, connected or not")
+    connected: int = Field(description="of them, those that images tie to the map")
+    seams: int = Field(description="accepted connections of two scenes; map.json has their quality")
 
 
 class MapSceneResource(Resource):
     """A scene of a map's version."""
 
-    name: str = Field(description="in map.json, seams and the report", examples=["ring-road-2026-05-04"])
-    drive_id: str = Field(examples=[_DRIVE])
-    scene_id: str = Field(examples=["scn_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"])
-    connected: bool = Field(description="false: placed by its GNSS alone, as it overlaps nothing", examples=[True])
+    model_config = ConfigDict(json_schema_extra={"examples": [_SCENE]})
+
+    name: str = Field(description="in map.json, seams and the report")
+    drive_id: str
+    scene_id: str
+    connected: bool = Field(description="false: placed by its GNSS alone, as it overlaps nothing")
 
 
 class FailedDrive(Resource):
     """A drive that was asked for and is not in the map."""
 
-    name: str = Field(examples=["ring-road-2026-05-05"])
-    drive_id: str = Field(examples=["drv_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b"])
+    name: str = Field(description="of the drive")
+    drive_id: str
     job_id: str | None = Field(None, description="the reconstruction that failed")
     problem: Problem = Field(description="why it has no scene")
 
@@ -65,33 +96,26 @@ class FailedDrive(Resource):
 class MapFileResource(Resource):
     """One artifact of a map's version."""
 
-    path: str = Field(examples=["points.ply"])
-    size_bytes: int = Field(examples=[1387264])
-    sha256: Sha256 = Field(examples=["ab" * 32])
-    media_type: str = Field(examples=["application/octet-stream"])
-    url: str = Field(
-        description="where to get it, relative to the server", examples=[f"/v1/maps/{_MAP}/versions/1/files/points.ply"]
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [_FILE]})
+
+    path: str = Field(description="with its folders")
+    size_bytes: int
+    sha256: Sha256 = Field(description="in hexadecimal")
+    media_type: str = Field(description="what the download says as Content-Type")
+    url: str = Field(description="where to get it, relative to the server")
 
 
-_VERSION: dict[str, Any] = {
-    "map_id": _MAP,
+_VERSION: JsonDict = {
+    "map_id": EXAMPLE_MAP,
     "number": 1,
     "is_current": True,
     "name": "crossing",
-    "job_id": _JOB,
+    "job_id": EXAMPLE_JOB,
     "summary": _SUMMARY,
-    "scenes": [
-        {
-            "name": "ring-road-2026-05-04",
-            "drive_id": _DRIVE,
-            "scene_id": "scn_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
-            "connected": True,
-        }
-    ],
+    "scenes": [_SCENE, _OTHER_SCENE],
     "unconnected": [],
     "failed": [],
-    "files": [],
+    "files": [_FILE],
     "created_at": "2026-05-04T10:41:00Z",
 }
 
@@ -101,7 +125,7 @@ class MapVersionResource(Resource):
 
     model_config = ConfigDict(json_schema_extra={"examples": [_VERSION]})
 
-    map_id: str
+    map_id: str = Field(description="whose version it is")
     number: int = Field(description="1 for the first, rising", ge=1)
     is_current: bool = Field(description="whether the map shows this one")
     name: str = Field(description="of the map")
@@ -121,10 +145,10 @@ class MapResource(Times):
         json_schema_extra={
             "examples": [
                 {
-                    "id": _MAP,
+                    "id": EXAMPLE_MAP,
                     "name": "crossing",
                     "current_version": 1,
-                    "version": _VERSION,
+                    "version": {**_VERSION, "files": []},
                     "job_id": None,
                     "created_at": "2026-05-04T10:31:00Z",
                     "expires_at": None,
@@ -134,7 +158,7 @@ class MapResource(Times):
     )
 
     id: str
-    name: str
+    name: str = Field(description="as the aggregation that began it said")
     current_version: int | None = Field(description="null: none has been published yet")
     version: MapVersionResource | None = Field(None, description="the current one, without its files")
     job_id: str | None = Field(None, description="the aggregation under way that will make the next version")
@@ -145,4 +169,4 @@ class CurrentVersion(RequestBody):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"version": 1}]})
 
-    version: int = Field(ge=1, le=2**31 - 1, description="one that is there", examples=[1])
+    version: int = Field(ge=1, le=2**31 - 1, description="one that is there")

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic.config import JsonDict
+
+# Examples tell of the same things throughout: an answer shows what the request before it made.
+EXAMPLE_DRIVE = "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
+EXAMPLE_OTHER_DRIVE = "drv_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b"
+EXAMPLE_JOB = "job_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
+EXAMPLE_SCENE = "scn_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
+EXAMPLE_MAP = "map_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
+EXAMPLE_SHA256 = "ab" * 32
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Item = TypeVar("Item")
@@ -23,24 +32,64 @@ class RequestBody(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+def example_of(model: type[BaseModel]) -> dict[str, Any]:
+    """The first example of a model.
+
+    Raises
+    ------
+    TypeError
+        Where it has none.
+    """
+    extra = model.model_config.get("json_schema_extra")
+    examples = extra.get("examples") if isinstance(extra, dict) else None
+    if not isinstance(examples, list) or not isinstance(examples[0], dict):
+        raise TypeError(f"{model.__name__} has no example")
+    return dict(examples[0])
+
+
+def _describe_page(schema: JsonDict, page: type[Any]) -> None:
+    (item,) = get_args(page.model_fields["items"].annotation)
+    shown = example_of(item)
+    if "files" in shown:
+        shown["files"] = []  # lists leave them out
+    schema["description"] = Page.__doc__
+    schema["examples"] = [{"items": [shown], "next": None}]
+
+
 class Page(Resource, Generic[Item]):
     """Part of a list, newest first unless said otherwise."""
 
-    items: list[Item]
+    model_config = ConfigDict(json_schema_extra=_describe_page)
+
+    items: list[Item] = Field(description="at most `limit`")
     next: str | None = Field(None, description="give it as `cursor` to go on; null at the end")
 
 
 class Finding(Resource):
     """What the check of a drive found."""
 
-    severity: str = Field(description="error stops a reconstruction, warning does not", examples=["warning"])
-    code: str = Field(examples=["gnss-gap"])
-    what: str = Field(examples=["GNSS has no sample for 12.4 s from 103.200 s"])
-    remedy: str = Field(examples=["Check the receiver; poses there rest on images alone."])
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "severity": "warning",
+                    "code": "gnss-jump",
+                    "what": "GNSS jumps at gnss.samples.412: 38 m in 0.1 s at the first",
+                    "remedy": "Nothing needs to be done for single outliers, which are rejected; for many, check the "
+                    "receiver's data or give larger sigmas.",
+                }
+            ]
+        }
+    )
+
+    severity: Literal["error", "warning"] = Field(description="error stops a reconstruction, warning does not")
+    code: str = Field(description="stable; in lower case with dashes")
+    what: str = Field(description="one sentence that names the file or field")
+    remedy: str = Field(description="one sentence that says what to do")
 
 
 class Times(Resource):
     """When a resource came and when it goes."""
 
-    created_at: datetime
+    created_at: datetime = Field(description="in UTC, as all times")
     expires_at: datetime | None = Field(None, description="when it will be deleted; null: never by itself")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
+from typing import Literal
 
 from pydantic import ConfigDict, Field
+from pydantic.config import JsonDict
 
 from schemas.api.resource import Resource
 
@@ -17,30 +19,47 @@ class Health(StrEnum):
     DEGRADED = "degraded"
 
 
+_WORKER: JsonDict = {
+    "name": "reconstructions@host",
+    "queues": ["reconstructions"],
+    "concurrency": 1,
+    "seen_at": "2026-05-04T09:33:40Z",
+    "online": True,
+}
+_QUEUE: JsonDict = {"queued": 2, "running": 1, "stalled": 0}
+_DISK: JsonDict = {"free_bytes": 80_000_000_000, "total_bytes": 250_000_000_000, "accepts_uploads": True}
+
+
 class WorkerStatus(Resource):
     """A worker as it last reported."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [_WORKER]})
+
     name: str
-    queues: list[str]
-    concurrency: int
-    seen_at: datetime
-    online: bool
+    queues: list[str] = Field(description="whose jobs it does")
+    concurrency: int = Field(description="jobs that it does at one time")
+    seen_at: datetime = Field(description="when it last reported")
+    online: bool = Field(description="whether that was within the last minute")
 
 
 class QueueStatus(Resource):
     """Jobs of all projects."""
 
-    queued: int
-    running: int
-    stalled: int
+    model_config = ConfigDict(json_schema_extra={"examples": [_QUEUE]})
+
+    queued: int = Field(description="jobs that wait")
+    running: int = Field(description="jobs that a worker holds, stalled ones too")
+    stalled: int = Field(description="running jobs without a recent heartbeat")
 
 
 class DiskStatus(Resource):
     """Space where uploads are received."""
 
-    free_bytes: int
-    total_bytes: int
-    accepts_uploads: bool
+    model_config = ConfigDict(json_schema_extra={"examples": [_DISK]})
+
+    free_bytes: int = Field(description="of the file system")
+    total_bytes: int = Field(description="of the file system")
+    accepts_uploads: bool = Field(description="false: so little is free that uploads are refused with 507")
 
 
 class ServiceStatus(Resource):
@@ -54,24 +73,26 @@ class ServiceStatus(Resource):
                     "reasons": ["the broker does not answer: jobs are accepted and start when it is back"],
                     "version": "0.2.0",
                     "broker": False,
-                    "workers": [],
-                    "queue": {"queued": 2, "running": 0, "stalled": 0},
-                    "disk": {"free_bytes": 80000000000, "total_bytes": 250000000000, "accepts_uploads": True},
+                    "workers": [_WORKER],
+                    "queue": _QUEUE,
+                    "disk": _DISK,
                 }
             ]
         }
     )
 
-    status: Health
+    status: Health = Field(description="degraded: some of it does not work; the reasons say what")
     reasons: list[str] = Field(description="what does not work, and what that means")
-    version: str
+    version: str = Field(description="of the service")
     broker: bool = Field(description="whether it answers")
-    workers: list[WorkerStatus]
-    queue: QueueStatus
-    disk: DiskStatus
+    workers: list[WorkerStatus] = Field(description="that reported within the last day")
+    queue: QueueStatus = Field(description="jobs of all projects")
+    disk: DiskStatus = Field(description="where uploads are received")
 
 
 class Ready(Resource):
     """The service takes requests."""
 
-    status: str = Field(examples=["ready"])
+    model_config = ConfigDict(json_schema_extra={"examples": [{"status": "ready"}]})
+
+    status: Literal["alive", "ready"]

@@ -6,7 +6,7 @@ from datetime import datetime
 
 from pydantic import ConfigDict, Field
 
-from schemas.api.resource import Resource, Sha256
+from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_SHA256, Resource, Sha256
 
 
 class UploadResource(Resource):
@@ -17,11 +17,11 @@ class UploadResource(Resource):
             "examples": [
                 {
                     "id": "upl_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
-                    "drive_id": "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c",
+                    "drive_id": EXAMPLE_DRIVE,
                     "path": "front/000000.png",
                     "size_bytes": 73400320,
                     "offset_bytes": 0,
-                    "sha256": "ab" * 32,
+                    "sha256": EXAMPLE_SHA256,
                     "done": False,
                     "created_at": "2026-05-04T09:30:00Z",
                     "expires_at": "2026-05-05T09:30:00Z",
@@ -30,10 +30,10 @@ class UploadResource(Resource):
         }
     )
 
-    id: str = Field(examples=["upl_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"])
-    drive_id: str = Field(description="whose file it becomes", examples=["drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"])
+    id: str
+    drive_id: str = Field(description="whose file it becomes")
     path: str | None = Field(None, description="as the manifest names it; null: an archive of files")
-    size_bytes: int = Field(description="of the whole, as announced in Upload-Length", examples=[73400320])
+    size_bytes: int = Field(description="of the whole, as announced in Upload-Length")
     offset_bytes: int = Field(description="where the next PATCH goes on; all of them: there is nothing to send")
     sha256: Sha256 | None = Field(None, description="of the whole, if it was announced; other bytes are refused")
     done: bool = Field(description="the bytes are the drive's")

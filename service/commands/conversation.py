@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
@@ -84,16 +84,12 @@ def job_failed(job: JobResource, summary: Told, display: Display) -> int:
 def items_of(problem: Problem) -> list[str]:
     """The particulars of a problem, a line each."""
     lines = [f"  {item.field}: {item.detail}" if item.field else f"  {item.detail}" for item in problem.errors]
-    lines += [_finding(finding) for finding in problem.findings]
+    lines += [f"  {finding.severity}: {finding.what}. {finding.remedy}" for finding in problem.findings]
     if len(lines) > _SHOWN_ITEMS:
         lines[_SHOWN_ITEMS:] = [f"  and {len(lines) - _SHOWN_ITEMS} more"]
     if problem.log_tail:
         lines += ["  the last lines of its log:", *(f"    {line}" for line in problem.log_tail.splitlines())]
     return lines
-
-
-def _finding(finding: Mapping[str, Any]) -> str:
-    return f"  {finding.get('severity', 'finding')}: {finding.get('what', '')}. {finding.get('remedy', '')}".rstrip()
 
 
 def failed(summary: Told, display: Display, text: str, code: int) -> int:

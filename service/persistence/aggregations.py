@@ -15,6 +15,7 @@ from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DriveState, PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
+from schemas.api.resource import Finding
 from service.errors import ServiceError
 from service.persistence import drives, jobs, maps
 from service.persistence.checkpoints import settings_sha256
@@ -301,7 +302,7 @@ def _rejection(drive: Drive) -> Problem:
         title="The check of the drive found errors",
         detail=str(first.get("what", "the check of the drive found errors")),
         remedy=str(first.get("remedy", "Correct the drive, and upload it as a new one.")),
-        findings=[dict(finding) for finding in drive.findings],
+        findings=[Finding.model_validate(finding) for finding in drive.findings],
         stage="preflight",
         retryable=False,
     )

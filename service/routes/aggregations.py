@@ -13,20 +13,23 @@ from service.context import Context
 from service.persistence import aggregations
 from service.persistence.idempotency import Answer
 from service.persistence.tables import Job, now_us
+from service.routes.answers import gives, problems
 from service.routes.bodies import Body, describe, json_body
-from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us, problems
+from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us
 from service.routes.job_views import RETRY_AFTER_S, view_of
 
-router = APIRouter(prefix="/v1/aggregations", tags=["jobs"])
+router = APIRouter(prefix="/v1/aggregations", tags=["maps"])
 
 read_request = json_body(AggregationRequest, lambda settings: settings.max_json_bytes)
+ACCEPTED = gives(202, "The job is recorded and will run", "Location", "Retry-After")
 
 
 @router.post(
     "",
     status_code=202,
     response_model=JobResource,
-    responses=problems(401, 404, 408, 409, 413, 422, 429),
+    summary="Ask for a map",
+    responses={**ACCEPTED, **problems(401, 404, 408, 409, 413, 422, 429)},
     openapi_extra=describe(AggregationRequest),
 )
 def create_aggregation(

@@ -133,20 +133,15 @@ def request_sha256(request: Request, raw: bytes) -> str:
 documented: dict[str, type[BaseModel]] = {}
 
 
-def describe(model: type[BaseModel], example: dict[str, Any] | None = None) -> dict[str, Any]:
-    """`openapi_extra` of a route whose body is `model`; the model's own examples are shown where none is given."""
-    documented[model.__name__] = model
-    content: dict[str, Any] = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
-    if example is not None:
-        content["example"] = example
-    return {"requestBody": {"required": True, "content": {"application/json": content}}}
+def describe(model: type[BaseModel]) -> dict[str, Any]:
+    """`openapi_extra` of a route whose body is `model`."""
+    return {"requestBody": {"required": True, "content": json_content(model)}}
 
 
-def describe_answer(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
-    """`responses` of a route that answers with a stored document of this form."""
+def json_content(model: type[BaseModel]) -> dict[str, Any]:
+    """The `content` of what FastAPI neither parses nor writes itself."""
     documented[model.__name__] = model
-    reference = {"$ref": f"#/components/schemas/{model.__name__}"}
-    return {200: {"content": {"application/json": {"schema": reference}}}}
+    return {"application/json": {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}}
 
 
 def describe_bytes(what: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import BackgroundTasks, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
@@ -15,7 +15,6 @@ from pydantic import BaseModel
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.problems import MEDIA_TYPE
 from service.context import Context
 from service.errors import ServiceError
 from service.persistence import jobs
@@ -126,7 +125,10 @@ async def get_once(
     request: Request,
     background: BackgroundTasks,
     idempotency_key: Annotated[
-        str | None, Header(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description=_IDEMPOTENCY)
+        str | None,
+        Header(
+            alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description=_IDEMPOTENCY
+        ),
     ] = None,
 ) -> Once:
     """The idempotent execution of this request."""
@@ -151,31 +153,6 @@ def answer(status: int, body: BaseModel, *, waiting: tuple[Job, ...] = (), **hea
     """An answer with a resource as its body; header names are written with underscores."""
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     return Answer(status=status, body=body.model_dump(mode="json"), headers=named, jobs=waiting)
-
-
-def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """`responses` of a route: which problems it answers with."""
-    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    known = {
-        400: "The request is malformed",
-        401: "No valid API key",
-        404: "There is no such thing in this project",
-        405: "The resource has no such method",
-        408: "The body came too slowly",
-        409: "The resource is not in the right state; the problem says what to do",
-        410: "Its time is over, and its bytes were dropped",
-        412: "Another version of the protocol",
-        413: "Too large, or the storage quota is full",
-        415: "The bytes are of no kind that is taken here",
-        416: "The range lies outside the file",
-        422: "The request or the drive is at fault; all defects are listed",
-        423: "Another request is writing it",
-        429: "A quota is full; try later",
-        460: "The checksum of the request's bytes is another; they were dropped",
-        503: "Database, artifact store or another part does not answer; try again",
-        507: "The disk is full",
-    }
-    return {status: {"description": known[status], "content": content} for status in statuses}
 
 
 def expiry_us(created_us: int, days: float | None) -> int | None:

@@ -9,21 +9,54 @@ from typing import Any
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
+from schemas.api.resource import EXAMPLE_SHA256
 from service.context import Context
 from service.errors import store_unavailable
 from service.persistence.tables import Blob
+from service.routes.answers import gives
 from service.routes.ranges import Part, content_disposition, none_match, requested_part
 from service.uploads.digests import format_digest
 
+_ETAG = f'"{EXAMPLE_SHA256}"'
 _FILE = {"schema": {"type": "string", "format": "binary"}}
-DOWNLOADS: dict[int | str, dict[str, Any]] = {
-    200: {"description": "The whole file", "content": {"application/octet-stream": _FILE}},
-    206: {"description": "The range that was asked for", "content": {"application/octet-stream": _FILE}},
-    304: {"description": "The client has this version"},
+_CONTENT = {"application/octet-stream": _FILE}
+_HEADERS = (
+    "ETag",
+    "Repr-Digest",
+    "Accept-Ranges",
+    "Cache-Control",
+    "Content-Disposition",
+    "X-Content-Type-Options",
+)
+_NOT_MODIFIED = gives(304, "The client has this version", *_HEADERS)
+DOWNLOADS = {
+    **gives(200, "The whole file", *_HEADERS, content=_CONTENT),
+    **gives(206, "The range that was asked for", *_HEADERS, "Content-Range", content=_CONTENT),
+    **_NOT_MODIFIED,
 }
-HEADS: dict[int | str, dict[str, Any]] = {
-    200: {"description": "What a download would answer"},
-    304: DOWNLOADS[304],
+HEADS = {**gives(200, "What a download would answer", *_HEADERS, "Content-Length"), **_NOT_MODIFIED}
+
+
+def _asked(name: str, description: str, example: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "in": "header",
+        "required": False,
+        "description": description,
+        "schema": {"type": "string"},
+        "example": example,
+    }
+
+
+_IF_NONE_MATCH = _asked("If-None-Match", "`ETag` of what you have: 304 where the file is still that", _ETAG)
+# `openapi_extra` of the routes: `send_file` reads these itself.
+HEAD_PARAMETERS = {"parameters": [_IF_NONE_MATCH]}
+DOWNLOAD_PARAMETERS = {
+    "parameters": [
+        _asked("Range", "one part: `bytes=FIRST-LAST`, `bytes=FIRST-` or `bytes=-COUNT`", "bytes=0-1023"),
+        _asked("If-Range", "`ETag` of what you have: the whole file where it is another by now", _ETAG),
+        _IF_NONE_MATCH,
+    ]
 }
 
 

@@ -10,7 +10,7 @@ from fastapi import APIRouter, BackgroundTasks, Depends, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.drives import EXAMPLE_MANIFEST, DriveResource, DriveState, PreflightResource
+from schemas.api.drives import DriveResource, DriveState, PreflightResource
 from schemas.api.resource import Finding, Page
 from schemas.drive import DriveManifest
 from service.context import Context
@@ -23,7 +23,8 @@ from service.persistence.durability import secure_drive
 from service.persistence.idempotency import Answer
 from service.persistence.storing import StoredFile, Storing, storing
 from service.persistence.tables import Blob, Drive, now_us
-from service.routes.bodies import Body, describe, describe_answer, json_body
+from service.routes.answers import gives, problems
+from service.routes.bodies import Body, describe, json_body, json_content
 from service.routes.dependencies import (
     CallerDep,
     ContextDep,
@@ -33,7 +34,6 @@ from service.routes.dependencies import (
     answer,
     expiry_us,
     moment,
-    problems,
 )
 from service.routes.paging import cursor_of, position_of
 from service.uploads.spool import SpoolWriter
@@ -47,8 +47,9 @@ read_manifest = json_body(DriveManifest, lambda settings: settings.max_manifest_
     "",
     status_code=201,
     response_model=DriveResource,
-    responses=problems(401, 408, 409, 413, 422, 429, 507),
-    openapi_extra=describe(DriveManifest, EXAMPLE_MANIFEST),
+    summary="Create a drive",
+    responses={**gives(201, "The drive is open", "Location"), **problems(401, 408, 409, 413, 422, 429, 507)},
+    openapi_extra=describe(DriveManifest),
 )
 async def create_drive(
     once: OnceDep, caller: CallerDep, context: ContextDep, body: Annotated[Body[DriveManifest], Depends(read_manifest)]
@@ -83,7 +84,7 @@ def _store_manifest(context: Context, store: Storing, raw: bytes) -> StoredFile:
         writer.discard()
 
 
-@router.get("", responses=problems(401, 422))
+@router.get("", summary="List drives", responses={**gives(200, "A page of drives"), **problems(401, 422)})
 def list_drives(
     caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[DriveResource]:
@@ -98,7 +99,7 @@ def list_drives(
     )
 
 
-@router.get("/{drive_id}", responses=problems(401, 404))
+@router.get("/{drive_id}", summary="Show a drive", responses={**gives(200, "The drive"), **problems(401, 404)})
 def get_drive(drive_id: str, caller: CallerDep, context: ContextDep) -> DriveResource:
     """One drive."""
     with context.database.read() as session:
@@ -108,9 +109,10 @@ def get_drive(drive_id: str, caller: CallerDep, context: ContextDep) -> DriveRes
 @router.get(
     "/{drive_id}/manifest",
     response_class=Response,
-    responses={**describe_answer(DriveManifest), **problems(401, 404)},
+    summary="Show a drive's manifest",
+    responses={**gives(200, "The manifest", content=json_content(DriveManifest)), **problems(401, 404)},
 )
-def get_manifest(drive_id: str, caller: CallerDep, context: ContextDep) -> Response:
+def get_drive_manifest(drive_id: str, caller: CallerDep, context: ContextDep) -> Response:
     """The drive's manifest, byte for byte as it was sent."""
     with context.database.read() as session:
         drive = drives.get(session, caller.project_id, drive_id)
@@ -118,7 +120,12 @@ def get_manifest(drive_id: str, caller: CallerDep, context: ContextDep) -> Respo
     return Response(context.artifacts.read(key), media_type="application/json")
 
 
-@router.delete("/{drive_id}", status_code=204, responses=problems(401, 404, 409))
+@router.delete(
+    "/{drive_id}",
+    status_code=204,
+    summary="Delete a drive",
+    responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
+)
 def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a drive and its files. Scenes that were made of it stay.
 
@@ -129,7 +136,15 @@ def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, backgrou
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 
-@router.post("/{drive_id}:commit", response_model=DriveResource, responses=problems(401, 404, 409, 422, 429, 503))
+@router.post(
+    "/{drive_id}:commit",
+    response_model=DriveResource,
+    summary="Commit a drive",
+    responses={
+        **gives(200, "The drive is frozen, and the check of its images begins"),
+        **problems(401, 404, 409, 422, 429, 503),
+    },
+)
 async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
     """Freeze a drive whose files are all there, check its manifest, and start the check of its images.
 
@@ -160,7 +175,11 @@ async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context:
     return await anyio.to_thread.run_sync(partial(once, effect, prepare=prepare), limiter=context.commits)
 
 
-@router.get("/{drive_id}/preflight", responses=problems(401, 404))
+@router.get(
+    "/{drive_id}/preflight",
+    summary="Show what the check of a drive found",
+    responses={**gives(200, "What is known so far"), **problems(401, 404)},
+)
 def get_preflight(drive_id: str, caller: CallerDep, context: ContextDep) -> PreflightResource:
     """What the check of the drive found: of the manifest at once, of the images when its job is done."""
     with context.database.read() as session:
@@ -182,7 +201,7 @@ def rejected(drive_id: str, findings: list[Finding]) -> ServiceError:
         "The check of the drive found errors",
         f"drive {drive_id}: {errors[0].what}{more}",
         remedy=errors[0].remedy,
-        findings=[finding.model_dump() for finding in findings],
+        findings=findings,
     )
 
 

@@ -22,8 +22,9 @@ from service.errors import ServiceError
 from service.persistence import drives, slots
 from service.persistence.idempotency import Answer
 from service.persistence.tables import Blob, DriveFile
+from service.routes.answers import gives, problems
 from service.routes.bodies import Body, describe, describe_bytes, json_body
-from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, problems
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer
 from service.routes.keeping import keep_archive, keep_file, require_room, require_wanted
 from service.routes.paging import cursor_of, position_of
 from service.uploads.digests import parse_digest
@@ -49,7 +50,7 @@ ContentDigest = Annotated[
 Replace = Annotated[bool, Query(description="take the bytes although others are stored under this name")]
 
 
-@router.get("/files", responses=problems(401, 404, 422))
+@router.get("/files", summary="List files", responses={**gives(200, "A page of files"), **problems(401, 404, 422)})
 def list_files(
     drive_id: str,
     caller: CallerDep,
@@ -76,7 +77,8 @@ def list_files(
 @router.post(
     "/files:declare",
     response_model=DeclaredFiles,
-    responses=problems(401, 404, 408, 409, 413, 422),
+    summary="Learn which files must be sent",
+    responses={**gives(200, "What is here and what is not"), **problems(401, 404, 408, 409, 413, 422)},
     openapi_extra=describe(DeclareFiles),
 )
 def declare_files(
@@ -101,9 +103,10 @@ def declare_files(
 @router.put(
     "/files/{path:path}",
     response_model=DriveFileResource,
+    summary="Send a file",
     responses={
-        200: {"description": "Was stored before"},
-        201: {"model": DriveFileResource, "description": "Stored"},
+        **gives(200, "These bytes were stored before"),
+        **gives(201, "Stored", model=DriveFileResource),
         **problems(400, 401, 404, 409, 413, 422, 507),
     },
     openapi_extra=describe_bytes("the file's bytes"),
@@ -140,7 +143,12 @@ async def put_file(
     return shown
 
 
-@router.delete("/files/{path:path}", status_code=204, responses=problems(401, 404, 409, 422))
+@router.delete(
+    "/files/{path:path}",
+    status_code=204,
+    summary="Forget a file",
+    responses={**gives(204, "Its bytes are not here any more"), **problems(401, 404, 409, 422)},
+)
 def delete_file(drive_id: str, path: str, caller: CallerDep, context: ContextDep) -> None:
     """Forget the bytes of one file of an open drive."""
     with context.database.write() as session:
@@ -149,7 +157,8 @@ def delete_file(drive_id: str, path: str, caller: CallerDep, context: ContextDep
 
 @router.put(
     "/archive",
-    responses=problems(400, 401, 404, 409, 413, 415, 422, 507),
+    summary="Send an archive of files",
+    responses={**gives(200, "All its files are stored"), **problems(400, 401, 404, 409, 413, 415, 422, 507)},
     openapi_extra=describe_bytes(
         "a zip, tar, tar.gz, tar.bz2 or tar.xz of files under the names that the manifest gives"
     ),

@@ -19,16 +19,25 @@ from service.persistence import aggregations, jobs, trees
 from service.persistence.idempotency import Answer
 from service.persistence.owned import require
 from service.persistence.tables import TERMINAL, Job, JobEvent, JobState, now_us
-from service.routes.aggregations import accepted
-from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, expiry_us, problems
+from service.routes.aggregations import ACCEPTED, accepted
+from service.routes.answers import gives, problems
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, expiry_us
 from service.routes.job_views import RETRY_AFTER_S, etag_of, view_of, views_of
 from service.routes.paging import cursor_of, position_of
 from service.routes.ranges import none_match
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
+_EVENTS = {
+    "text/event-stream": {
+        "example": 'event: state\ndata: {"state":"RUNNING","attempt":1,"percent":0.0}\nid: 2\n\n'
+        'event: progress\ndata: {"attempt":1,"stage":"matches","done":410,"total":1902,"unit":"pairs","percent":33.5,'
+        '"eta_low_s":120.0,"eta_high_s":260.0}\nid: 17\n\n'
+    }
+}
 
-@router.get("", responses=problems(401, 422))
+
+@router.get("", summary="List jobs", responses={**gives(200, "A page of jobs"), **problems(401, 422)})
 def list_jobs(
     caller: CallerDep,
     context: ContextDep,
@@ -56,14 +65,21 @@ def list_jobs(
 @router.get(
     "/{job_id}",
     response_model=JobResource,
-    responses={304: {"description": "Nothing has changed since the ETag in If-None-Match"}, **problems(401, 404)},
+    summary="Show a job",
+    responses={
+        **gives(200, "The job as it is now", "ETag", "Cache-Control", sometimes=["Retry-After"]),
+        **gives(304, "Nothing has changed since If-None-Match", "ETag", "Cache-Control", sometimes=["Retry-After"]),
+        **problems(401, 404),
+    },
 )
 def get_job(
     job_id: str,
     caller: CallerDep,
     context: ContextDep,
     response: Response,
-    if_none_match: Annotated[str | None, Header(max_length=2000)] = None,
+    if_none_match: Annotated[
+        str | None, Header(alias="If-None-Match", max_length=2000, description="`ETag` of an answer before")
+    ] = None,
 ) -> Response | JobResource:
     """One job: poll this every `Retry-After` seconds, with `If-None-Match`, or read its events."""
     with context.database.read() as session:
@@ -79,7 +95,13 @@ def get_job(
     return shown
 
 
-@router.post("/{job_id}:cancel", status_code=202, response_model=JobResource, responses=problems(401, 404, 409, 422))
+@router.post(
+    "/{job_id}:cancel",
+    status_code=202,
+    response_model=JobResource,
+    summary="Cancel a job",
+    responses={**gives(202, "It has ended, or will", "Location"), **problems(401, 404, 409, 422)},
+)
 def cancel_job(
     job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep, background: BackgroundTasks
 ) -> Response:
@@ -99,7 +121,11 @@ def cancel_job(
 
 
 @router.post(
-    "/{job_id}:retry", status_code=202, response_model=JobResource, responses=problems(401, 404, 409, 422, 429)
+    "/{job_id}:retry",
+    status_code=202,
+    response_model=JobResource,
+    summary="Do a job again",
+    responses={**ACCEPTED, **problems(401, 404, 409, 422, 429)},
 )
 def retry_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
     """Do again what failed or was cancelled, as a new job. Finished stages are reused."""
@@ -121,12 +147,23 @@ def _existing(job_id: str, caller: CallerDep, context: ContextDep) -> str:
         return require(session, Job, caller.project_id, job_id).id
 
 
-@router.get("/{job_id}/events", response_class=EventSourceResponse, responses=problems(401, 404, 422))
-async def stream_events(
+@router.get(
+    "/{job_id}/events",
+    response_class=EventSourceResponse,
+    summary="Follow a job",
+    responses={
+        **gives(200, "Events as they come", "Cache-Control", "X-Accel-Buffering", content=_EVENTS),
+        **problems(401, 404, 422),
+    },
+)
+async def stream_job_events(
     job_id: Annotated[str, Depends(_existing)],
     context: ContextDep,
     last_event_id: Annotated[
-        int | None, Header(ge=0, lt=2**62, description="go on after this event, as a browser does by itself")
+        int | None,
+        Header(
+            alias="Last-Event-ID", ge=0, lt=2**62, description="go on after this event, as a browser does by itself"
+        ),
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """The job's changes of state, from the beginning, and its newest progress, until it has ended."""

@@ -16,9 +16,17 @@ from service.errors import not_found
 from service.persistence import maps
 from service.persistence.collecting import collect_unused
 from service.persistence.tables import Blob, Map, MapFile, MapScene, MapVersion
+from service.routes.answers import gives, problems
 from service.routes.bodies import Body, describe, json_body
-from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment, problems
-from service.routes.downloads import DOWNLOADS, HEADS, download_name, send_file
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment
+from service.routes.downloads import (
+    DOWNLOAD_PARAMETERS,
+    DOWNLOADS,
+    HEAD_PARAMETERS,
+    HEADS,
+    download_name,
+    send_file,
+)
 from service.routes.paging import cursor_of, position_of
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
@@ -26,7 +34,7 @@ router = APIRouter(prefix="/v1/maps", tags=["maps"])
 read_current = json_body(CurrentVersion, lambda settings: settings.max_json_bytes)
 
 
-@router.get("", responses=problems(401, 422))
+@router.get("", summary="List maps", responses={**gives(200, "A page of maps"), **problems(401, 422)})
 def list_maps(caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor: Cursor = None) -> Page[MapResource]:
     """Maps of the project, newest first, with their current versions."""
     with context.database.read() as session:
@@ -36,14 +44,19 @@ def list_maps(caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor:
     return Page(items=items, next=None if last is None else cursor_of(last.created_us, last.id))
 
 
-@router.get("/{map_id}", responses=problems(401, 404))
+@router.get("/{map_id}", summary="Show a map", responses={**gives(200, "The map"), **problems(401, 404)})
 def get_map(map_id: str, caller: CallerDep, context: ContextDep) -> MapResource:
     """One map and its current version. One without a version is being made, or could not be."""
     with context.database.read() as session:
         return _shown(session, maps.get(session, caller.project_id, map_id))
 
 
-@router.delete("/{map_id}", status_code=204, responses=problems(401, 404, 409))
+@router.delete(
+    "/{map_id}",
+    status_code=204,
+    summary="Delete a map",
+    responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
+)
 def delete_map(map_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a map with all its versions. Its scenes and drives stay."""
     with context.database.write() as session:
@@ -54,10 +67,11 @@ def delete_map(map_id: str, caller: CallerDep, context: ContextDep, background: 
 @router.put(
     "/{map_id}/current-version",
     response_model=MapResource,
-    responses=problems(401, 404, 408, 409, 413, 422),
+    summary="Choose a map's current version",
+    responses={**gives(200, "The map with this version"), **problems(401, 404, 408, 409, 413, 422)},
     openapi_extra=describe(CurrentVersion),
 )
-def show_version(
+def set_current_version(
     map_id: str, caller: CallerDep, context: ContextDep, body: Annotated[Body[CurrentVersion], Depends(read_current)]
 ) -> MapResource:
     """Make another version the current one, for example to go back. The next aggregation goes on from it."""
@@ -68,8 +82,12 @@ def show_version(
         return _shown(session, found)
 
 
-@router.get("/{map_id}/versions", responses=problems(401, 404, 422))
-def list_versions(
+@router.get(
+    "/{map_id}/versions",
+    summary="List a map's versions",
+    responses={**gives(200, "A page of versions"), **problems(401, 404, 422)},
+)
+def list_map_versions(
     map_id: str, caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[MapVersionResource]:
     """Versions of a map, newest first, without their files."""
@@ -85,16 +103,25 @@ def list_versions(
     return Page(items=items, next=None if last is None else cursor_of(last.number))
 
 
-@router.get("/{map_id}/versions/{version}", responses=problems(401, 404))
-def get_version(map_id: str, version: str, caller: CallerDep, context: ContextDep) -> MapVersionResource:
+@router.get(
+    "/{map_id}/versions/{version}",
+    summary="Show a map's version",
+    responses={**gives(200, "The version"), **problems(401, 404)},
+)
+def get_map_version(map_id: str, version: str, caller: CallerDep, context: ContextDep) -> MapVersionResource:
     """One version and its files, by its number or as `current`."""
     with context.database.read() as session:
         found = maps.get(session, caller.project_id, map_id)
         return _shown_version(session, found, maps.version_of(session, found, version), with_files=True)
 
 
-@router.delete("/{map_id}/versions/{version}", status_code=204, responses=problems(401, 404, 409))
-def delete_version(
+@router.delete(
+    "/{map_id}/versions/{version}",
+    status_code=204,
+    summary="Delete a map's version",
+    responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
+)
+def delete_map_version(
     map_id: str, version: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks
 ) -> None:
     """Delete a version that is not the current one. Its scenes stay."""
@@ -106,13 +133,17 @@ def delete_version(
 @router.head(
     "/{map_id}/versions/{version}/files/{path:path}",
     response_class=Response,
-    summary="Download's headers",
+    name="head_map_file",
+    summary="Show a download's headers",
     responses={**HEADS, **problems(401, 404)},
+    openapi_extra=HEAD_PARAMETERS,
 )
 @router.get(
     "/{map_id}/versions/{version}/files/{path:path}",
     response_class=Response,
+    summary="Download a file of a map",
     responses={**DOWNLOADS, **problems(401, 404, 416)},
+    openapi_extra=DOWNLOAD_PARAMETERS,
 )
 async def download_map_file(
     map_id: str, version: str, path: str, request: Request, caller: CallerDep, context: ContextDep

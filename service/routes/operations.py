@@ -16,27 +16,30 @@ from service.metrics import CONTENT_TYPE, ONLINE_US, Metrics
 from service.persistence.tables import Job, JobState, WorkerSeen, now_us
 from service.persistence.wakeups import QUEUES, BrokerError
 from service.readiness import Readiness
-from service.routes.dependencies import CallerDep, ContextDep, moment, problems
+from service.routes.answers import gives, problems
+from service.routes.dependencies import CallerDep, ContextDep, moment
 
 router = APIRouter(tags=["operation"])
 
+_ALIVE = {"application/json": {"example": {"status": "alive"}}}
 
-@router.get("/livez")
-async def live() -> Ready:
+
+@router.get("/livez", summary="Is it alive?", responses=gives(200, "It is", content=_ALIVE))
+async def get_liveness() -> Ready:
     """The process answers."""
     return Ready(status="alive")
 
 
-@router.get("/readyz", responses=problems(503))
-async def ready(request: Request) -> Ready:
+@router.get("/readyz", summary="Is it ready?", responses={**gives(200, "It is"), **problems(503)})
+async def get_readiness(request: Request) -> Ready:
     """Database and artifact store can be written. A broker that is down does not matter here: uploads go on."""
     readiness: Readiness = request.app.state.readiness
     await readiness.require()
     return Ready(status="ready")
 
 
-@router.get("/v1/status", responses=problems(401))
-def status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
+@router.get("/v1/status", summary="How is it?", responses={**gives(200, "Also where it is degraded"), **problems(401)})
+def get_status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
     """What works and what does not, and what that means for you."""
     broker, reasons = True, []
     try:
@@ -110,8 +113,13 @@ def metrics_route(metrics: Metrics) -> APIRouter:
     """`/metrics` of these metrics."""
     metrics_router = APIRouter(tags=["operation"])
 
-    @metrics_router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
-    async def read_metrics() -> Response:
+    @metrics_router.get(
+        "/metrics",
+        response_class=Response,
+        summary="Metrics",
+        responses=gives(200, "In Prometheus' text format", content={"text/plain": {"schema": {"type": "string"}}}),
+    )
+    async def get_metrics() -> Response:
         """Metrics for Prometheus."""
         return Response(await run_in_threadpool(metrics.text), media_type=CONTENT_TYPE)
 

@@ -14,12 +14,13 @@ from service.errors import ServiceError
 from service.persistence import drives, jobs
 from service.persistence.idempotency import Answer
 from service.persistence.tables import now_us
-from service.routes.aggregations import accepted
+from service.routes.aggregations import ACCEPTED, accepted
+from service.routes.answers import problems
 from service.routes.bodies import Body, describe, json_body
-from service.routes.dependencies import CallerDep, ContextDep, OnceDep, expiry_us, problems
+from service.routes.dependencies import CallerDep, ContextDep, OnceDep, expiry_us
 from service.routes.drives import rejected
 
-router = APIRouter(prefix="/v1/reconstructions", tags=["jobs"])
+router = APIRouter(prefix="/v1/reconstructions", tags=["reconstructions"])
 
 read_request = json_body(ReconstructionRequest, lambda settings: settings.max_json_bytes)
 
@@ -28,7 +29,8 @@ read_request = json_body(ReconstructionRequest, lambda settings: settings.max_js
     "",
     status_code=202,
     response_model=JobResource,
-    responses=problems(401, 404, 408, 409, 413, 422, 429),
+    summary="Ask for a reconstruction",
+    responses={**ACCEPTED, **problems(401, 404, 408, 409, 413, 422, 429)},
     openapi_extra=describe(ReconstructionRequest),
 )
 def create_reconstruction(

@@ -17,14 +17,22 @@ from service.persistence.collecting import collect_unused
 from service.persistence.maps import require_unused
 from service.persistence.owned import require
 from service.persistence.tables import Blob, Scene, SceneFile
-from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment, problems
-from service.routes.downloads import DOWNLOADS, HEADS, download_name, send_file
+from service.routes.answers import gives, problems
+from service.routes.dependencies import CallerDep, ContextDep, Cursor, Limit, moment
+from service.routes.downloads import (
+    DOWNLOAD_PARAMETERS,
+    DOWNLOADS,
+    HEAD_PARAMETERS,
+    HEADS,
+    download_name,
+    send_file,
+)
 from service.routes.paging import cursor_of, position_of
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 
-@router.get("", responses=problems(401, 422))
+@router.get("", summary="List scenes", responses={**gives(200, "A page of scenes"), **problems(401, 422)})
 def list_scenes(
     caller: CallerDep,
     context: ContextDep,
@@ -48,7 +56,7 @@ def list_scenes(
     )
 
 
-@router.get("/{scene_id}", responses=problems(401, 404))
+@router.get("/{scene_id}", summary="Show a scene", responses={**gives(200, "The scene"), **problems(401, 404)})
 def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneResource:
     """One scene and its files."""
     with context.database.read() as session:
@@ -58,7 +66,12 @@ def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneRes
     return _shown(scene, [_shown_file(file, blob) for file, blob in rows])
 
 
-@router.delete("/{scene_id}", status_code=204, responses=problems(401, 404, 409))
+@router.delete(
+    "/{scene_id}",
+    status_code=204,
+    summary="Delete a scene",
+    responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
+)
 def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a scene and its files. Its drive stays; what a map is made of cannot be deleted."""
     with context.database.write() as session:
@@ -71,15 +84,21 @@ def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, backgrou
 @router.head(
     "/{scene_id}/files/{path:path}",
     response_class=Response,
-    summary="Download's headers",
+    name="head_scene_file",
+    summary="Show a download's headers",
     responses={**HEADS, **problems(401, 404)},
+    openapi_extra=HEAD_PARAMETERS,
 )
 @router.get(
     "/{scene_id}/files/{path:path}",
     response_class=Response,
+    summary="Download a file of a scene",
     responses={**DOWNLOADS, **problems(401, 404, 416)},
+    openapi_extra=DOWNLOAD_PARAMETERS,
 )
-async def download(scene_id: str, path: str, request: Request, caller: CallerDep, context: ContextDep) -> Response:
+async def download_scene_file(
+    scene_id: str, path: str, request: Request, caller: CallerDep, context: ContextDep
+) -> Response:
     """One file of a scene. `Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
     scene, file, blob = await run_in_threadpool(_look_up, context, caller.project_id, scene_id, path)
     name = download_name(scene.name, path)

@@ -15,7 +15,8 @@ from service.errors import ServiceError
 from service.persistence import drives, uploads
 from service.persistence.idempotency import Answer
 from service.persistence.tables import Upload, now_us
-from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, moment, problems
+from service.routes.answers import gives, problems
+from service.routes.dependencies import CallerDep, ContextDep, OnceDep, answer, moment
 from service.routes.upload_writing import UploadWriting, discard, look
 from service.uploads import tus
 from service.uploads.spool import require_space
@@ -45,12 +46,19 @@ router = APIRouter(prefix="/v1/drives/{drive_id}/uploads", tags=["uploads"], rou
 Resumable = Annotated[str | None, Header(alias="Tus-Resumable", description=f"always `{tus.VERSION}`")]
 _BYTES = {"schema": {"type": "string", "format": "binary", "description": "the bytes from Upload-Offset on"}}
 _PATCH_BODY = {"requestBody": {"required": True, "content": {tus.CONTENT_TYPE: _BYTES}}}
-_OFFSET = {"Upload-Offset": {"description": "how many bytes are here for good", "schema": {"type": "integer"}}}
 
 
-@router.options("", status_code=204, responses=problems(401, 404))
+@router.options(
+    "",
+    status_code=204,
+    summary="Show what of tus there is",
+    responses={
+        **gives(204, "See the headers", "Tus-Version", "Tus-Extension", "Tus-Checksum-Algorithm", "Tus-Max-Size"),
+        **problems(401, 404),
+    },
+)
 @router.options("/{upload_id}", status_code=204, include_in_schema=False)
-def describe_protocol(drive_id: str, caller: CallerDep, context: ContextDep, response: Response) -> None:
+def get_upload_protocol(drive_id: str, caller: CallerDep, context: ContextDep, response: Response) -> None:
     """Which version and extensions of tus this service speaks, and how large an upload may be."""
     with context.database.read() as session:
         drives.get(session, caller.project_id, drive_id)
@@ -64,7 +72,11 @@ def describe_protocol(drive_id: str, caller: CallerDep, context: ContextDep, res
     "",
     status_code=201,
     response_model=UploadResource,
-    responses=problems(400, 401, 404, 409, 412, 413, 422, 429, 507),
+    summary="Begin a resumable upload",
+    responses={
+        **gives(201, "It takes bytes, or is complete already", "Location", "Upload-Offset", "Upload-Expires"),
+        **problems(400, 401, 404, 409, 412, 413, 422, 429, 507, sometimes={413: "Tus-Max-Size"}),
+    },
 )
 def create_upload(
     drive_id: str,
@@ -72,16 +84,17 @@ def create_upload(
     caller: CallerDep,
     context: ContextDep,
     tus_resumable: Resumable = None,
-    upload_length: Annotated[str | None, Header(description="bytes of the whole file")] = None,
+    upload_length: Annotated[str | None, Header(alias="Upload-Length", description="bytes of the whole file")] = None,
     upload_metadata: Annotated[
         str | None,
         Header(
+            alias="Upload-Metadata",
             description="`path` with a file's name in the manifest, or `archive` for a zip or tar of files; "
             "`sha256` with the digest of the whole in hexadecimal; `replace` to take the bytes although others are "
-            "stored. Values are in base64"
+            "stored. Values are in base64",
         ),
     ] = None,
-    upload_concat: Annotated[str | None, Header(description="not supported")] = None,
+    upload_concat: Annotated[str | None, Header(alias="Upload-Concat", description="not supported")] = None,
 ) -> Response:
     """Begin a resumable upload of one file of an open drive, or of an archive; `Location` takes its bytes.
 
@@ -128,12 +141,21 @@ def create_upload(
 @router.head(
     "/{upload_id}",
     response_class=Response,
+    summary="Show how far an upload is",
     responses={
-        200: {"description": "How far the upload is", "headers": _OFFSET},
+        **gives(
+            200,
+            "How far the upload is",
+            "Upload-Offset",
+            "Upload-Expires",
+            "Upload-Length",
+            "Cache-Control",
+            sometimes=["Upload-Metadata"],
+        ),
         **problems(400, 401, 404, 409, 410, 412, 413, 415, 422, 423, 507),
     },
 )
-async def get_offset(
+async def get_upload_offset(
     drive_id: str, upload_id: str, caller: CallerDep, context: ContextDep, tus_resumable: Resumable = None
 ) -> Response:
     """Where to go on. All bytes up to `Upload-Offset` are here, also after a crash of the service or its machine."""
@@ -149,22 +171,30 @@ async def get_offset(
     "/{upload_id}",
     status_code=204,
     response_class=Response,
+    summary="Go on with an upload",
     responses={
-        204: {"description": "The bytes are here for good", "headers": _OFFSET},
-        **problems(400, 401, 404, 408, 409, 410, 412, 413, 415, 422, 423, 460, 507),
+        **gives(204, "The bytes are here for good", "Upload-Offset", "Upload-Expires"),
+        **problems(
+            *(400, 401, 404, 408, 409, 410, 412, 413, 415, 422, 423, 460, 507), sometimes={409: "Upload-Offset"}
+        ),
     },
     openapi_extra=_PATCH_BODY,
 )
-async def append_bytes(
+async def append_to_upload(
     drive_id: str,
     upload_id: str,
     request: Request,
     caller: CallerDep,
     context: ContextDep,
     tus_resumable: Resumable = None,
-    upload_offset: Annotated[str | None, Header(description="where these bytes begin: what HEAD answered")] = None,
+    upload_offset: Annotated[
+        str | None, Header(alias="Upload-Offset", description="where these bytes begin: what HEAD answered")
+    ] = None,
     upload_checksum: Annotated[
-        str | None, Header(description="`sha256 BASE64` or `sha1 BASE64` of these bytes; others are dropped")
+        str | None,
+        Header(
+            alias="Upload-Checksum", description="`sha256 BASE64` or `sha1 BASE64` of these bytes; others are dropped"
+        ),
     ] = None,
 ) -> Response:
     """Go on with an upload. With its last byte it becomes the drive's file, as a PUT of it does.
@@ -190,8 +220,13 @@ async def append_bytes(
     return Response(status_code=204, headers=_headers(upload, offset))
 
 
-@router.delete("/{upload_id}", status_code=204, responses=problems(401, 404, 410, 412, 423))
-async def end_upload(
+@router.delete(
+    "/{upload_id}",
+    status_code=204,
+    summary="End an upload",
+    responses={**gives(204, "Its bytes are dropped"), **problems(401, 404, 410, 412, 423)},
+)
+async def delete_upload(
     drive_id: str, upload_id: str, caller: CallerDep, context: ContextDep, tus_resumable: Resumable = None
 ) -> None:
     """End an upload and drop its bytes. What has become a file of the drive stays."""
@@ -214,12 +249,12 @@ async def override_method(
     match (x_http_method_override or "").upper():
         case "PATCH":
             given = (resumable, headers.get("upload-offset"), headers.get("upload-checksum"))
-            return await append_bytes(drive_id, upload_id, request, caller, context, *given)
+            return await append_to_upload(drive_id, upload_id, request, caller, context, *given)
         case "DELETE":
-            await end_upload(drive_id, upload_id, caller, context, resumable)
+            await delete_upload(drive_id, upload_id, caller, context, resumable)
             return Response(status_code=204)
         case "HEAD":
-            return await get_offset(drive_id, upload_id, caller, context, resumable)
+            return await get_upload_offset(drive_id, upload_id, caller, context, resumable)
     raise ServiceError(
         405,
         "method-not-allowed",

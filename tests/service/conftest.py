@@ -29,6 +29,13 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield running
 
 
+@pytest.fixture(scope="session")
+def page(api: Api) -> dict[str, Any]:
+    """The OpenAPI page."""
+    with api.anonymous() as client:
+        return dict(client.get("/openapi.json").json())
+
+
 @pytest.fixture
 def client(api: Api) -> Client:
     """A client of a project of its own."""

@@ -15,7 +15,7 @@ from schemathesis.generation import GenerationMode
 
 from tests.service.tiny_drive import manifest, png
 
-KEY = "idempotency-key"
+KEY = "Idempotency-Key"
 _MANIFEST = manifest("fuzzed", frames=1)
 _PATHS = tuple(image["file"] for image in _MANIFEST["frames"][0]["images"].values())
 
@@ -47,7 +47,7 @@ def before_call(context: Any, case: Any, kwargs: dict[str, Any]) -> None:
     if label == "POST /v1/drives" and not isinstance(case.body, NotSet):
         case.body = _MANIFEST
         # A replayed answer may name a drive that was deleted since.
-        case.headers = {name: value for name, value in (case.headers or {}).items() if name.lower() != KEY}
+        case.headers = {name: value for name, value in (case.headers or {}).items() if name != KEY}
     elif label == "PUT /v1/drives/{drive_id}/files/{path}":
         case.path_parameters["path"] = _PATHS[chance // 2 % len(_PATHS)]
         case.body = png(seed=str(chance // 2 % 3))

@@ -80,7 +80,7 @@ def test_a_key_is_free_after_an_error(client: Client) -> None:
 def test_keys_that_are_refused(client: Client, key: str) -> None:
     answer = client.post("/v1/drives", content=tiny_drive().raw, headers={"Idempotency-Key": key.encode()})
     problem = problem_of(answer, 422, "invalid-request")
-    assert problem["errors"][0]["field"] == "header.idempotency-key"
+    assert problem["errors"][0]["field"] == "header.Idempotency-Key"
 
 
 def test_two_requests_at_once_have_one_effect(client: Client) -> None:
