@@ -37,3 +37,10 @@ def test_images_are_pinned_and_only_the_api_is_published_on_loopback() -> None:
     for image in re.findall(r"image: (\S+)", COMPOSE):
         assert re.search(r":(v?\d|\$\{MRASFM_VERSION)", image), image
     assert re.findall(r"ports: (.*)", COMPOSE) == ['["${MRASFM_LISTEN:-127.0.0.1}:${MRASFM_PORT:-8000}:8000"]']
+
+
+def test_one_service_alone_builds_the_image() -> None:
+    """Several that build one tag at the same time end with "already exists" where containerd keeps the images."""
+    assert len(re.findall(r"^ +build:", COMPOSE, re.MULTILINE)) == 1
+    migrate = COMPOSE.partition("\n  migrate:\n")[2].partition("\n\n")[0]
+    assert "\n    build: ." in migrate  # all others wait for it, so that it is part of whatever is started
