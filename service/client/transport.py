@@ -103,6 +103,7 @@ class Transport:
             headers={"Authorization": f"Bearer {_checked_key(key)}", "Accept-Encoding": "identity"},
             timeout=httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, pool=None),
             limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
+            follow_redirects=False,  # the key is for this service, not for whom it names
             # A proxy of the environment cannot reach this machine's loopback.
             trust_env=not is_loopback(httpx.URL(self.url).host),
         )
@@ -163,9 +164,14 @@ class Transport:
         ------
         ApiError
             The service refused it.
+        ClientError
+            `path` is not one.
         TroubleError
             It may work another time; also where the connection breaks while the answer is read.
         """
+        if not path.startswith("/") or path.startswith("//"):
+            # httpx would take an address for the whole target, and send the key there.
+            raise ClientError(f"{path!r} is not a path of {self.url}. Nothing was sent to it.")
         timeout = httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, read=read_timeout_s, pool=None)
         content = None if body is None else body()
         try:

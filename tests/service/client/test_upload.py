@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +20,15 @@ from service.client import (
     DriveFolderError,
     UnreachableError,
     UploadState,
+    resumable,
     start_reconstruction,
     upload_drive,
 )
 from service.client import Client as LibraryClient
 from service.client.drive_folder import identify
+from service.client.transport import Transport
 from service.client.upload_state import STATE_NAME
-from tests.service.client.bad_network import Cut, bad_network
+from tests.service.client.bad_network import Cut, Recorder, bad_network
 from tests.service.client.conftest import Connect, written
 from tests.service.live_api import Client, free_port
 from tests.service.tiny_drive import png, tiny_drive
@@ -236,6 +241,55 @@ def test_what_is_kept_goes_elsewhere_where_the_folder_is_not_writable(
     first = upload_drive(library, folder)
     assert len(list((tmp_path / "cache" / "mrasfm" / "uploads").iterdir())) == 1
     assert upload_drive(library, folder).drive_id == first.drive_id
+
+
+@pytest.fixture
+def stranger() -> Iterator[Recorder]:
+    """A server that is not the service, and notes what it is told."""
+    with closing(Recorder()) as server:
+        yield server
+
+
+@pytest.mark.parametrize("form", ["{url}/steal", "//{host}/steal", "../../../steal", "upl_0/../../steal", "upl_0\n"])
+def test_no_address_in_the_folder_is_given_the_key(
+    client: Client, connect: Connect, tmp_path: Path, stranger: Recorder, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    """A drive's folder may come from anybody, with a record of an upload in it."""
+    monkeypatch.setattr(resumable, "FROM_BYTES", 1)
+    folder = DriveFolder.read(written(tiny_drive(seed=tmp_path.name), tmp_path / "drive"))
+    library = connect(client)
+    target = form.format(url=stranger.url, host=stranger.url.removeprefix("http://"))
+    files = [identify(folder.root, path) for path in folder.paths]
+    planted = {
+        "upload": str(uuid.uuid4()),
+        "drive_id": client.create(tiny_drive(seed=tmp_path.name)),
+        "resumable": {f"{file.path} {file.sha256}": target for file in files},
+    }
+    record = {"version": 1, "uploads": {f"{library.url} {folder.manifest_sha256}": planted}}
+    (folder.root / STATE_NAME).write_text(json.dumps(record))
+    sent = upload_drive(library, folder)
+    assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
+    assert stranger.requests == []
+
+
+@pytest.mark.parametrize("target", ["{url}/x", "//{host}/x", "v1/drives", "", "http:/x"])
+def test_only_paths_of_the_service_are_asked_for(client: Client, stranger: Recorder, target: str) -> None:
+    target = target.format(url=stranger.url, host=stranger.url.removeprefix("http://"))
+    transport = Transport(client.api.url, client.key, connections=1, patience_s=0.0)
+    with closing(transport), pytest.raises(ClientError, match="is not a path"):
+        transport.request("GET", target)
+    assert stranger.requests == []
+
+
+def test_a_redirect_is_told_and_not_followed(stranger: Recorder) -> None:
+    with (
+        closing(Recorder(redirect_to=f"{stranger.url}/v1/status")) as first,
+        LibraryClient(first.url, "key") as library,
+        pytest.raises(ApiError, match=f"leads to: {stranger.url}/v1/status"),
+    ):
+        library.status()
+    assert len(first.requests) == 1
+    assert stranger.requests == []
 
 
 @pytest.mark.parametrize("kept", [b"", b"{", b"[]", b'{"version": 1, "uploads": {"x": 3}}'])
