@@ -45,8 +45,8 @@ class JobEvent:
 class Client:
     """A service, under one API key.
 
-    Every request is tried again while trouble may pass: no connection, a broken one, 5xx, 429. May be used by many
-    threads.
+    Every request is tried again while trouble may pass: no connection, a broken one, 5xx, 408, 429. May be used by
+    many threads.
 
     Parameters
     ----------

@@ -64,10 +64,11 @@ class ResumableUpload:
             It does not answer.
         """
         self.begin()
-        patience = self._client.patience()
+        patience, reached_bytes = self._client.patience(), 0
         while (offset := self._offset(patience)) < self._file.size_bytes:
-            if offset > self._counted_bytes:
+            if offset > reached_bytes:  # however little of what was sent: it goes on
                 patience.renew()
+            reached_bytes = offset
             self._count(offset)
             try:
                 self._append(offset)

@@ -25,7 +25,13 @@ IO_TIMEOUT_S = 60.0
 CHECK_TIMEOUT_S = 180.0  # an answer that waits for the check of a large manifest
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 15.0
 _SHOWN_CHARACTERS = 200
-_PASSING = (HTTPStatus.INTERNAL_SERVER_ERROR, HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE, 504)
+_PASSING = (
+    HTTPStatus.REQUEST_TIMEOUT,  # the body came too slowly: this machine slept, or its network was gone for a while
+    HTTPStatus.INTERNAL_SERVER_ERROR,
+    HTTPStatus.BAD_GATEWAY,
+    HTTPStatus.SERVICE_UNAVAILABLE,
+    HTTPStatus.GATEWAY_TIMEOUT,
+)
 
 Body = Callable[[], Iterator[bytes]]  # called for every try, so that each begins with the first byte
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from service.client import ApiError, ClientError, DriveFolder, UploadState, resumable, upload_drive
-from service.client.drive_folder import identify
+from service.client.drive_folder import LocalFile, identify
 from service.client.parallel import Meter, no_report
 from service.client.resumable import ResumableUpload
 from service.client.upload_state import STATE_NAME
@@ -18,6 +20,7 @@ from service.persistence.tables import Drive
 from service.uploads.resumable import PartialFile
 from tests.service.client.bad_network import Cut, bad_network
 from tests.service.client.conftest import Connect, written
+from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client
 from tests.service.test_uploads import image
 from tests.service.tiny_drive import TinyDrive, tiny_drive
@@ -72,6 +75,28 @@ def test_another_run_goes_on_in_the_middle_of_a_file(
     upload_drive(again, folder, parallel=1, report=lambda stage, at, of: done.append(at) if stage == "send" else None)
     assert any(at >= kept for at in done[:3]), "the first that is counted is what was there"
     assert UploadState(folder, again.url).uploads == {}
+
+
+def test_a_machine_that_slept_goes_on_in_the_middle_of_a_file(
+    start_api: StartApi, connect: Connect, large_drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = start_api(upload_idle_seconds=0.3).client()
+    file, drive_id, begun_at = identify(large_drive, "front/000001.png"), client.create(), list[int]()
+    awake = LocalFile.pieces
+
+    def pieces(self: LocalFile, offset: int = 0) -> Iterator[bytes]:
+        begun_at.append(offset)
+        for i, piece in enumerate(awake(self, offset)):
+            if i == 2 and len(begun_at) == 1:
+                time.sleep(1.0)
+            yield piece
+
+    monkeypatch.setattr(LocalFile, "pieces", pieces)
+    ResumableUpload(connect(client), drive_id, file, Meter(no_report, "send", file.size_bytes)).send()
+    assert len(begun_at) == 2
+    assert begun_at[1] > 0, "what came before is not sent again"
+    (sent,) = client.get(f"/v1/drives/{drive_id}/files", params={"stored": "true"}).json()["items"]
+    assert sent["sha256"] == file.sha256
 
 
 def test_an_upload_that_is_gone_begins_anew(client: Client, connect: Connect, large_drive: Path) -> None:

@@ -143,6 +143,21 @@ def test_lost_answers_have_their_effect_once(client: Client, connect: Connect, d
     assert sorted(job["kind"] for job in jobs) == ["PREFLIGHT", "RECONSTRUCTION"]
 
 
+def test_requests_that_came_too_slowly_are_sent_again(client: Client, connect: Connect, drive: Path) -> None:
+    """As after a while in which this machine slept: 408 is no refusal."""
+    answer = b"HTTP/1.1 408 Request Timeout\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+    parts = (b"POST /v1/drives ", b":declare", b"PUT /v1/drives/", b":commit")
+    cuts = [Cut(part, answer_bytes=0, times=2, answer=answer) for part in parts]
+    with bad_network(client.api.url, *cuts) as network:
+        upload_drive(connect(client, url=network.url), DriveFolder.read(drive))
+        cuts[0].times = 1000
+        with pytest.raises(ApiError) as ended:
+            connect(client, url=network.url, patience_s=0.5).create_drive(tiny_drive().raw)
+    assert ended.value.status == 408, "patience ends here too"
+    assert [len(cut.seen) for cut in cuts[1:]] == [2, 2, 2]
+    assert [(shown["state"], shown["files_stored"]) for shown in drives_of(client)] == [("COMMITTED", 6)]
+
+
 def test_nothing_is_sent_where_files_are_missing(client: Client, drive: Path) -> None:
     (drive / "rear" / "000002.png").unlink()
     shutil.rmtree(drive / "front")
