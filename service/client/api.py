@@ -98,8 +98,8 @@ class Client:
         self._transport.close()
 
     def stop(self) -> None:
-        """End what waits or sends in other threads, soon."""
-        self._transport.closing.set()
+        """End what waits, sends or receives in other threads, now. The client cannot be used again."""
+        self._transport.stop()
 
     @property
     def stopped(self) -> bool:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import threading
+import time
 import uuid
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -26,11 +30,12 @@ from service.client import (
 )
 from service.client import Client as LibraryClient
 from service.client.drive_folder import identify
+from service.client.parallel import in_parallel
 from service.client.transport import Transport
 from service.client.upload_state import STATE_NAME
 from tests.service.client.bad_network import Cut, Recorder, bad_network
 from tests.service.client.conftest import Connect, written
-from tests.service.live_api import Client, free_port
+from tests.service.live_api import DEADLINE_S, Client, free_port, wait_until
 from tests.service.tiny_drive import png, tiny_drive
 
 
@@ -236,6 +241,48 @@ def test_what_cannot_be_a_url_is_refused(url: str) -> None:
     with pytest.raises(ClientError, match="URL") as refused:
         LibraryClient(url, "key")
     assert "secret" not in str(refused.value)
+
+
+def test_a_client_that_is_stopped_waits_for_nothing(client: Client, connect: Connect) -> None:
+    silent = [Cut(part, answer_bytes=0, times=9, silent=True) for part in (b"/status", b"/jobs/")]
+    with bad_network(client.api.url, *silent) as network, ThreadPoolExecutor() as pool:
+        library = connect(client, url=network.url)
+        waiting = [pool.submit(library.status), pool.submit(lambda: list(library.events("job_0")))]
+        wait_until(lambda: all(cut.seen for cut in silent), "the requests")
+        began_s = time.monotonic()
+        library.stop()
+        for asked in waiting:
+            with pytest.raises(UnreachableError, match="the client was stopped"):
+                asked.result(DEADLINE_S)
+        assert time.monotonic() - began_s < 5
+        with pytest.raises(UnreachableError, match="the client was stopped"):
+            library.create_drive(tiny_drive().raw)
+    assert drives_of(client) == [], "nothing is begun after it"
+
+
+def test_work_that_cannot_be_ended_is_not_waited_for() -> None:
+    stopped, released, begun = threading.Event(), threading.Event(), list[int]()
+
+    def work(item: int) -> None:
+        begun.append(item)
+        released.wait(DEADLINE_S)
+
+    def interrupt() -> None:
+        wait_until(lambda: begun, "the work")
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    interrupting = threading.Thread(target=interrupt)
+    interrupting.start()
+    began_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            in_parallel(work, [1, 2, 3], threads=1, stop=stopped.set)
+    finally:
+        released.set()
+    interrupting.join()
+    assert stopped.is_set()
+    assert begun == [1]
+    assert time.monotonic() - began_s < 10
 
 
 def test_patience_ends() -> None:
