@@ -62,9 +62,7 @@ class Settings(BaseSettings):
     max_json_bytes: Bytes = 8_000_000  # of every other JSON body
     max_file_bytes: Bytes = 256_000_000  # one image or mask
     max_archive_bytes: Bytes = 50_000_000_000  # one zip or tar, and what it unpacks to
-    max_compression_ratio: Annotated[float, Field(gt=1, le=1e6, allow_inf_nan=False)] = (
-        200.0  # of one archive entry; images hardly compress
-    )
+    max_compression_ratio: Ratio = 200.0  # of one archive entry; images hardly compress
     min_free_disk_bytes: Annotated[int, Field(ge=0, le=_MAX_BYTES)] = 1_000_000_000  # below, uploads are refused (507)
     max_concurrent_writes: Count = 8  # uploads that write to disk at one time; the others wait their turn
     upload_hours: Hours = 24.0  # a resumable upload that nobody goes on with ends
