@@ -39,6 +39,7 @@ MAX_CAMERAS = 64
 MAX_FRAMES = 100_000
 MAX_GNSS_SAMPLES = 1_000_000  # 100 Hz for 2.7 hours
 MAX_IMAGE_SIDE_PX = 20_000
+MAX_PATH_CHARACTERS = 512
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
 MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
@@ -52,7 +53,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 
 def _relative_path(value: str) -> str:
     path = PurePosixPath(value)
-    plain = value.isprintable() and "\\" not in value and 0 < len(value) <= 512
+    plain = value.isprintable() and "\\" not in value and 0 < len(value) <= MAX_PATH_CHARACTERS
     plain = plain and all(len(part.encode()) <= 255 for part in path.parts)  # what file systems can hold
     # str(path) differs where the same file could be written in two ways: './a', 'a//b', 'a/'.
     if not plain or path.is_absolute() or ".." in path.parts or str(path) != value or value == ".":

@@ -8,14 +8,14 @@ from __future__ import annotations
 import argparse
 import sys
 
-from service.commands import api, keys, migrate, standalone
+from service.commands import api, keys, migrate, projects, standalone
 
 
 def main() -> int:
     """Run one subcommand."""
     parser = argparse.ArgumentParser(prog="python -m service")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (api, keys, migrate, standalone):
+    for command in (api, keys, migrate, projects, standalone):
         command.register(subparsers)
     arguments = parser.parse_args()
     return int(arguments.run(arguments))

@@ -16,8 +16,13 @@ from urllib.parse import quote
 from pydantic import Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-Bytes = Annotated[int, Field(ge=1)]
+# Numbers have both bounds: what does not fit the database's integers, or a date, would fail at the first request.
+_MAX_BYTES = 2**60
+Bytes = Annotated[int, Field(ge=1, le=_MAX_BYTES)]
+Hours = Annotated[float, Field(gt=0, le=24 * 365, allow_inf_nan=False)]
+Days = Annotated[float, Field(gt=0, le=36_500, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, le=7 * 86400, allow_inf_nan=False)]
+Ratio = Annotated[float, Field(gt=1, le=1e6, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
 
@@ -58,12 +63,13 @@ class Settings(BaseSettings):
     max_json_bytes: Bytes = 8_000_000  # of every other JSON body
     max_file_bytes: Bytes = 256_000_000  # one image or mask
     max_archive_bytes: Bytes = 50_000_000_000  # one zip or tar, and what it unpacks to
-    max_compression_ratio: Annotated[float, Field(gt=1)] = 200.0  # of one archive entry; images hardly compress
-    min_free_disk_bytes: Annotated[int, Field(ge=0)] = 1_000_000_000  # below, uploads are refused (507)
+    max_compression_ratio: Ratio = 200.0  # of one archive entry; images hardly compress
+    min_free_disk_bytes: Annotated[int, Field(ge=0, le=_MAX_BYTES)] = 1_000_000_000  # below, uploads are refused (507)
     max_concurrent_writes: Count = 8  # uploads that write to disk at one time; the others wait their turn
-    upload_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 24.0  # a resumable upload that nobody goes on with ends
+    upload_hours: Hours = 24.0  # a resumable upload that nobody goes on with ends
     upload_idle_seconds: Seconds = 60.0  # a request of whose body nothing comes ends; resumable uploads keep what came
-    poll_seconds: Seconds = 1.0  # how often an event stream looks for news
+    # how often an event stream looks for news, and whether its key is still valid
+    poll_seconds: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 1.0
 
     # Quotas of a new project
     project_max_bytes: Bytes = 1_000_000_000_000
@@ -85,11 +91,11 @@ class Settings(BaseSettings):
     engine_threads: Annotated[int, Field(ge=0, le=1024)] = 0  # of one reconstruction; 0: all cores
 
     # Retention; None keeps for ever
-    drive_retention_days: Annotated[float, Field(gt=0)] | None = None
-    scene_retention_days: Annotated[float, Field(gt=0)] | None = None
-    map_retention_days: Annotated[float, Field(gt=0)] | None = None  # since its newest version
-    job_retention_days: Annotated[float, Field(gt=0)] | None = None  # also of maps that have no version
-    idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
+    drive_retention_days: Days | None = None
+    scene_retention_days: Days | None = None
+    map_retention_days: Days | None = None  # since its newest version
+    job_retention_days: Days | None = None  # also of maps that have no version
+    idempotency_hours: Hours = 24.0
 
     @field_validator(*{name for first, _, second in _IN_STEP for name in (first, second)})
     @classmethod

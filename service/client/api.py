@@ -45,8 +45,8 @@ class JobEvent:
 class Client:
     """A service, under one API key.
 
-    Every request is tried again while trouble may pass: no connection, a broken one, 5xx, 429. May be used by many
-    threads.
+    Every request is tried again while trouble may pass: no connection, a broken one, 5xx, 408, 429. May be used by
+    many threads.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ class Client:
         self._transport.close()
 
     def stop(self) -> None:
-        """End what waits or sends in other threads, soon."""
-        self._transport.closing.set()
+        """End what waits, sends or receives in other threads, now. The client cannot be used again."""
+        self._transport.stop()
 
     @property
     def stopped(self) -> bool:
@@ -243,7 +243,7 @@ class Client:
             yield (start if partial else 0), response.iter_bytes()
 
     def create_upload(self, drive_id: str, size_bytes: int, metadata: Mapping[str, str]) -> str:
-        """Begin a resumable upload; its path."""
+        """Begin a resumable upload; its id."""
         encoded = (f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in metadata.items())
         headers = {
             **_TUS,
@@ -252,22 +252,21 @@ class Client:
             "Idempotency-Key": str(uuid.uuid4()),
         }
         response = self._transport.request("POST", f"/v1/drives/{_part(drive_id)}/uploads", headers=headers)
-        return f"/v1/drives/{_part(drive_id)}/uploads/{_part(_parsed(response, UploadResource).id)}"
+        return _parsed(response, UploadResource).id
 
-    def upload_offset(self, upload: str) -> int:
+    def upload_offset(self, drive_id: str, upload_id: str) -> int:
         """How many bytes of a resumable upload the service has."""
-        response = self._transport.request("HEAD", upload, headers=_TUS)
+        response = self._transport.request("HEAD", _upload_path(drive_id, upload_id), headers=_TUS)
         offset = response.headers.get("upload-offset", "")
         if not offset.isdecimal():
             raise unexpected(response, "an upload's offset")
         return int(offset)
 
-    def append_to_upload(self, upload: str, offset: int, body: Body) -> None:
+    def append_to_upload(self, drive_id: str, upload_id: str, offset: int, body: Body) -> None:
         """Send the bytes of a resumable upload from `offset` on. One try."""
+        path = _upload_path(drive_id, upload_id)
         headers = {**_TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
-        with self._transport.open(
-            "PATCH", upload, headers=headers, body=body, read_timeout_s=CHECK_TIMEOUT_S
-        ) as answer:
+        with self._transport.open("PATCH", path, headers=headers, body=body, read_timeout_s=CHECK_TIMEOUT_S) as answer:
             answer.read()
 
     def _get(self, path: str, model: type[Model]) -> Model:
@@ -293,6 +292,10 @@ class Client:
 
 def _part(identifier: str) -> str:
     return quote(identifier, safe="")
+
+
+def _upload_path(drive_id: str, upload_id: str) -> str:
+    return f"/v1/drives/{_part(drive_id)}/uploads/{_part(upload_id)}"
 
 
 def _parsed(response: httpx.Response, model: type[Model]) -> Model:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Report = Callable[[str, int, int], None]  # stage, bytes done, bytes in total
+_GRACE_S = 1.0
 
 
 def no_report(stage: str, done_bytes: int, total_bytes: int) -> None:
@@ -37,19 +40,44 @@ def in_parallel(
 ) -> list[Result]:
     """The results of `work` for all items, in their order.
 
-    The first error ends it: what has not begun is not begun, and the error is raised. `stop` is called where the whole
-    is interrupted, and must end the work that is under way soon.
+    The first error ends it: what has not begun is not begun, what is under way is finished, and the error is raised.
+    `stop` is called where the whole is interrupted, and must end the work that is under way soon.
     """
-    with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="mrasfm-client") as pool:
-        futures = [pool.submit(work, item) for item in items]
-        try:
-            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-            failed = next((future for future in done if future.exception() is not None), None)
-            if failed is not None:
-                failed.result()
-            return [future.result() for future in futures]
-        except BaseException as error:
-            if not isinstance(error, Exception):
-                stop()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    tasks = [(item, Future[Result]()) for item in items]
+    waiting = deque(tasks)
+
+    def serve() -> None:
+        while True:
+            try:
+                item, future = waiting.popleft()
+            except IndexError:
+                return
+            try:
+                future.set_result(work(item))
+            except BaseException as error:
+                future.set_exception(error)
+
+    # Not the pool of concurrent.futures: the interpreter waits for its threads at the end, and one that asks a name
+    # server, or waits for a connection to be made, cannot be told to end.
+    count = min(threads, len(tasks))
+    pool = [threading.Thread(target=serve, name=f"mrasfm-client-{i}", daemon=True) for i in range(count)]
+    try:
+        for thread in pool:
+            thread.start()
+        done, _ = wait([future for _, future in tasks], return_when=FIRST_EXCEPTION)
+        waiting.clear()
+        for thread in pool:
+            thread.join()
+        failed = next((future for future in done if future.exception() is not None), None)
+        if failed is not None:
+            failed.result()
+        return [future.result() for _, future in tasks]
+    except BaseException as error:
+        if not isinstance(error, Exception):
+            waiting.clear()
+            stop()
+            end_s = time.monotonic() + _GRACE_S
+            for thread in pool:
+                if thread.is_alive():
+                    thread.join(max(0.0, end_s - time.monotonic()))
+        raise

@@ -22,29 +22,31 @@ class ResumableUpload:
 
     Parameters
     ----------
-    url
+    upload_id
         Of the upload that an earlier run began; None: begin.
     """
 
-    def __init__(self, client: Client, drive_id: str, file: LocalFile, meter: Meter, *, url: str | None = None) -> None:
+    def __init__(
+        self, client: Client, drive_id: str, file: LocalFile, meter: Meter, *, upload_id: str | None = None
+    ) -> None:
         self._client = client
         self._drive_id = drive_id
         self._file = file
         self._meter = meter
         self._counted_bytes = 0
-        self._url = url or ""
+        self._id = upload_id or ""
 
     def begin(self) -> str:
-        """Where the bytes go: as before, where the service still knows it; else anew."""
-        if self._url:
+        """The upload's id: as before, where the service still knows it; else anew."""
+        if self._id:
             try:
                 self._offset(self._client.patience())
-                return self._url
+                return self._id
             except ApiError as error:
                 if error.status not in _ENDED:
                     raise
-        self._url = self._create()
-        return self._url
+        self._id = self._create()
+        return self._id
 
     def _create(self) -> str:
         file = self._file
@@ -62,13 +64,14 @@ class ResumableUpload:
             It does not answer.
         """
         self.begin()
-        patience = self._client.patience()
+        patience, reached_bytes = self._client.patience(), 0
         while (offset := self._offset(patience)) < self._file.size_bytes:
-            if offset > self._counted_bytes:
+            if offset > reached_bytes:  # however little of what was sent: it goes on
                 patience.renew()
+            reached_bytes = offset
             self._count(offset)
             try:
-                self._client.append_to_upload(self._url, offset, lambda at=offset: self._pieces(at))  # type: ignore[misc]
+                self._append(offset)
             except TroubleError as trouble:
                 patience.pause(trouble)
             except ApiError as error:
@@ -78,16 +81,19 @@ class ResumableUpload:
                 patience.pause(TroubleError(error, 1.0))
         self._count(self._file.size_bytes)
 
+    def _append(self, offset: int) -> None:
+        self._client.append_to_upload(self._drive_id, self._id, offset, lambda: self._pieces(offset))
+
     def _offset(self, patience: Patience) -> int:
         while True:
             try:
-                return self._client.upload_offset(self._url)
+                return self._client.upload_offset(self._drive_id, self._id)
             except ApiError as error:
                 match error.status:
                     case HTTPStatus.LOCKED:
                         patience.pause(TroubleError(error, 1.0))
                     case HTTPStatus.CONFLICT:  # an answer to HEAD has no words: this one says why, or begins anew
-                        self._url = self._create()
+                        self._id = self._create()
                     case _:
                         raise
 

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import ipaddress
 import random
+import socket
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from typing import Any
 
@@ -25,7 +27,13 @@ IO_TIMEOUT_S = 60.0
 CHECK_TIMEOUT_S = 180.0  # an answer that waits for the check of a large manifest
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 15.0
 _SHOWN_CHARACTERS = 200
-_PASSING = (HTTPStatus.INTERNAL_SERVER_ERROR, HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE, 504)
+_PASSING = (
+    HTTPStatus.REQUEST_TIMEOUT,  # the body came too slowly: this machine slept, or its network was gone for a while
+    HTTPStatus.INTERNAL_SERVER_ERROR,
+    HTTPStatus.BAD_GATEWAY,
+    HTTPStatus.SERVICE_UNAVAILABLE,
+    HTTPStatus.GATEWAY_TIMEOUT,
+)
 
 Body = Callable[[], Iterator[bytes]]  # called for every try, so that each begins with the first byte
 
@@ -98,18 +106,25 @@ class Transport:
         self._patience_s = patience_s
         self._first_patience_s = patience_s if first_patience_s is None else first_patience_s
         self.closing = threading.Event()
+        self._connections = _Connections()
         self._http = httpx.Client(
             base_url=self.url,
             headers={"Authorization": f"Bearer {_checked_key(key)}", "Accept-Encoding": "identity"},
             timeout=httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, pool=None),
             limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
+            follow_redirects=False,  # the key is for this service, not for whom it names
             # A proxy of the environment cannot reach this machine's loopback.
             trust_env=not is_loopback(httpx.URL(self.url).host),
         )
 
-    def close(self) -> None:
-        """End all waiting, and all connections."""
+    def stop(self) -> None:
+        """End what waits, sends or receives in other threads, now."""
         self.closing.set()
+        self._connections.end()
+
+    def close(self) -> None:
+        """End everything, and give its resources back."""
+        self.stop()
         self._http.close()
 
     def patience(self) -> Patience:
@@ -163,30 +178,72 @@ class Transport:
         ------
         ApiError
             The service refused it.
+        ClientError
+            `path` is not one.
         TroubleError
             It may work another time; also where the connection breaks while the answer is read.
         """
+        if not path.startswith("/") or path.startswith("//"):
+            # httpx would take an address for the whole target, and send the key there.
+            raise ClientError(f"{path!r} is not a path of {self.url}. Nothing was sent to it.")
         timeout = httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, read=read_timeout_s, pool=None)
         content = None if body is None else body()
         try:
-            with self._http.stream(method, path, headers=headers, json=json, content=content, timeout=timeout) as got:
+            with self._http.stream(
+                method,
+                path,
+                headers=headers,
+                json=json,
+                content=content,
+                timeout=timeout,
+                extensions={"trace": self._connections.note},
+            ) as got:
                 self._answered = True
                 if got.status_code >= HTTPStatus.MULTIPLE_CHOICES and got.status_code != HTTPStatus.NOT_MODIFIED:
                     got.read()
                     raise _refusal(got)
                 yield got
-        except httpx.TransportError as error:
-            what = str(error).rstrip(".") or type(error).__name__
-            raise TroubleError(
-                UnreachableError(
-                    f"{self.url} cannot be reached: {what}. Check the URL, and that the service runs; then give the "
-                    "same command again."
-                )
-            ) from error
         except (httpx.RequestError, RuntimeError) as error:
-            if not self.closing.is_set() and isinstance(error, RuntimeError):
-                raise
-            raise UnreachableError(f"{method} {path} was given up: {error}") from error
+            if self.closing.is_set():  # a closed client of httpx raises RuntimeError
+                raise UnreachableError(f"{method} {path} was given up: the client was stopped") from error
+            if isinstance(error, httpx.TransportError):
+                raise TroubleError(self._unreachable(error)) from error
+            if isinstance(error, httpx.RequestError):
+                raise UnreachableError(f"{method} {path} was given up: {error}") from error
+            raise
+
+    def _unreachable(self, error: httpx.TransportError) -> UnreachableError:
+        what = str(error).rstrip(".") or type(error).__name__
+        return UnreachableError(
+            f"{self.url} cannot be reached: {what}. Check the URL, and that the service runs; then give the same "
+            "command again."
+        )
+
+
+class _Connections:
+    """The sockets of a client, so that another thread can end what one waits for: closing does not wake it up."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+        self._ended = False
+
+    def note(self, event: str, info: Mapping[str, Any]) -> None:
+        """A step of a request, as httpx tells its extension `trace`."""
+        if event.endswith((".connect_tcp.complete", ".start_tls.complete")):
+            with self._lock:
+                self._sockets.add(info["return_value"].get_extra_info("socket"))
+            if self._ended:
+                self.end()
+
+    def end(self) -> None:
+        """End all connections, and those that are still being made."""
+        self._ended = True
+        with self._lock:
+            for connection in self._sockets:
+                with suppress(OSError):
+                    # A TLS socket's own shutdown would let what another thread sends now pass unencrypted.
+                    socket.socket.shutdown(connection, socket.SHUT_RDWR)
 
 
 def checked_url(url: str) -> str:

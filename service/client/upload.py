@@ -203,7 +203,7 @@ class _Upload:
 
     def _send_resumably(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
         name = f"{file.path} {file.sha256}"
-        upload = ResumableUpload(self._client, drive_id, file, meter, url=self._state.uploads.get(name))
+        upload = ResumableUpload(self._client, drive_id, file, meter, upload_id=self._state.uploads.get(name))
         self._state.note_upload(name, upload.begin())
         upload.send()
         self._state.note_upload(name, None)

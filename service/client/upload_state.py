@@ -2,6 +2,9 @@
 
 Under a name that is kept before the first request is made, a request whose answer was lost is repeated without a
 second effect.
+
+The record lies in the drive's folder, which may come from anybody: it holds ids and names, checked for their form, and
+no address that a key would be sent to.
 """
 
 from __future__ import annotations
@@ -12,14 +15,18 @@ import threading
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from service.client.drive_folder import DriveFolder
 from service.data_folder import write_private_file
 
 STATE_NAME = ".mrasfm-upload.json"
+_RequestName = Annotated[str, StringConstraints(pattern=r"^[0-9a-f-]{36}$")]
+_DriveId = Annotated[str, StringConstraints(pattern=r"^drv_[0-9a-f]{1,40}$")]
+_JobId = Annotated[str, StringConstraints(pattern=r"^job_[0-9a-f]{1,40}$")]
+_UploadId = Annotated[str, StringConstraints(pattern=r"^upl_[0-9a-f]{1,40}$")]
 
 
 class _Record(BaseModel):
@@ -29,17 +36,17 @@ class _Record(BaseModel):
 class JobRecord(_Record):
     """A reconstruction that was asked for: `key` names the request."""
 
-    key: str
-    job_id: str | None = None
+    key: _RequestName
+    job_id: _JobId | None = None
 
 
 class UploadRecord(_Record):
     """One drive on one service: `upload` names the attempt to send it."""
 
-    upload: str
-    drive_id: str | None = None
+    upload: _RequestName
+    drive_id: _DriveId | None = None
     jobs: dict[str, JobRecord] = {}  # by the digest of what was asked for
-    resumable: dict[str, str] = {}  # paths of uploads under way, by what they send
+    resumable: dict[str, _UploadId] = {}  # uploads under way, by what they send
 
 
 class _Document(_Record):
@@ -85,16 +92,16 @@ class UploadState:
 
     @property
     def uploads(self) -> Mapping[str, str]:
-        """Paths of resumable uploads that an earlier run left under way, by what they send."""
+        """Ids of resumable uploads that an earlier run left under way, by what they send."""
         return self.record.resumable
 
-    def note_upload(self, name: str, path: str | None) -> None:
+    def note_upload(self, name: str, upload_id: str | None) -> None:
         """Remember where something is being sent; None: it is there. May be called from several threads."""
         with self._lock:
-            if path is None:
+            if upload_id is None:
                 self.record.resumable.pop(name, None)
             else:
-                self.record.resumable[name] = path
+                self.record.resumable[name] = upload_id
             self.save()
 
     def save(self) -> None:

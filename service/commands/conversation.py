@@ -100,8 +100,11 @@ def failed(summary: Told, display: Display, text: str, code: int) -> int:
 
 
 def _is_trouble(status: int) -> bool:
-    """Whether the service could not answer, rather than did not want to. A full disk (507) is its answer."""
-    return status >= 500 and status != 507
+    """Whether the service could not answer, rather than did not want to. A full disk (507) is its answer.
+
+    After many tries, requests that arrive too slowly (408) are a network that does not carry them.
+    """
+    return status == 408 or (status >= 500 and status != 507)
 
 
 def _key(key_file: Path | None) -> str:

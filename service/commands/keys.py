@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.settings import Settings
+from service.commands.administration import add_data, administer
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
+
+    from service.settings import Settings
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser("keys", help="make, list and revoke API keys")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="state of a standalone service (MRASFM_DATA_DIR)")
+    add_data(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     create = actions.add_parser("create", help="make a key and print it")
     create.add_argument("--project", default="default", help="made where there is none of this name")
@@ -29,16 +30,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what is asked; a key is printed once and not kept."""
-    from service.persistence.database import Database, migrate
-
-    settings = Settings() if arguments.data is None else Settings(data_dir=arguments.data)
-    migrate(settings)
-    database = Database.of(settings)
-    try:
-        with database.write() as session:
-            return _ACTIONS[arguments.action](session, settings, arguments)
-    finally:
-        database.close()
+    return administer(_ACTIONS[arguments.action], arguments)
 
 
 def _create(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:

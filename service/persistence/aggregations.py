@@ -234,7 +234,7 @@ def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
             f"is {limit}: waiting does not help",
             remedy=f"Reconstruct at least {needed - limit} of the drives first, no more than {limit} at one time, then "
             "ask again: scenes made with the same settings are reused, others can be named as scenes. Or ask the "
-            "operator for a larger quota.",
+            "operator for a larger quota ('mrasfm projects set').",
         )
     jobs.require_places(session, project_id, needed)
 

@@ -171,7 +171,8 @@ def quota_full(project: Project, size_bytes: int, *, coming_bytes: int = 0) -> S
         "quota-full",
         "The project's storage quota is full",
         f"{size_bytes} bytes do not fit: {project.used_bytes} of {project.max_bytes} bytes are used{coming}",
-        remedy="Delete drives or scenes that are not needed any more, or ask the operator for a larger quota.",
+        remedy="Delete drives or scenes that are not needed any more, or ask the operator for a larger quota "
+        "('mrasfm projects set').",
     )
 
 

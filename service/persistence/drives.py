@@ -64,7 +64,8 @@ def create(
             "too-many-drives",
             "Too many drives",
             f"the project has {count} drives, its quota is {project.max_drives}",
-            remedy="Delete drives that are not needed any more.",
+            remedy="Delete drives that are not needed any more, or ask the operator for a larger quota "
+            "('mrasfm projects set').",
         )
     blob = blobs.record(session, project_id=project_id, **stored.identity)
     roles = files_of(manifest)

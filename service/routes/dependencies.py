@@ -22,7 +22,7 @@ from service.persistence.idempotency import Answer, once
 from service.persistence.tables import Job
 from service.persistence.wakeups import BrokerError
 from service.routes.bodies import request_sha256
-from service.routes.paging import MAX_LIMIT
+from service.routes.paging import MAX_CURSOR_CHARACTERS, MAX_LIMIT
 
 log = logging.getLogger("mrasfm.api")
 
@@ -81,7 +81,7 @@ _api_key = _ApiKey(
 CallerDep = Annotated[Caller, Depends(_api_key)]
 
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items a page")]
-Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the page before")]
+Cursor = Annotated[str | None, Query(max_length=MAX_CURSOR_CHARACTERS, description="`next` of the page before")]
 _IDEMPOTENCY = (
     "Names this request: repeated under the same key it has its effect once, and the first answer is replayed for a day"
 )

@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Response
+from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Request, Response
+from fastapi.security.utils import get_authorization_scheme_param
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select, tuple_
 from sqlalchemy.orm import Session
@@ -78,7 +79,7 @@ def get_job(
     context: ContextDep,
     response: Response,
     if_none_match: Annotated[
-        str | None, Header(alias="If-None-Match", max_length=2000, description="`ETag` of an answer before")
+        list[str] | None, Header(alias="If-None-Match", description="`ETag` of an answer before")
     ] = None,
 ) -> Response | JobResource:
     """One job: poll this every `Retry-After` seconds, with `If-None-Match`, or read its events."""
@@ -159,6 +160,7 @@ def _existing(job_id: str, caller: CallerDep, context: ContextDep) -> str:
 async def stream_job_events(
     job_id: Annotated[str, Depends(_existing)],
     context: ContextDep,
+    request: Request,
     last_event_id: Annotated[
         int | None,
         Header(
@@ -166,10 +168,10 @@ async def stream_job_events(
         ),
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """The job's changes of state, from the beginning, and its newest progress, until it has ended."""
-    last = last_event_id or 0
+    """The job's changes of state, from the beginning, and its newest progress, until it or the key has ended."""
+    last, secret = last_event_id or 0, get_authorization_scheme_param(request.headers.get("authorization"))[1]
     while True:
-        ended, events = await run_in_threadpool(_news, context, job_id, last)
+        ended, events = await run_in_threadpool(_news, context, secret, job_id, last)
         for event in events:
             last = event.id
             yield ServerSentEvent(id=str(event.id), event=event.kind, data=event.data)
@@ -179,7 +181,9 @@ async def stream_job_events(
             await asyncio.sleep(context.settings.poll_seconds)
 
 
-def _news(context: Context, job_id: str, last: int) -> tuple[bool, list[JobEvent]]:
+def _news(context: Context, secret: str, job_id: str, last: int) -> tuple[bool, list[JobEvent]]:
+    if context.keys.find(secret) is None:
+        return True, []  # revoked since the stream began
     with context.database.read() as session:
         state = session.scalar(select(Job.state).where(Job.id == job_id))
         ended = state is None or JobState(state) in TERMINAL

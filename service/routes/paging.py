@@ -7,14 +7,17 @@ import binascii
 import json
 from typing import Any
 
+from schemas.drive import MAX_PATH_CHARACTERS
 from service.errors import ServiceError
 
 MAX_LIMIT = 1000
+# Of the longest position, a path: four bytes a character in UTF-8, and four characters of base64 for three bytes.
+MAX_CURSOR_CHARACTERS = 4 * (4 * MAX_PATH_CHARACTERS + len('[""]') + 2) // 3
 
 
 def cursor_of(*position: Any) -> str:
     """A cursor that holds a position."""
-    return base64.urlsafe_b64encode(json.dumps(position).encode()).decode().rstrip("=")
+    return base64.urlsafe_b64encode(json.dumps(position, ensure_ascii=False).encode()).decode().rstrip("=")
 
 
 def position_of(cursor: str | None, *kinds: type) -> tuple[Any, ...] | None:

@@ -168,8 +168,8 @@ def test_operations_have_short_names(page: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("path", "allowed"),
     [
-        ("/v1/drives", "GET, POST"),
-        ("/v1/drives/x", "GET, DELETE"),
+        ("/v1/drives", "GET, HEAD, POST"),
+        ("/v1/drives/x", "GET, HEAD, DELETE"),
         ("/v1/drives/x:commit", "POST"),
         ("/v1/jobs/x:cancel", "POST"),
         ("/v1/drives/x/files/a/b", "PUT, DELETE"),
@@ -177,7 +177,8 @@ def test_operations_have_short_names(page: dict[str, Any]) -> None:
         ("/v1/maps/x/versions/1/files/a/b", "GET, HEAD"),
         ("/v1/maps/x/current-version", "PUT"),
         ("/v1/drives/x/uploads", "POST, OPTIONS"),
-        ("/livez", "GET"),
+        ("/livez", "GET, HEAD"),
+        ("/v1/jobs/x/events", "GET"),
         ("/docs", "GET, HEAD"),
     ],
 )

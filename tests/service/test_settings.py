@@ -6,6 +6,38 @@ import pytest
 from pydantic import ValidationError
 
 from service.settings import Settings
+from tests.service.conftest import StartApi
+from tests.service.tiny_drive import tiny_drive
+
+FIELDS = Settings.model_json_schema()["properties"]
+NUMBERS = {
+    name: form.get("maximum")
+    for name, field in FIELDS.items()
+    for form in (field, *field.get("anyOf", ()))
+    if form.get("type") in ("number", "integer")
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", ["inf", "nan", "1e300", "10" * 40, "-1"])
+def test_every_number_has_bounds(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    assert NUMBERS[name] is not None
+    monkeypatch.setenv(f"MRASFM_{name.upper()}", value)
+    with pytest.raises(ValidationError) as caught:
+        Settings()
+    assert name in [problem["loc"][0] for problem in caught.value.errors()]
+
+
+def test_the_largest_numbers_can_be_worked_with(start_api: StartApi) -> None:
+    of_api = [name for name in NUMBERS if name.endswith(("_hours", "_days")) or name.startswith(("max_", "project_"))]
+    assert len(of_api) >= 14
+    api = start_api(**{name: NUMBERS[name] for name in of_api})
+    client = api.client()
+    created = client.post("/v1/drives", content=tiny_drive().raw, headers={"Idempotency-Key": "largest"})
+    assert created.status_code == 201, created.text
+    assert created.json()["expires_at"] > "2100"
+    job = client.reconstruct(client.committed(tiny_drive("b")), **{"Idempotency-Key": "job"})
+    assert client.publish(client.claim(job["id"]), {"report.json": b"{}"})
 
 
 def test_the_defaults_fit_together() -> None:

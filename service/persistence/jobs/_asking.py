@@ -94,7 +94,8 @@ def require_places(session: Session, project_id: str, count: int) -> None:
             "too-many-jobs",
             "Too many jobs",
             f"the project has {active} jobs queued or running, its quota is {project.max_active_jobs}{wanted}",
-            remedy="Wait until some have ended, or cancel some.",
+            remedy="Wait until some have ended, or cancel some, or ask the operator for a larger quota "
+            "('mrasfm projects set').",
             headers={"Retry-After": "60"},
         )
 

@@ -1,4 +1,4 @@
-"""A TCP relay between a client and an API that breaks connections where a test says so."""
+"""Who a client may meet: a TCP relay to an API that breaks connections where a test says so, and other servers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
 
 _PIECE_BYTES = 65536
@@ -14,11 +15,16 @@ _PIECE_BYTES = 65536
 
 @dataclass
 class Cut:
-    """Requests whose first line holds `part` get so many bytes of their answer, and then the end of the connection."""
+    """Requests whose first line holds `part` get so many bytes of their answer, and then the end of the connection.
+
+    With `answer` they get this, and the API does not see them; with `silent` nothing, and the connection stays.
+    """
 
     part: bytes
     answer_bytes: int
     times: int
+    answer: bytes = b""
+    silent: bool = False
     seen: list[bytes] = field(default_factory=list)  # the heads of those that were cut
 
 
@@ -55,6 +61,13 @@ class BadNetwork:
         with suppress(OSError):
             while piece := near.recv(_PIECE_BYTES):
                 cut = self._cut_for(piece)
+                if cut is not None and cut.answer:
+                    near.sendall(cut.answer)
+                    break
+                if cut is not None and cut.silent:
+                    while near.recv(_PIECE_BYTES):
+                        continue
+                    break
                 if cut is not None:
                     left.append(cut.answer_bytes)
                 far.sendall(piece)
@@ -87,6 +100,37 @@ class BadNetwork:
 def _end(connection: socket.socket) -> None:
     with suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
+
+
+class Recorder:
+    """A server that is no API: it notes every request's method, path and key, and answers 404 or with a redirect."""
+
+    def __init__(self, *, redirect_to: str | None = None) -> None:
+        self.requests: list[tuple[str, str, str | None]] = []
+        noted = self.requests
+
+        class Handler(BaseHTTPRequestHandler):
+            def handle_one_request(self) -> None:
+                self.raw_requestline = self.rfile.readline(_PIECE_BYTES)
+                self.close_connection = True
+                if self.raw_requestline and self.parse_request():
+                    noted.append((self.command, self.path, self.headers.get("Authorization")))
+                    self.send_response(404 if redirect_to is None else 307)
+                    if redirect_to is not None:
+                        self.send_header("Location", redirect_to)
+                    self.end_headers()
+
+            def log_message(self, format: str, *arguments: object) -> None:
+                pass
+
+        # Another address than the API's, and loopback too.
+        self._server = ThreadingHTTPServer(("127.0.0.2", 0), Handler)
+        self.url = f"http://127.0.0.2:{self._server.server_port}"
+        threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
 
 
 @contextmanager

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from service.client import ApiError, ClientError, DriveFolder, UploadState, resumable, upload_drive
-from service.client.drive_folder import identify
+from service.client.drive_folder import LocalFile, identify
 from service.client.parallel import Meter, no_report
 from service.client.resumable import ResumableUpload
 from service.client.upload_state import STATE_NAME
@@ -17,6 +20,7 @@ from service.persistence.tables import Drive
 from service.uploads.resumable import PartialFile
 from tests.service.client.bad_network import Cut, bad_network
 from tests.service.client.conftest import Connect, written
+from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client
 from tests.service.test_uploads import image
 from tests.service.tiny_drive import TinyDrive, tiny_drive
@@ -37,7 +41,7 @@ def large_drive(tmp_path: Path) -> Path:
     return written(TinyDrive(tiny.manifest, files), tmp_path / "drive")
 
 
-def state_of(drive: Path) -> dict[str, dict[str, str]]:
+def state_of(drive: Path) -> dict[str, Any]:
     (upload,) = json.loads((drive / STATE_NAME).read_text())["uploads"].values()
     return dict(upload)
 
@@ -64,8 +68,8 @@ def test_another_run_goes_on_in_the_middle_of_a_file(
 
     with pytest.raises(ClientError):
         upload_drive(library, folder, parallel=1, report=stop)
-    (path,) = state_of(large_drive)["resumable"].values()
-    kept = connect(client).upload_offset(path)
+    drive_id, (upload_id,) = state_of(large_drive)["drive_id"], state_of(large_drive)["resumable"].values()
+    kept = connect(client).upload_offset(drive_id, upload_id)
     assert 0 < kept < SIZE_BYTES
     again, done = connect(client), list[int]()
     upload_drive(again, folder, parallel=1, report=lambda stage, at, of: done.append(at) if stage == "send" else None)
@@ -73,12 +77,34 @@ def test_another_run_goes_on_in_the_middle_of_a_file(
     assert UploadState(folder, again.url).uploads == {}
 
 
+def test_a_machine_that_slept_goes_on_in_the_middle_of_a_file(
+    start_api: StartApi, connect: Connect, large_drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = start_api(upload_idle_seconds=0.3).client()
+    file, drive_id, begun_at = identify(large_drive, "front/000001.png"), client.create(), list[int]()
+    awake = LocalFile.pieces
+
+    def pieces(self: LocalFile, offset: int = 0) -> Iterator[bytes]:
+        begun_at.append(offset)
+        for i, piece in enumerate(awake(self, offset)):
+            if i == 2 and len(begun_at) == 1:
+                time.sleep(1.0)
+            yield piece
+
+    monkeypatch.setattr(LocalFile, "pieces", pieces)
+    ResumableUpload(connect(client), drive_id, file, Meter(no_report, "send", file.size_bytes)).send()
+    assert len(begun_at) == 2
+    assert begun_at[1] > 0, "what came before is not sent again"
+    (sent,) = client.get(f"/v1/drives/{drive_id}/files", params={"stored": "true"}).json()["items"]
+    assert sent["sha256"] == file.sha256
+
+
 def test_an_upload_that_is_gone_begins_anew(client: Client, connect: Connect, large_drive: Path) -> None:
     library, folder = connect(client), DriveFolder.read(large_drive)
     state = UploadState(folder, library.url)
     (large,) = [path for path in folder.paths if (large_drive / path).stat().st_size > SIZE_BYTES]
     file = identify(folder.root, large)
-    state.note_upload(f"{file.path} {file.sha256}", "/v1/drives/drv_0/uploads/upl_0")
+    state.note_upload(f"{file.path} {file.sha256}", "upl_0")
     sent = upload_drive(library, folder, state=state)
     assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
 
@@ -91,11 +117,11 @@ def test_a_drive_that_is_committed_meanwhile(
     library, folder = connect(client), DriveFolder.read(large_drive)
     file, drive_id, counted = identify(folder.root, "front/000001.png"), client.filled(), list[int]()
     meter = Meter(lambda stage, done, total: counted.append(done), "send", file.size_bytes)
-    url = ResumableUpload(library, drive_id, file, meter).begin()
+    upload_id = ResumableUpload(library, drive_id, file, meter).begin()
     with api.database.write() as session:
         session.get_one(Drive, drive_id).state = "COMMITTED"
     with pytest.raises(ApiError) as raised:
-        ResumableUpload(library, drive_id, file, meter, url=url if is_known else None).send()
+        ResumableUpload(library, drive_id, file, meter, upload_id=upload_id if is_known else None).send()
     assert raised.value.code == "drive-committed"
     assert max(counted) == 0
 
@@ -105,7 +131,7 @@ def test_another_request_still_holds_the_upload(api: Api, client: Client, connec
     library, folder = connect(client), DriveFolder.read(large_drive)
     file, drive_id = identify(folder.root, "front/000001.png"), client.create()
     upload = ResumableUpload(library, drive_id, file, Meter(no_report, "send", file.size_bytes))
-    holding = PartialFile(api.settings.uploads_dir, upload.begin().rsplit("/", 1)[1])
+    holding = PartialFile(api.settings.uploads_dir, upload.begin())
     letting_go = threading.Timer(0.5, holding.close)
     letting_go.start()
     upload.send()

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +24,18 @@ from service.client import (
     DriveFolderError,
     UnreachableError,
     UploadState,
+    resumable,
     start_reconstruction,
     upload_drive,
 )
 from service.client import Client as LibraryClient
 from service.client.drive_folder import identify
+from service.client.parallel import in_parallel
+from service.client.transport import Transport
 from service.client.upload_state import STATE_NAME
-from tests.service.client.bad_network import Cut, bad_network
+from tests.service.client.bad_network import Cut, Recorder, bad_network
 from tests.service.client.conftest import Connect, written
-from tests.service.live_api import Client, free_port
+from tests.service.live_api import DEADLINE_S, Client, free_port, wait_until
 from tests.service.tiny_drive import png, tiny_drive
 
 
@@ -138,6 +148,21 @@ def test_lost_answers_have_their_effect_once(client: Client, connect: Connect, d
     assert sorted(job["kind"] for job in jobs) == ["PREFLIGHT", "RECONSTRUCTION"]
 
 
+def test_requests_that_came_too_slowly_are_sent_again(client: Client, connect: Connect, drive: Path) -> None:
+    """As after a while in which this machine slept: 408 is no refusal."""
+    answer = b"HTTP/1.1 408 Request Timeout\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+    parts = (b"POST /v1/drives ", b":declare", b"PUT /v1/drives/", b":commit")
+    cuts = [Cut(part, answer_bytes=0, times=2, answer=answer) for part in parts]
+    with bad_network(client.api.url, *cuts) as network:
+        upload_drive(connect(client, url=network.url), DriveFolder.read(drive))
+        cuts[0].times = 1000
+        with pytest.raises(ApiError) as ended:
+            connect(client, url=network.url, patience_s=0.5).create_drive(tiny_drive().raw)
+    assert ended.value.status == 408, "patience ends here too"
+    assert [len(cut.seen) for cut in cuts[1:]] == [2, 2, 2]
+    assert [(shown["state"], shown["files_stored"]) for shown in drives_of(client)] == [("COMMITTED", 6)]
+
+
 def test_nothing_is_sent_where_files_are_missing(client: Client, drive: Path) -> None:
     (drive / "rear" / "000002.png").unlink()
     shutil.rmtree(drive / "front")
@@ -218,6 +243,48 @@ def test_what_cannot_be_a_url_is_refused(url: str) -> None:
     assert "secret" not in str(refused.value)
 
 
+def test_a_client_that_is_stopped_waits_for_nothing(client: Client, connect: Connect) -> None:
+    silent = [Cut(part, answer_bytes=0, times=9, silent=True) for part in (b"/status", b"/jobs/")]
+    with bad_network(client.api.url, *silent) as network, ThreadPoolExecutor() as pool:
+        library = connect(client, url=network.url)
+        waiting = [pool.submit(library.status), pool.submit(lambda: list(library.events("job_0")))]
+        wait_until(lambda: all(cut.seen for cut in silent), "the requests")
+        began_s = time.monotonic()
+        library.stop()
+        for asked in waiting:
+            with pytest.raises(UnreachableError, match="the client was stopped"):
+                asked.result(DEADLINE_S)
+        assert time.monotonic() - began_s < 5
+        with pytest.raises(UnreachableError, match="the client was stopped"):
+            library.create_drive(tiny_drive().raw)
+    assert drives_of(client) == [], "nothing is begun after it"
+
+
+def test_work_that_cannot_be_ended_is_not_waited_for() -> None:
+    stopped, released, begun = threading.Event(), threading.Event(), list[int]()
+
+    def work(item: int) -> None:
+        begun.append(item)
+        released.wait(DEADLINE_S)
+
+    def interrupt() -> None:
+        wait_until(lambda: begun, "the work")
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    interrupting = threading.Thread(target=interrupt)
+    interrupting.start()
+    began_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            in_parallel(work, [1, 2, 3], threads=1, stop=stopped.set)
+    finally:
+        released.set()
+    interrupting.join()
+    assert stopped.is_set()
+    assert begun == [1]
+    assert time.monotonic() - began_s < 10
+
+
 def test_patience_ends() -> None:
     url = f"http://127.0.0.1:{free_port()}"
     with (
@@ -236,6 +303,55 @@ def test_what_is_kept_goes_elsewhere_where_the_folder_is_not_writable(
     first = upload_drive(library, folder)
     assert len(list((tmp_path / "cache" / "mrasfm" / "uploads").iterdir())) == 1
     assert upload_drive(library, folder).drive_id == first.drive_id
+
+
+@pytest.fixture
+def stranger() -> Iterator[Recorder]:
+    """A server that is not the service, and notes what it is told."""
+    with closing(Recorder()) as server:
+        yield server
+
+
+@pytest.mark.parametrize("form", ["{url}/steal", "//{host}/steal", "../../../steal", "upl_0/../../steal", "upl_0\n"])
+def test_no_address_in_the_folder_is_given_the_key(
+    client: Client, connect: Connect, tmp_path: Path, stranger: Recorder, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    """A drive's folder may come from anybody, with a record of an upload in it."""
+    monkeypatch.setattr(resumable, "FROM_BYTES", 1)
+    folder = DriveFolder.read(written(tiny_drive(seed=tmp_path.name), tmp_path / "drive"))
+    library = connect(client)
+    target = form.format(url=stranger.url, host=stranger.url.removeprefix("http://"))
+    files = [identify(folder.root, path) for path in folder.paths]
+    planted = {
+        "upload": str(uuid.uuid4()),
+        "drive_id": client.create(tiny_drive(seed=tmp_path.name)),
+        "resumable": {f"{file.path} {file.sha256}": target for file in files},
+    }
+    record = {"version": 1, "uploads": {f"{library.url} {folder.manifest_sha256}": planted}}
+    (folder.root / STATE_NAME).write_text(json.dumps(record))
+    sent = upload_drive(library, folder)
+    assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
+    assert stranger.requests == []
+
+
+@pytest.mark.parametrize("target", ["{url}/x", "//{host}/x", "v1/drives", "", "http:/x"])
+def test_only_paths_of_the_service_are_asked_for(client: Client, stranger: Recorder, target: str) -> None:
+    target = target.format(url=stranger.url, host=stranger.url.removeprefix("http://"))
+    transport = Transport(client.api.url, client.key, connections=1, patience_s=0.0)
+    with closing(transport), pytest.raises(ClientError, match="is not a path"):
+        transport.request("GET", target)
+    assert stranger.requests == []
+
+
+def test_a_redirect_is_told_and_not_followed(stranger: Recorder) -> None:
+    with (
+        closing(Recorder(redirect_to=f"{stranger.url}/v1/status")) as first,
+        LibraryClient(first.url, "key") as library,
+        pytest.raises(ApiError, match=f"leads to: {stranger.url}/v1/status"),
+    ):
+        library.status()
+    assert len(first.requests) == 1
+    assert stranger.requests == []
 
 
 @pytest.mark.parametrize("kept", [b"", b"{", b"[]", b'{"version": 1, "uploads": {"x": 3}}'])

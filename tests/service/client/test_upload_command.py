@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.client.upload_state import STATE_NAME
 from service.context import Context
 from service.persistence import jobs
+from tests.service.client.bad_network import Cut, bad_network
 from tests.service.client.conftest import written
 from tests.service.live_api import (
     DEADLINE_S,
@@ -149,6 +151,20 @@ def test_interrupted_it_says_how_to_go_on(client: Client, large_drive: Path) -> 
     assert code == 130
     assert "The same command goes on from here." in told
     assert "Traceback" not in told
+
+
+def test_interrupted_while_the_service_is_silent_it_ends_at_once(client: Client, drive: Path) -> None:
+    with bad_network(client.api.url, silent := Cut(b"PUT ", answer_bytes=0, times=4, silent=True)) as network:
+        running = Upload(drive, url=network.url, key=client.key)
+        wait_until(lambda: len(silent.seen) == 4, "the files")
+        running.end(signal.SIGINT)
+        began_s = time.monotonic()
+        code, _, told = running.ended()
+    assert time.monotonic() - began_s < 10, "an answer is waited for 60 s"
+    assert code == 130
+    assert "The same command goes on from here." in told
+    assert "Traceback" not in told
+    assert upload(client, drive)[0] == 0
 
 
 def test_interrupted_while_waiting_the_job_goes_on(client: Client, drive: Path) -> None:

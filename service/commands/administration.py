@@ -1,0 +1,34 @@
+"""What commands that change a service's records share: whose, and a transaction on them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from service.settings import Settings
+
+if TYPE_CHECKING:
+    from sqlalchemy.orm import Session
+
+Action = Callable[["Session", Settings, argparse.Namespace], int]
+
+
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that says which service."""
+    parser.add_argument("--data", type=Path, metavar="DIR", help="state of a standalone service (MRASFM_DATA_DIR)")
+
+
+def administer(action: Action, arguments: argparse.Namespace) -> int:
+    """Run an action in one transaction on the service's records; its exit code."""
+    from service.persistence.database import Database, migrate
+
+    settings = Settings() if arguments.data is None else Settings(data_dir=arguments.data)
+    migrate(settings)
+    database = Database.of(settings)
+    try:
+        with database.write() as session:
+            return action(session, settings, arguments)
+    finally:
+        database.close()
