@@ -301,7 +301,7 @@ class _Child:
             return True
         answered, self._asked = self._asked.end(), None
         self._silent = 0 if answered else self._silent + 1
-        self.ask_at_s = now_s + self.spec.ask_every_s
+        self.ask_at_s = now_s + self.spec.ask_every_s - self.spec.answer_within_s
         return self._silent < MAX_SILENT
 
     def note_failure(self) -> None:

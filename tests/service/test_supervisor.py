@@ -422,10 +422,10 @@ def test_a_child_that_hangs_is_killed_and_starts_again(world: World) -> None:
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-    asked = {"ask_at": port, "ask_every_s": 0.3, "answer_within_s": 0.5, "ready_file": str(world.folder / "answers")}
+    asked = {"ask_at": port, "ask_every_s": 1.0, "answer_within_s": 0.8, "ready_file": str(world.folder / "answers")}
     supervisor = world.start_ready(world.child("api", body=ANSWERING.format(port=port), **asked))
     first = world.pid("api")
-    time.sleep(5)
+    time.sleep(8)
     assert world.pid("api") == first
     os.kill(first, signal.SIGSTOP)
     wait_for(lambda: world.pid("api") != first)
