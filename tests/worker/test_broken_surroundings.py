@@ -1,19 +1,25 @@
-"""A worker whose broker goes without a word, and one whose store is not to be had."""
+"""A broker that is down or goes without a word, and a worker whose store is not to be had."""
 
 from __future__ import annotations
 
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 from pydantic import SecretStr
 
-from tests.worker.service_world import World, wait_until
+from service.persistence.keys import create_key
+from service.persistence.tables import Project
+from service.persistence.wakeups import Wakeups, task_id
+from service.settings import Settings
+from tests.service.live_api import api_process
+from tests.worker.service_world import FAST, TERMINAL, World, environment_of, wait_until
 
 
 class Proxy:
@@ -87,6 +93,45 @@ def test_broker_that_goes_without_a_word(world: World, proxy: Proxy, brief_drive
     proxy.cut()
     worker.terminate()
     worker.wait(60)
+
+
+@pytest.mark.slow
+def test_reconstruction_asked_for_while_the_broker_is_down(
+    make_world: Callable[..., World], brief_drive: Path, tmp_path: Path
+) -> None:
+    """Accepted over HTTP, and done when the broker is back, whose every message may be lost."""
+    world = make_world(reconcile_seconds=Settings().reconcile_seconds)
+    world.start_worker()
+    world.start_reconciler()
+    drive_id = world.add_drive(brief_drive)
+    with world.database.write() as session:
+        key = create_key(session, session.get_one(Project, world.project_id), "test")[1]
+    with (
+        api_process(world.settings, tmp_path, **environment_of(world.settings)) as api,
+        httpx.Client(base_url=api.url, headers={"Authorization": f"Bearer {key}"}, timeout=60) as client,
+    ):
+        world.broker.kill()
+        accepted = client.post("/v1/reconstructions", json={"drive_id": drive_id, "settings": FAST})
+        assert accepted.status_code == 202, accepted.text
+        assert accepted.headers["Retry-After"]
+        where = accepted.headers["Location"]
+        assert client.get("/v1/status").json()["broker"] is False
+        time.sleep(world.settings.lease_seconds)
+        assert client.get(where).json()["state"] == "QUEUED"
+
+        world.broker.start()
+        wakeups = Wakeups(world.settings)
+        job_id = accepted.json()["id"]
+        wait_until(
+            lambda: world.job(job_id).state != "QUEUED" or task_id(world.job(job_id)) in wakeups.waiting(),
+            "its message",
+            within_s=30,
+        )
+        wait_until(lambda: client.get(where).json()["state"] in TERMINAL, world.log, within_s=300)
+        job = client.get(where).json()
+        assert job["state"] == "SUCCEEDED", job
+        assert len(job["attempts"]) == 1
+        assert [scene["job_id"] for scene in client.get("/v1/scenes").json()["items"]] == [job_id]
 
 
 def test_store_that_is_not_to_be_had(world: World, brief_drive: Path, tmp_path: Path) -> None:
