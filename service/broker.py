@@ -6,10 +6,14 @@ spellings (`unix://`, `redis+socket://`), and its path may have 107 bytes at mos
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import secrets
 import shutil
 import socket
-from contextlib import closing
+from collections.abc import Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -27,6 +31,14 @@ PORTS = range(20_000, 30_000)
 PORT_TRIES = 100
 PASSWORD_BYTES = 32
 PROBE_TIMEOUT_S = 1.0
+JOURNAL = "appendonlydir"  # as the server names it
+JOURNAL_SET_ASIDE = "appendonlydir.damaged"
+# What the server says last when it cannot read its journal, and what it does not say then.
+_OF_JOURNAL = re.compile(r"append.?only|\bAOF\b", re.IGNORECASE)
+_OF_MACHINE = tuple(
+    os.strerror(number)
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EMFILE, errno.ENOMEM)
+)
 SERVER_NAMES = ("valkey-server", "redis-server")
 
 CONFIGURATION = """\
@@ -90,6 +102,30 @@ def prepare(directory: Path) -> EmbeddedBroker:
     )
     url = f"redis://:{password}@{HOST}:{port}/0"
     return EmbeddedBroker(argv=(str(server), str(configuration)), port=port, url=url)
+
+
+def set_damaged_journal_aside(directory: Path, last_lines: Sequence[str]) -> str | None:
+    """Let the broker start empty where the last lines of its log say that it cannot read its journal.
+
+    All that is lost are messages, and the reconciler sends those that are missed again. One damaged journal is kept.
+
+    Returns
+    -------
+    str or None
+        What was done, for the person at the terminal; None where nothing was.
+    """
+    told = "\n".join(last_lines)
+    if not _OF_JOURNAL.search(told) or any(words in told for words in _OF_MACHINE):
+        return None
+    journal, aside = directory / JOURNAL, directory / JOURNAL_SET_ASIDE
+    with suppress(OSError):
+        if any(file.stat().st_size for file in journal.iterdir()):
+            shutil.rmtree(aside, ignore_errors=True)
+            journal.rename(aside)
+            return (
+                f"its journal is damaged and was moved to {aside}: it starts empty, and waiting jobs are queued again"
+            )
+    return None
 
 
 def find_server() -> Path:

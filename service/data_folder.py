@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import secrets
@@ -28,29 +29,31 @@ def make_private_folder(folder: Path) -> None:
     DataFolderError
         Where it cannot be made or written, or belongs to somebody else.
     """
-    try:
+    with _explained(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
-    except OSError as error:
-        raise DataFolderError(
-            f"the data folder {folder} cannot be used: {error.strerror}. "
-            "Give a folder that belongs to you with --data, or correct its owner."
-        ) from error
 
 
 def write_private_file(path: Path, text: str) -> None:
-    """Write a file that only its owner may read, whole or not at all."""
+    """Write a file that only its owner may read, whole or not at all.
+
+    Raises
+    ------
+    DataFolderError
+        Where it cannot be written.
+    """
     scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(path)
-    except BaseException:
-        scratch.unlink(missing_ok=True)
-        raise
+    with _explained(path.parent):
+        descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            scratch.replace(path)
+        except BaseException:
+            scratch.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
@@ -68,13 +71,16 @@ def exclusive_use(folder: Path, *, patience_s: float = LOCK_PATIENCE_S) -> Itera
     Raises
     ------
     DataFolderError
-        Where another run, or a process that one left behind, still has the folder after `patience_s`.
+        Where another run, or a process that one left behind, still has the folder after `patience_s`, or where the
+        lock cannot be written.
     """
-    descriptor = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    with _explained(folder):
+        descriptor = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
-        _wait_for_lock(descriptor, folder, patience_s)
-        os.truncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        with _explained(folder):
+            _wait_for_lock(descriptor, folder, patience_s)
+            os.truncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield descriptor
     finally:
         os.close(descriptor)
@@ -95,3 +101,15 @@ def _wait_for_lock(descriptor: int, folder: Path, patience_s: float) -> None:
                 f"the data folder {folder} is in use by another `mrasfm standalone` (process {holder}). "
                 "Stop that one, or give another folder with --data."
             ) from error
+
+
+@contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    """Errors of the file system as errors that say what to do."""
+    try:
+        yield
+    except OSError as error:
+        remedy = "Give a folder that belongs to you with --data, or correct its owner."
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            remedy = "Make room on its disk, or give a folder on another one with --data."
+        raise DataFolderError(f"the data folder {folder} cannot be used: {error.strerror}. {remedy}") from error

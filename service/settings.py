@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from pydantic import Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+from sqlalchemy import URL
 
 # Numbers have both bounds: what does not fit the database's integers, or a date, would fail at the first request.
 _MAX_BYTES = 2**60
@@ -115,7 +116,8 @@ class Settings(BaseSettings):
         """The database's URL, with the embedded one in its place where none is set."""
         if self.database_url is not None:
             return self.database_url.get_secret_value()
-        return f"sqlite:///{self.data_dir.resolve() / 'mrasfm.sqlite3'}"
+        path = str(self.data_dir.resolve() / "mrasfm.sqlite3")
+        return URL.create("sqlite", database=path).render_as_string()  # quoted: a folder may be named `a?b`
 
     @property
     def resolved_artifacts_url(self) -> str:

@@ -12,7 +12,10 @@ import socket
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from importlib.metadata import version
+from pathlib import Path
 
+from alembic.util import CommandError
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -20,6 +23,7 @@ from service import broker
 from service.data_folder import exclusive_use, make_private_folder
 from service.persistence.database import migrate
 from service.persistence.keys import ensure_first_key
+from service.pulse import Pulse
 from service.settings import Settings
 from service.supervisor import ChildSpec, Supervisor
 
@@ -59,7 +63,7 @@ def run_standalone(settings: Settings, *, workers: int, log_level: str, say: Say
     make_private_folder(settings.data_dir)
     with exclusive_use(settings.data_dir) as lock:
         _prepare_records(settings, say)
-        embedded = broker.prepare(settings.data_dir / "broker") if settings.redis_url is None else None
+        embedded = broker.prepare(_broker_folder(settings)) if settings.redis_url is None else None
         say("starting")
         Supervisor(
             child_specs(settings, embedded, workers=workers, log_level=log_level),
@@ -84,6 +88,7 @@ def child_specs(
         environment=environment,
         depends_on=after_broker,  # it does without, but the broker shall end last
         is_ready=lambda: _is_ready(*address),
+        ask=lambda: Pulse(_reachable(settings.host), settings.port, "/livez"),
         listens_on=address,
         port_remedy="Stop the other program, or take another port with --port.",
         grace_s=API_GRACE_S,
@@ -99,7 +104,7 @@ def child_specs(
         )
 
     return [
-        *([_broker_spec(embedded)] if embedded else []),
+        *([_broker_spec(embedded, settings)] if embedded else []),
         api,
         background("checker", "worker", "--queues", "checks", "--concurrency", "1"),
         background("worker", "worker", "--queues", "reconstructions", "--concurrency", str(workers)),
@@ -107,14 +112,19 @@ def child_specs(
     ]
 
 
-def _broker_spec(embedded: broker.EmbeddedBroker) -> ChildSpec:
+def _broker_spec(embedded: broker.EmbeddedBroker, settings: Settings) -> ChildSpec:
     return ChildSpec(
         name="broker",
         argv=embedded.argv,
         is_ready=lambda: broker.answers(embedded.url),
+        repair=lambda lines: broker.set_damaged_journal_aside(_broker_folder(settings), lines),
         listens_on=(broker.HOST, embedded.port),
         port_remedy="Start again: another port is chosen then.",
     )
+
+
+def _broker_folder(settings: Settings) -> Path:
+    return settings.data_dir / "broker"
 
 
 def _environment(settings: Settings, embedded: broker.EmbeddedBroker | None, *, workers: int) -> Mapping[str, str]:
@@ -140,14 +150,23 @@ def _prepare_records(settings: Settings, say: Say) -> None:
     try:
         migrate(settings)
         key = ensure_first_key(settings)
-    except SQLAlchemyError as error:
-        database = make_url(settings.resolved_database_url).render_as_string(hide_password=True)
-        reason = str(getattr(error, "orig", None) or error).strip()
+    except CommandError as error:  # the database names a step of the schema that is not among ours
         raise StandaloneError(
-            f"the database {database} cannot be used: {reason}. Check MRASFM_DATABASE_URL, and that its server runs."
+            f"the database {_database_of(settings)} is of a newer MRASfM than this one, {version('mrasfm')}: "
+            f"{error}. Install that version again, or give another database or another folder with --data."
         ) from error
+    except SQLAlchemyError as error:
+        reason = str(getattr(error, "orig", None) or error).strip()
+        remedy = "Check MRASFM_DATABASE_URL, and that its server runs."
+        if settings.database_url is None:
+            remedy = "Check that its disk has room and that the file belongs to you."
+        raise StandaloneError(f"the database {_database_of(settings)} cannot be used: {reason}. {remedy}") from error
     if key is not None:
         say(f"the first API key, shown this once: {key}")
+
+
+def _database_of(settings: Settings) -> str:
+    return make_url(settings.resolved_database_url).render_as_string(hide_password=True)
 
 
 def _announce(settings: Settings, say: Say) -> None:
@@ -164,13 +183,16 @@ def _announce(settings: Settings, say: Say) -> None:
 
 
 def _is_ready(host: str, port: int) -> bool:
-    reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    with closing(http.client.HTTPConnection(reachable, port, timeout=PROBE_TIMEOUT_S)) as connection:
+    with closing(http.client.HTTPConnection(_reachable(host), port, timeout=PROBE_TIMEOUT_S)) as connection:
         try:
             connection.request("GET", "/readyz")
             return connection.getresponse().status == http.HTTPStatus.OK
         except (OSError, http.client.HTTPException):
             return False
+
+
+def _reachable(host: str) -> str:
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
 
 
 def _free_port(host: str) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import math
 import os
 import select
 import signal
@@ -24,6 +25,7 @@ from types import FrameType
 from service import process_guard
 from service.child_log import ChildLog
 from service.data_folder import make_private_folder
+from service.pulse import Pulse
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FIRST_DELAY_S = 0.5  # before a restart; doubles with each failure
@@ -32,6 +34,7 @@ STABLE_AFTER_S = 60.0  # a child that lived this long starts again without waiti
 SETTLED_AFTER_S = 10.0  # a child without a probe has proven by then that it can start
 MAX_FAILED_STARTS = 3  # of a child that has never proven so; then it is not a crash but something to correct
 PROBE_INTERVAL_S = 0.2
+MAX_SILENT = 4  # questions in a row; a machine that was suspended or is very busy leaves one or two unanswered
 LOG_CHECK_INTERVAL_S = 60.0
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -51,6 +54,11 @@ class ChildSpec:
     environment: Mapping[str, str] = field(default_factory=dict, repr=False)  # added to ours; may hold secrets
     depends_on: Sequence[str] = ()  # children that are ready before it starts, and end after it
     is_ready: Callable[[], bool] | None = None  # quick; without it, a child is ready when it runs
+    # Given the last lines of a life that ended in an error before it was ready: what it put right, if anything.
+    repair: Callable[[Sequence[str]], str | None] | None = None
+    ask: Callable[[], Pulse] | None = None  # whether it lives, once it has been ready
+    ask_every_s: float = 15.0
+    answer_within_s: float = 5.0
     listens_on: tuple[str, int] | None = None  # checked to be free before anything starts
     port_remedy: str = "Stop the other program."  # where it is not
     start_timeout_s: float = 120.0
@@ -135,18 +143,38 @@ class Supervisor:
     def _attend(self, child: _Child) -> None:
         if child.process is None:
             if self._may_start(child) and time.monotonic() >= child.start_at_s:
-                child.start()
+                self._start(child)
         elif child.process.poll() is not None:
             self._after_death(child)
         elif not (child.ready and child.proven):
             child.probe()
+        elif child.spec.ask is not None and not child.answers(child.spec.ask):
+            self._say(f"{child.spec.name} runs but has not answered {MAX_SILENT} times, and is killed")
+            child.kill()
 
     def _may_start(self, child: _Child) -> bool:
         return all(self._children[name].was_ready for name in child.spec.depends_on)
 
+    def _start(self, child: _Child) -> None:
+        try:
+            child.start()
+        except (OSError, subprocess.SubprocessError) as error:
+            why = f"{child.spec.argv[0]}: {error.strerror if isinstance(error, OSError) else error}"
+            if not child.proven:
+                raise SupervisorError(f"{child.spec.name} cannot start: {why}") from error
+            child.note_failure()  # it could before: the machine is short of something, or a new version is put in place
+            self._say(f"{child.spec.name} cannot start: {why}; trying again in {child.delay_s:g} s")
+
     def _after_death(self, child: _Child) -> None:
+        was_ready = child.ready
         ending = child.collect()
-        tail = "".join(f"\n  {child.spec.name} | {line}" for line in child.log.tail())
+        lines = child.log.tail()
+        if child.spec.repair is not None and not was_ready and child.failed:
+            repaired = child.spec.repair(lines)
+            if repaired is not None:
+                self._say(f"{child.spec.name} {ending} at its start; {repaired}")
+                return
+        tail = "".join(f"\n  {child.spec.name} | {line}" for line in lines)
         if child.gave_up:
             raise SupervisorError(
                 f"{child.spec.name} cannot start: it {ending}, {child.failures} times. "
@@ -169,7 +197,10 @@ class Supervisor:
         if not all(child.ready and child.proven for child in running):
             return PROBE_INTERVAL_S
         waiting = [child for child in self._children.values() if child.process is None and self._may_start(child)]
-        return max(0.0, min([self._next_log_check_s, *(child.start_at_s for child in waiting)]) - time.monotonic())
+        events = [self._next_log_check_s, self._guard.start_at_s]
+        events += [child.start_at_s for child in waiting]
+        events += [child.ask_at_s for child in running if child.spec.ask is not None]
+        return max(0.0, min(events) - time.monotonic())
 
     def _stop_all(self, wakeup: int) -> None:
         while running := [child for child in self._children.values() if child.process is not None]:
@@ -203,6 +234,10 @@ class _Child:
         self.delay_s = 0.0
         self.start_at_s = 0.0
         self.kill_at_s: float | None = None
+        self.failed = False  # its latest life ended in an error, and by itself
+        self.ask_at_s = 0.0  # or look for the answer
+        self._asked: Pulse | None = None
+        self._silent = 0  # questions in a row
         self._started_at_s = 0.0
         self._guard = guard
         self._kept_descriptors = tuple(kept_descriptors)
@@ -216,7 +251,13 @@ class _Child:
         return not self.proven and self.failures >= MAX_FAILED_STARTS
 
     def start(self) -> None:
-        self.ready = self.spec.is_ready is None
+        """Begin a life.
+
+        Raises
+        ------
+        OSError, subprocess.SubprocessError
+            Where no process can be made, or not of this program.
+        """
         self._started_at_s = time.monotonic()
         output = self.log.open_for_child()
         try:
@@ -230,10 +271,9 @@ class _Child:
                 pass_fds=self._kept_descriptors,
                 preexec_fn=_die_with_parent(os.getpid()),  # single-threaded: see the module
             )
-        except OSError as error:
-            raise SupervisorError(f"{self.spec.name} cannot start: {self.spec.argv[0]}: {error.strerror}") from error
         finally:
             os.close(output)
+        self.ready = self.spec.is_ready is None
         self._guard.watch(self.process.pid)
 
     def probe(self) -> None:
@@ -250,17 +290,39 @@ class _Child:
                 f"What it is doing is in {self.log.path}."
             )
 
+    def answers(self, ask: Callable[[], Pulse]) -> bool:
+        """Ask now and then whether it lives; False once it has left too many questions unanswered."""
+        now_s = time.monotonic()
+        if now_s < self.ask_at_s:
+            return True
+        if self._asked is None:
+            self._asked = ask()
+            self.ask_at_s = now_s + self.spec.answer_within_s
+            return True
+        answered, self._asked = self._asked.end(), None
+        self._silent = 0 if answered else self._silent + 1
+        self.ask_at_s = now_s + self.spec.ask_every_s - self.spec.answer_within_s
+        return self._silent < MAX_SILENT
+
+    def note_failure(self) -> None:
+        """Decide when it starts again."""
+        lived_s = time.monotonic() - self._started_at_s
+        self.failures = 1 if lived_s >= STABLE_AFTER_S else self.failures + 1
+        self.delay_s = min(FIRST_DELAY_S * 2 ** min(self.failures - 1, 10), LONGEST_DELAY_S)
+        self.start_at_s = time.monotonic() + self.delay_s
+
     def collect(self) -> str:
         """Clean up after its death, decide when it starts again, and tell how it ended."""
         assert self.process is not None
         self.kill()  # what it started and left
         self._guard.forget(self.process.pid)
-        lived_s = time.monotonic() - self._started_at_s
-        self.failures = 1 if lived_s >= STABLE_AFTER_S else self.failures + 1
-        self.delay_s = min(FIRST_DELAY_S * 2 ** min(self.failures - 1, 10), LONGEST_DELAY_S)
-        self.start_at_s = time.monotonic() + self.delay_s
+        self.note_failure()
         ending = _ending(self.process.returncode)
+        self.failed = self.process.returncode > 0
         self.process, self.ready = None, False
+        if self._asked is not None:
+            self._asked.end()
+        self._asked, self._silent, self.ask_at_s = None, 0, 0.0
         return ending
 
     def terminate(self) -> None:
@@ -281,6 +343,7 @@ class _Guard:
         self._kept_descriptors = tuple(kept_descriptors)
         self._groups: set[int] = set()
         self._process: subprocess.Popen[bytes] | None = None
+        self.start_at_s = math.inf  # where it could not be started
 
     def watch(self, group: int) -> None:
         self._groups.add(group)
@@ -295,15 +358,20 @@ class _Guard:
         if self._process is not None and self._process.poll() is None:
             return
         self._release()
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", process_guard.__file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-            pass_fds=self._kept_descriptors,
-            bufsize=0,
-        )
+        self._process, self.start_at_s = None, math.inf
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", process_guard.__file__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+                pass_fds=self._kept_descriptors,
+                bufsize=0,
+            )
+        except OSError:  # the machine is short of something; until it is there, the kernel alone watches over us
+            self.start_at_s = time.monotonic() + FIRST_DELAY_S
+            return
         for group in self._groups:
             self._tell(f"+{group}\n")
 

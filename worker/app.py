@@ -8,9 +8,12 @@ import mmap
 import os
 import signal
 import sys
+import time
+from collections.abc import Callable
 from typing import Any
 
 from celery import Celery, signals
+from celery.exceptions import Reject
 
 from service.logs import configure
 from service.persistence.wakeups import TASK, celery_options
@@ -18,7 +21,11 @@ from service.settings import Settings
 from worker.execution import Runner
 from worker.lease import RenewLeases, ReportPresence
 
+log = logging.getLogger("mrasfm.worker")
+
 _PR_SET_PDEATHSIG = 1
+_FIRST_DELAY_S = 1.0  # before a message goes back where this process cannot work; doubles with each
+_LONGEST_DELAY_S = 30.0
 _POOL_START_S = 120.0  # a pool process first removes what others left behind; by default it would be killed after 4 s
 
 
@@ -41,6 +48,44 @@ class ShutdownFlag:
         return self._byte[0] == 1
 
 
+class LazyRunner:
+    """A pool process's runner: made as the process begins, and again with each message until it could be made.
+
+    Celery logs what is raised as a pool process begins, and gives it work all the same.
+    """
+
+    def __init__(self, settings: Settings, shutting_down: Callable[[], bool]) -> None:
+        self._settings = settings
+        self._shutting_down = shutting_down
+        self._runner: Runner | None = None
+        self._failures = 0
+
+    def prepare(self) -> bool:
+        """Open database and store where that is still to do; whether they are open."""
+        if self._runner is not None:
+            return True
+        try:
+            runner = Runner(self._settings, shutting_down=self._shutting_down)
+            runner.sweep_scratch()
+        except Exception:  # whatever it is, it may pass
+            log.exception("this worker cannot work: its database, artifact store or scratch folder is not to be had")
+            self._failures += 1
+            return False
+        self._runner, self._failures = runner, 0
+        return True
+
+    def run(self, job_id: str) -> None:
+        """Do a job; where this process cannot, give its message to whoever can."""
+        if self.prepare():
+            assert self._runner is not None
+            self._runner.run(job_id)
+            return
+        end_s = time.monotonic() + min(_FIRST_DELAY_S * 2 ** min(self._failures - 1, 10), _LONGEST_DELAY_S)
+        while time.monotonic() < end_s and not self._shutting_down():
+            time.sleep(0.1)
+        raise Reject("this worker cannot work", requeue=True)
+
+
 def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
     """The application that `mrasfm worker` runs; its pool processes are forked from it."""
     app = Celery("mrasfm", set_as_current=False)
@@ -56,7 +101,7 @@ def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
     app.steps["consumer"].add(ReportPresence)
     flag = ShutdownFlag()
     main_pid = os.getpid()
-    runner: Runner | None = None
+    runner = LazyRunner(settings, flag.is_set)
 
     @signals.setup_logging.connect(weak=False)
     def _log(**_: Any) -> None:
@@ -69,14 +114,11 @@ def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
 
     @signals.worker_process_init.connect(weak=False)
     def _begin(**_: Any) -> None:
-        nonlocal runner
         _die_with(main_pid)
-        runner = Runner(settings, shutting_down=flag.is_set)
-        runner.sweep_scratch()
+        runner.prepare()
 
     @app.task(name=TASK)
     def run_job(job_id: str) -> None:
-        assert runner is not None, "pool processes are initialised before they get work"
         runner.run(job_id)
 
     return app

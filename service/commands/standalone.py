@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -59,4 +61,13 @@ def _count(text: str) -> int:
 
 
 def _say(line: str) -> None:
-    print(f"mrasfm: {line}", file=sys.stderr, flush=True)
+    """Tell who is at the terminal; that nobody is there any more, or no room for it, stops nothing."""
+    try:
+        print(f"mrasfm: {line}", file=sys.stderr, flush=True)
+    except BrokenPipeError:  # what reads our words has ended
+        with suppress(OSError):  # else what is left of the line fails again at the interpreter's end
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stderr.fileno())
+            os.close(nowhere)
+    except OSError:
+        return

@@ -27,6 +27,7 @@ QUEUES = {
     JobKind.AGGREGATION: "reconstructions",
 }
 _ANSWER_WITHIN_S = 2
+_NOTICE_WITHIN_S = 10  # that the broker has vanished: a worker's main process waits for its answers
 _SILENT_FOR_S = 3.0  # a broker that did not answer is not asked again for so long: it would hold up every request
 
 
@@ -53,6 +54,8 @@ def celery_options(settings: Settings) -> dict[str, Any]:
             "unacked_restore_throttle": 1,
             "unacked_mutex_expire": 10,
             "socket_connect_timeout": _ANSWER_WITHIN_S,
+            # Without it a broker that goes without a word (a lost node, a cut network) stops the worker for ever.
+            "socket_timeout": _NOTICE_WITHIN_S,
             "socket_keepalive": True,
             "health_check_interval": 10,
         },

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import random
 import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,13 @@ import pytest
 
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
+from service.broker import JOURNAL, JOURNAL_SET_ASIDE
+from service.settings import Settings
 
 DEADLINE_S = 120.0
 WORKER_STARTS_WITHIN_S = 90.0
 TERMINAL = ("SUCCEEDED", "FAILED", "CANCELLED")
+ORDER_SEED = 5  # of killing everything
 
 
 class Standalone:
@@ -107,6 +112,25 @@ class Standalone:
         (process,) = [process for process in self.processes() if process.cwd() == str(self.data / "broker")]
         return process
 
+    def kill_everything(self, *, supervisor_last: bool) -> None:
+        """Every process there is, in an order of its own each time; the supervisor has time to start some again."""
+        assert self.process is not None
+        victims = self.processes()
+        random.Random(ORDER_SEED).shuffle(victims)
+        victims.sort(key=lambda process: (process.pid == self.process.pid) == supervisor_last)
+        for process in victims:
+            with suppress(psutil.NoSuchProcess):  # gone with another
+                process.kill()
+            time.sleep(0.1)
+        self.process.wait()
+        wait_until(lambda: self.processes() == [], lambda: f"left: {self.processes()}")
+
+    def damage_journal(self) -> None:
+        """As a power cut does: the file has its size, and not its data."""
+        (journal,) = (self.data / "broker" / JOURNAL).glob("*.incr.aof")
+        with journal.open("ab") as file:
+            file.write(bytes(512))
+
     def hold(self, job_id: str) -> psutil.Process:
         """Stop a job's stage in its tracks once it works."""
         stage: list[psutil.Process] = []
@@ -168,16 +192,24 @@ def test_kills(service: Standalone, drive: Path) -> None:
     service.hold(job_ids[-1]).kill()
     assert_one_scene(service, job_ids, attempts=2)
 
-    job_ids.append(service.ask(drive_id, seed=len(job_ids)))
-    service.hold(job_ids[-1])
-    for process in service.processes():
-        process.kill()
-    wait_until(lambda: service.processes() == [], lambda: f"left: {service.processes()}")
-    assert service.process is not None
-    service.process.wait()
-    service.start()
+    for supervisor_last in (False, True):
+        job_ids.append(service.ask(drive_id, seed=len(job_ids)))
+        service.hold(job_ids[-1])
+        service.kill_everything(supervisor_last=supervisor_last)
+        if supervisor_last:
+            service.damage_journal()
+        service.start()
+        assert_one_scene(service, job_ids, attempts=2)
+    assert "its journal is damaged and was moved to" in service.said()
+    assert (service.data / "broker" / JOURNAL_SET_ASIDE).is_dir()
+
+    # What a worker held when it died is delivered again after this, if nobody has taken care of it by then.
+    jobs = [service.job(job_id) for job_id in job_ids]
+    time.sleep(Settings().visibility_timeout_seconds + 10)
+    assert [service.job(job_id) for job_id in job_ids] == jobs
     assert_one_scene(service, job_ids, attempts=2)
 
+    assert service.process is not None
     service.process.send_signal(signal.SIGINT)
     assert service.process.wait(60) == 0, service.said()
     assert service.processes() == []

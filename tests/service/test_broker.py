@@ -19,6 +19,7 @@ from redis.backoff import NoBackoff
 from redis.retry import Retry
 
 from service import broker
+from service.child_log import TAIL_LINES
 from service.data_folder import DataFolderError
 
 Start = Callable[[broker.EmbeddedBroker], subprocess.Popen[bytes]]
@@ -95,6 +96,69 @@ def test_a_half_written_last_command_does_not_stop_the_server(tmp_path: Path, st
     (journal,) = (tmp_path / "broker").rglob("*.incr.aof")
     with journal.open("ab") as file:
         file.write(b"*3\r\n$5\r\nRPUSH\r\n$5\r\npla")
+    start(prepared)
+    assert what_is_there(prepared.url) == ([b"one", b"two"], {"job": "job_1"})
+
+
+def half_a_block(files: Path) -> None:
+    """What a power cut leaves of a file whose size was written before its data."""
+    (journal,) = files.glob("*.incr.aof")
+    with journal.open("ab") as file:
+        file.write(bytes(512))
+
+
+def overwritten(files: Path) -> None:
+    (journal,) = files.glob("*.incr.aof")
+    journal.write_bytes(b"*2\r\n$7\r\nNONSENSE\r\n" + journal.read_bytes()[20:])
+
+
+def base_lost(files: Path) -> None:
+    (base,) = files.glob("*.base.*")
+    base.unlink()
+
+
+def manifest_overwritten(files: Path) -> None:
+    (manifest,) = files.glob("*.manifest")
+    manifest.write_bytes(bytes(manifest.stat().st_size))
+
+
+@pytest.mark.parametrize("damage", [half_a_block, overwritten, base_lost, manifest_overwritten])
+def test_a_damaged_journal_is_moved_out_of_the_way(
+    tmp_path: Path, start: Start, damage: Callable[[Path], None]
+) -> None:
+    folder = tmp_path / "broker"
+    for _ in range(2):  # the copy of the first damage makes way for that of the second
+        prepared = broker.prepare(folder)
+        process = start(prepared)
+        put(prepared.url)
+        kill(process)
+        damage(folder / broker.JOURNAL)
+        ended = subprocess.run(prepared.argv, capture_output=True, text=True, timeout=60, check=False)
+        assert ended.returncode > 0
+        done = broker.set_damaged_journal_aside(folder, ended.stdout.splitlines()[-TAIL_LINES:])
+        assert done is not None, ended.stdout
+        assert str(folder / broker.JOURNAL_SET_ASIDE) in done
+        assert any((folder / broker.JOURNAL_SET_ASIDE).iterdir())
+        process = start(prepared)
+        with redis.Redis.from_url(prepared.url) as client:
+            assert client.keys() == []
+        kill(process)
+
+
+@pytest.mark.parametrize(
+    "last_line",
+    [
+        "",
+        "Failed listening on port 6379 (tcp), aborting.",
+        "Can't open or create append-only dir appendonlydir: No space left on device",
+    ],
+)
+def test_a_sound_journal_stays(tmp_path: Path, start: Start, last_line: str) -> None:
+    prepared = broker.prepare(tmp_path / "broker")
+    process = start(prepared)
+    put(prepared.url)
+    kill(process)
+    assert broker.set_damaged_journal_aside(tmp_path / "broker", [last_line]) is None
     start(prepared)
     assert what_is_there(prepared.url) == ([b"one", b"two"], {"job": "job_1"})
 

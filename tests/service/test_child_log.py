@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from pathlib import Path
+
+import pytest
 
 from service.child_log import KEPT, TAIL_LINES, ChildLog
 
@@ -50,3 +54,40 @@ def test_it_stays_bounded_while_the_child_writes(tmp_path: Path) -> None:
     assert kept == [str(KEPT + 2 - number) for number in range(KEPT)]
     assert len(list(tmp_path.iterdir())) == KEPT + 1
     assert all(path.stat().st_mode & 0o077 == 0 for path in tmp_path.iterdir())
+
+
+def test_a_log_that_was_removed_has_no_tail_and_comes_back(tmp_path: Path) -> None:
+    log = ChildLog(tmp_path / "logs" / "api.log")
+    os.close(log.open_for_child())
+    shutil.rmtree(tmp_path / "logs")
+    log.rotate_if_large()
+    assert log.tail() == []
+    descriptor = log.open_for_child()
+    write(descriptor, "here again")
+    os.close(descriptor)
+    assert log.tail() == ["here again"]
+
+
+def test_what_cannot_be_opened_is_not_written(tmp_path: Path) -> None:
+    (tmp_path / "logs").touch()
+    log = ChildLog(tmp_path / "logs" / "api.log")
+    descriptor = log.open_for_child()
+    write(descriptor, "nobody reads this")
+    os.close(descriptor)
+    assert log.tail() == []
+
+
+def test_on_a_full_disk_a_large_log_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_room(source: Path, target: Path) -> None:
+        target.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    log = ChildLog(tmp_path / "api.log", max_bytes=100)
+    descriptor = log.open_for_child()
+    write(descriptor, "x" * 150)
+    monkeypatch.setattr("service.child_log.shutil.copy", no_room)
+    log.rotate_if_large()
+    write(descriptor, "the newest")
+    os.close(descriptor)
+    assert log.tail() == ["the newest"]
+    assert [path.name for path in tmp_path.iterdir()] == ["api.log"]

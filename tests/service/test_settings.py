@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from pydantic import ValidationError
 
+from service.persistence.database import migrate
 from service.settings import Settings
 from tests.service.conftest import StartApi
 from tests.service.tiny_drive import tiny_drive
@@ -80,3 +83,10 @@ def test_a_time_that_is_no_number_is_the_only_error(monkeypatch: pytest.MonkeyPa
     with pytest.raises(ValidationError) as caught:
         Settings()
     assert [problem["loc"] for problem in caught.value.errors()] == [("heartbeat_seconds",)]
+
+
+@pytest.mark.parametrize("name", ["a?b", "50% off", "a#b", "a%20b", "Straße", "with ' and \" quotes"])
+def test_the_embedded_database_is_in_its_folder_whatever_that_is_called(tmp_path: Path, name: str) -> None:
+    migrate(Settings(data_dir=tmp_path / name))
+    assert (tmp_path / name / "mrasfm.sqlite3").stat().st_size > 0
+    assert [path.name for path in tmp_path.iterdir()] == [name]

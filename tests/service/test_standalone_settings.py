@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import socket
+import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -11,6 +16,7 @@ import pytest
 
 from service import broker
 from service.commands import standalone as command
+from service.persistence.database import migrate
 from service.settings import Settings
 from service.standalone import child_specs
 
@@ -76,6 +82,47 @@ def test_a_database_that_is_away_is_named_without_its_password(
     assert f"the database postgresql+psycopg://mrasfm:***@127.0.0.1:{port}/mrasfm cannot be used" in said
     assert "Check MRASFM_DATABASE_URL" in said
     assert "topsecret" not in said
+
+
+def test_a_schema_of_a_newer_version_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    migrate(Settings(data_dir=tmp_path))
+    with closing(sqlite3.connect(tmp_path / "mrasfm.sqlite3")) as connection, connection:
+        connection.execute("UPDATE alembic_version SET version_num = '9999'")
+    assert run("--data", str(tmp_path), "--port", "0") == 2
+    said = capsys.readouterr().err
+    assert f"{tmp_path}/mrasfm.sqlite3 is of a newer MRASfM than this one" in said
+    assert "Install that version again" in said
+
+
+@pytest.mark.parametrize("function", ["truncate", "fsync"])  # as the lock is written, and as the broker is prepared
+def test_a_full_disk_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], function: str
+) -> None:
+    def no_room(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(f"service.data_folder.os.{function}", no_room)
+    assert run("--data", str(tmp_path), "--port", "0") == 2
+    said = capsys.readouterr().err
+    assert "cannot be used: No space left on device. Make room on its disk" in said
+
+
+def test_a_reader_that_has_ended_ends_nothing() -> None:
+    """As `mrasfm standalone 2>&1 | head -3` does."""
+    speaker = "from service.commands.standalone import _say; input(); _say('one'); _say('two')"
+    with subprocess.Popen(
+        [sys.executable, "-c", speaker], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        process.stderr.close()
+        process.communicate("\n", timeout=60)
+    assert process.returncode == 0
+
+
+def test_a_full_disk_below_the_terminals_words_ends_nothing(tmp_path: Path) -> None:
+    speaker = "from service.commands.standalone import _say; _say('one'); _say('two')"
+    with Path("/dev/full").open("w") as full:
+        subprocess.run([sys.executable, "-c", speaker], stderr=full, check=True, timeout=60)
 
 
 def test_a_file_in_the_data_folder_s_place_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

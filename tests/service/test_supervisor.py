@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
@@ -19,6 +22,7 @@ import psutil
 import pytest
 
 from service.data_folder import DataFolderError, exclusive_use
+from service.supervisor import ChildSpec, Supervisor
 
 PATIENCE_S = 60.0
 
@@ -26,6 +30,7 @@ SUPERVISOR = """
 import json, sys
 from pathlib import Path
 from service.data_folder import DataFolderError, exclusive_use
+from service.pulse import Pulse
 from service.supervisor import ChildSpec, Supervisor, SupervisorError
 
 def say(line):
@@ -34,7 +39,11 @@ def say(line):
 def spec_of(document):
     ready_file = document.pop("ready_file", None)
     is_ready = None if ready_file is None else Path(ready_file).exists
-    return ChildSpec(is_ready=is_ready, **document)
+    ask_at = document.pop("ask_at", None)
+    ask = None if ask_at is None else lambda: Pulse("127.0.0.1", ask_at, "/livez")
+    mend = document.pop("mend", None)
+    repair = None if mend is None else lambda lines: Path(mend).touch() or f"mended: {lines[-1]}"
+    return ChildSpec(is_ready=is_ready, ask=ask, repair=repair, **document)
 
 folder = Path(sys.argv[1])
 specs = [spec_of(document) for document in json.loads(sys.argv[2])]
@@ -90,6 +99,10 @@ def is_gone(pid: int) -> bool:
         return True
 
 
+def guards_of(pid: int) -> list[psutil.Process]:
+    return [child for child in psutil.Process(pid).children() if "process_guard" in " ".join(child.cmdline())]
+
+
 @dataclass
 class World:
     """One folder, and the supervisors that were started in it."""
@@ -138,11 +151,8 @@ class World:
         return int(self.pid_file(name).read_text(encoding="ascii"))
 
     def guard(self, supervisor: subprocess.Popen[bytes]) -> psutil.Process:
-        def find() -> list[psutil.Process]:
-            children = psutil.Process(supervisor.pid).children()
-            return [child for child in children if "process_guard" in " ".join(child.cmdline())]
-
-        (guard,) = wait_for(find)
+        (guard,) = wait_for(lambda: guards_of(supervisor.pid))
+        assert isinstance(guard, psutil.Process)
         return guard
 
 
@@ -314,6 +324,114 @@ def test_a_killed_guard_is_replaced_and_knows_what_to_do(world: World) -> None:
     supervisor.wait()
     for name in ("worker", "grandchild"):
         wait_for(lambda name=name: is_gone(world.pid(name)))
+
+
+def test_without_its_logs_it_goes_on(world: World) -> None:
+    supervisor = world.start_ready(world.child("worker"))
+    logs = world.folder / "logs"
+    (logs / "worker.log").unlink()
+    first = world.pid("worker")
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: world.pid("worker") != first)
+    assert "hello from worker" in wait_for((logs / "worker.log").read_text)
+    shutil.rmtree(logs)
+    logs.touch()  # no folder can be made in its place
+    second = world.pid("worker")
+    os.kill(second, signal.SIGKILL)
+    wait_for(lambda: world.pid("worker") != second)
+    assert stop(supervisor) == 0
+
+
+def test_a_program_that_is_away_for_a_moment_is_started_when_it_is_back(world: World) -> None:
+    """As while another version of it is installed."""
+    child = world.child("worker")
+    program = world.folder / "program"
+    program.symlink_to(sys.executable)
+    supervisor = world.start_ready({**child, "argv": [str(program), *child["argv"][1:]]})
+    program.unlink()
+    first = world.pid("worker")
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: f"worker cannot start: {program}: No such file or directory; trying again" in world.console())
+    program.symlink_to(sys.executable)
+    wait_for(lambda: world.pid("worker") != first)
+    assert stop(supervisor) == 0
+
+
+def test_a_passing_lack_of_processes_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the guard's too, whose first two starts fail here."""
+    real, refused, said = subprocess.Popen, [], []
+
+    def scarce(argv: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        if "process_guard" in argv[-1] and len(refused) < 2:
+            refused.append(argv)
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        return real(argv, **options)
+
+    monkeypatch.setattr("service.supervisor.subprocess.Popen", scarce)
+    spec = ChildSpec(name="worker", argv=[sys.executable, "-I", "-S", "-c", "import time; time.sleep(600)"])
+
+    def end() -> None:
+        wait_for(lambda: len(guards_of(os.getpid())) == 1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    ending = threading.Thread(target=end)
+    Supervisor([spec], log_folder=tmp_path, say=said.append, on_ready=ending.start).run()
+    ending.join()
+    assert len(refused) == 2
+    assert said == []
+
+
+def test_what_keeps_a_child_from_starting_is_put_right(world: World) -> None:
+    mend = world.folder / "mended"
+    body = f"""
+if not Path("{mend}").exists():
+    print("the journal is damaged", flush=True)
+    sys.exit(1)
+"""
+    never_before = world.folder / "ready"
+    supervisor = world.start(
+        world.child(
+            "broker", body=body + f"Path('{never_before}').touch()", ready_file=str(never_before), mend=str(mend)
+        )
+    )
+    wait_for(lambda: "ready\n" in world.console())
+    assert "broker ended with exit code 1 at its start; mended: the journal is damaged" in world.console()
+    assert stop(supervisor) == 0
+
+
+ANSWERING = """
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+class Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self):
+        self.send_response(200 if self.path == "/livez" else 404)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+HTTPServer.allow_reuse_address = True
+server = HTTPServer(("127.0.0.1", {port}), Handler)
+threading.Thread(target=server.serve_forever, daemon=True).start()
+(folder / "answers").touch()
+"""
+
+
+def test_a_child_that_hangs_is_killed_and_starts_again(world: World) -> None:
+    with closing(socket.socket()) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    asked = {"ask_at": port, "ask_every_s": 1.0, "answer_within_s": 0.8, "ready_file": str(world.folder / "answers")}
+    supervisor = world.start_ready(world.child("api", body=ANSWERING.format(port=port), **asked))
+    first = world.pid("api")
+    time.sleep(8)
+    assert world.pid("api") == first
+    os.kill(first, signal.SIGSTOP)
+    wait_for(lambda: world.pid("api") != first)
+    assert "api runs but has not answered 4 times, and is killed" in world.console()
+    assert "api was ended by SIGKILL; starting it again" in world.console()
+    assert stop(supervisor) == 0
 
 
 def test_two_do_not_share_a_folder(world: World) -> None:
