@@ -12,12 +12,7 @@ import socket
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from importlib.metadata import version
 from pathlib import Path
-
-from alembic.util import CommandError
-from sqlalchemy.engine import make_url
-from sqlalchemy.exc import SQLAlchemyError
 
 from service import broker
 from service.data_folder import exclusive_use, make_private_folder
@@ -26,6 +21,7 @@ from service.persistence.keys import ensure_first_key
 from service.pulse import Pulse
 from service.settings import Settings
 from service.supervisor import ChildSpec, Supervisor
+from service.unusable_database import UnusableDatabaseError, unusable_is_told
 
 PROBE_TIMEOUT_S = 2.0
 # A worker that is told to stop ends its stage and gives its job back to the queue; the next start goes on from there.
@@ -148,25 +144,13 @@ def _python(package: str, *arguments: str) -> list[str]:
 
 def _prepare_records(settings: Settings, say: Say) -> None:
     try:
-        migrate(settings)
-        key = ensure_first_key(settings)
-    except CommandError as error:  # the database names a step of the schema that is not among ours
-        raise StandaloneError(
-            f"the database {_database_of(settings)} is of a newer MRASfM than this one, {version('mrasfm')}: "
-            f"{error}. Install that version again, or give another database or another folder with --data."
-        ) from error
-    except SQLAlchemyError as error:
-        reason = str(getattr(error, "orig", None) or error).strip()
-        remedy = "Check MRASFM_DATABASE_URL, and that its server runs."
-        if settings.database_url is None:
-            remedy = "Check that its disk has room and that the file belongs to you."
-        raise StandaloneError(f"the database {_database_of(settings)} cannot be used: {reason}. {remedy}") from error
+        with unusable_is_told(settings):
+            migrate(settings)
+            key = ensure_first_key(settings)
+    except UnusableDatabaseError as error:
+        raise StandaloneError(str(error)) from error
     if key is not None:
         say(f"the first API key, shown this once: {key}")
-
-
-def _database_of(settings: Settings) -> str:
-    return make_url(settings.resolved_database_url).render_as_string(hide_password=True)
 
 
 def _announce(settings: Settings, say: Say) -> None:

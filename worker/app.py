@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import mmap
 import os
-import signal
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +13,7 @@ from celery import Celery, signals
 from celery.exceptions import Reject
 
 from service.logs import configure
+from service.parent_death import end_with_parent
 from service.persistence.wakeups import TASK, celery_options
 from service.settings import Settings
 from worker.execution import Runner
@@ -23,7 +21,6 @@ from worker.lease import RenewLeases, ReportPresence
 
 log = logging.getLogger("mrasfm.worker")
 
-_PR_SET_PDEATHSIG = 1
 _FIRST_DELAY_S = 1.0  # before a message goes back where this process cannot work; doubles with each
 _LONGEST_DELAY_S = 30.0
 _POOL_START_S = 120.0  # a pool process first removes what others left behind; by default it would be killed after 4 s
@@ -114,7 +111,7 @@ def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
 
     @signals.worker_process_init.connect(weak=False)
     def _begin(**_: Any) -> None:
-        _die_with(main_pid)
+        end_with_parent(main_pid)  # and its stage with it
         runner.prepare()
 
     @app.task(name=TASK)
@@ -122,11 +119,3 @@ def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
         runner.run(job_id)
 
     return app
-
-
-def _die_with(main_pid: int) -> None:
-    """End this pool process with the worker's main process, however that ends; its stage ends with it."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != main_pid:  # it ended before the kernel knew
-        os._exit(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,8 @@ from service.settings import Settings
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
+
+EXIT_CANNOT_RUN = 2
 
 Action = Callable[["Session", Settings, argparse.Namespace], int]
 
@@ -22,9 +25,20 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 def administer(action: Action, arguments: argparse.Namespace) -> int:
     """Run an action in one transaction on the service's records; its exit code."""
-    from service.persistence.database import Database, migrate
+    from service.unusable_database import UnusableDatabaseError, unusable_is_told
 
     settings = Settings() if arguments.data is None else Settings(data_dir=arguments.data)
+    try:
+        with unusable_is_told(settings):
+            return _in_transaction(action, settings, arguments)
+    except UnusableDatabaseError as error:
+        print(f"mrasfm: error: {error}", file=sys.stderr)
+        return EXIT_CANNOT_RUN
+
+
+def _in_transaction(action: Action, settings: Settings, arguments: argparse.Namespace) -> int:
+    from service.persistence.database import Database, migrate
+
     migrate(settings)
     database = Database.of(settings)
     try:

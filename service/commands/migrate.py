@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
+from service.commands.administration import EXIT_CANNOT_RUN
 from service.settings import Settings
 
 
@@ -16,7 +18,14 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(arguments: argparse.Namespace) -> int:
     """Migrate; safe to repeat."""
     from service.persistence.database import migrate
+    from service.unusable_database import UnusableDatabaseError, unusable_is_told
 
-    migrate(Settings())
+    settings = Settings()
+    try:
+        with unusable_is_told(settings):
+            migrate(settings)
+    except UnusableDatabaseError as error:
+        print(f"mrasfm: error: {error}", file=sys.stderr)
+        return EXIT_CANNOT_RUN
     print("the database has this version's schema")
     return 0

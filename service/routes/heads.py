@@ -16,8 +16,8 @@ def heads_of(routers: Sequence[APIRouter]) -> APIRouter:
     The OpenAPI page says it once, for all. Event streams have none: their answer begins when there is news.
     """
     routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
-    own = {route.path for route in routes if "HEAD" in route.methods}
-    heads = [_head_of(route) for route in routes if "GET" in route.methods and route.path not in own]
+    own = {route.path for route in routes if "HEAD" in (route.methods or ())}
+    heads = [_head_of(route) for route in routes if "GET" in (route.methods or ()) and route.path not in own]
     return APIRouter(routes=[head for head in heads if head.response_class is not EventSourceResponse])
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 from alembic import command
 from alembic.autogenerate import compare_metadata
@@ -13,6 +17,7 @@ from sqlalchemy import inspect, text
 from service.persistence.database import MIGRATIONS, Database, is_current, migrate
 from service.persistence.tables import Base, Job, JobAttempt, JobEvent, Scene
 from service.settings import Settings
+from tests.service.live_api import REPOSITORY, free_port
 
 
 def differences(database: Database) -> list[object]:
@@ -96,3 +101,14 @@ def test_down_and_up_again(database: Database, database_settings: Settings) -> N
     assert not is_current(database)
     migrate(database_settings)
     assert differences(database) == []
+
+
+def test_the_command_says_what_is_wrong_with_the_database(tmp_path: Path) -> None:
+    environment = {**os.environ, "MRASFM_DATABASE_URL": f"postgresql+psycopg://mrasfm:hush@127.0.0.1:{free_port()}/x"}
+    command = [sys.executable, "-m", "service", "migrate"]
+    done = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "cannot be used" in done.stderr
+    assert "MRASFM_DATABASE_URL" in done.stderr
+    assert "hush" not in done.stderr
+    assert "Traceback" not in done.stderr
