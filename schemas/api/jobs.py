@@ -115,7 +115,7 @@ class JobAttempt(Resource):
 
     model_config = ConfigDict(json_schema_extra={"examples": [_ATTEMPT]})
 
-    attempt: int = Field(description="1 for the first, rising")
+    attempt: int = Field(description="1 for the first, rising; one that was released costs no retry")
     worker: str = Field(description="machine and process")
     started_at: datetime
     finished_at: datetime | None = Field(None, description="null while it runs")

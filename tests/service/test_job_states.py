@@ -79,6 +79,12 @@ def fail(database: Database, held: jobs.Claim, *, retryable: bool) -> JobState:
         return jobs.fail(session, held, problem(retryable=retryable), max_attempts=MAX_ATTEMPTS, retry_delay_us=0)
 
 
+def note_of(percent: float) -> jobs.ProgressNote:
+    return jobs.ProgressNote(
+        stage="matches", done=1, total=2, unit="pairs", percent=percent, eta_low_s=None, eta_high_s=None
+    )
+
+
 def cancel(database: Database, job_id: str) -> None:
     with database.write() as session:
         jobs.request_cancel(session, job_id)
@@ -223,10 +229,30 @@ def test_a_worker_that_is_told_to_stop_costs_no_attempt(database: Database, job_
     for _ in range(MAX_ATTEMPTS + 2):
         held = claimed(database, job_id)
         fences.append(held.fence)
-        assert held.attempt == 1
+        assert held.attempt == len(fences), "what was shown is not taken back"
         with database.write() as session:
             jobs.release(session, held)
     assert fences == sorted(set(fences)), "the fencing number rises all the same"
+    with database.read() as session:
+        rows = session.execute(select(JobAttempt.attempt, JobAttempt.outcome).order_by(JobAttempt.fence)).all()
+    assert [tuple(row) for row in rows] == [(number, "released") for number in range(1, len(fences) + 1)]
+    ends = [fail(database, claimed(database, job_id), retryable=True) for _ in range(MAX_ATTEMPTS)]
+    assert ends == [JobState.QUEUED] * (MAX_ATTEMPTS - 1) + [JobState.FAILED], "all of its retries are left"
+
+
+def test_progress_is_not_taken_back_when_a_worker_stops(database: Database, job_id: str) -> None:
+    """Nor by a note that comes late: per attempt the percent never falls."""
+    held = claimed(database, job_id)
+    for percent in (60.0, 40.0):
+        with database.write() as session:
+            jobs.heartbeat(session, held, lease_us=LEASE_US, note=note_of(percent))
+    with database.write() as session:
+        jobs.release(session, held)
+    claimed(database, job_id)
+    with database.read() as session:
+        told = [(event.data["attempt"], event.data["percent"]) for event in jobs.events_after(session, job_id, 0)]
+    assert told == sorted(told)
+    assert told[-1] == (2, 0.0)
 
 
 def test_a_retry_waits_its_time(database: Database, job_id: str) -> None:
@@ -410,6 +436,7 @@ class Transitions(RuleBasedStateMachine):
         self.held: list[jobs.Claim] = []
         self.ended: tuple[Any, ...] | None = None
         self.revision = 0
+        self.shown = (0, 0.0)
 
     def _try(self, action: Callable[[Session], Any]) -> Any:
         try:
@@ -427,7 +454,7 @@ class Transitions(RuleBasedStateMachine):
         if held is not None:
             assert self.ended is None
             assert all(held.fence > old.fence for old in self.held)
-            assert held.attempt <= MAX_ATTEMPTS
+            assert held.failures < MAX_ATTEMPTS
             self.held.append(held)
 
     @rule(pick=st.integers(0, 5), what=st.sampled_from(["beat", "succeed", "cancelled", "release", "publish"]))
@@ -442,6 +469,12 @@ class Transitions(RuleBasedStateMachine):
                 "publish": lambda s: scenes.publish(s, held, files={}, summary=SUMMARY, expires_us=None),
             }
             self._try(actions[what])
+
+    @rule(pick=st.integers(0, 5), percent=st.floats(0.0, 100.0))
+    def tell(self, pick: int, percent: float) -> None:
+        held = self._holder(pick)
+        if held is not None:
+            self._try(lambda s: jobs.heartbeat(s, held, lease_us=LEASE_US, note=note_of(percent)))
 
     @rule(pick=st.integers(0, 5), retryable=st.booleans())
     def fail(self, pick: int, retryable: bool) -> None:
@@ -469,11 +502,13 @@ class Transitions(RuleBasedStateMachine):
             published = session.scalars(select(Scene.id).where(Scene.job_id == job.id)).all()
         assert self.ended is None or seen == self.ended
         assert job.revision >= self.revision
-        assert 0 <= job.attempt <= MAX_ATTEMPTS
+        assert 0 <= job.failures < MAX_ATTEMPTS
+        assert (job.attempt, job.percent) >= self.shown, "neither falls, the percent within an attempt"
         assert open_attempts == ([job.fence] if job.state == JobState.RUNNING else [])
         assert published == ([] if job.scene_id is None else [job.scene_id])
         assert not (job.state == JobState.QUEUED and job.cancel_requested_us), "waits although nobody wants it"
         self.revision = job.revision
+        self.shown = (job.attempt, job.percent)
         if job.state in TERMINAL:
             self.ended = seen
 

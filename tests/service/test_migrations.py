@@ -66,6 +66,8 @@ def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
         assert (job.drive_id, job.map_id, job.is_child, job.waiting_for, job.children_percent) == (
             "drv_1", None, False, 0, 0.0,
         )  # fmt: skip
+        assert (job.attempt, job.failures) == (1, 0)
+        assert session.get_one(Job, "job_2").failures == 2, "attempts that failed before it was queued again"
         assert session.query(JobAttempt).count() == 1
         assert session.query(JobEvent).count() == 1
         assert session.query(Scene).count() == 0
@@ -78,6 +80,9 @@ _FIRST_RECORDS = (
     "INSERT INTO jobs (id, project_id, kind, drive_id, settings, state, revision, attempt, fence, not_before_us, "
     "percent, reused, created_us) VALUES "
     "('job_1', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'SUCCEEDED', 1, 1, 1, 0, 100, '[]', 1)",
+    "INSERT INTO jobs (id, project_id, kind, drive_id, settings, state, revision, attempt, fence, not_before_us, "
+    "percent, reused, created_us) VALUES "
+    "('job_2', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'QUEUED', 1, 2, 3, 0, 0, '[]', 1)",
     "INSERT INTO job_attempts (job_id, fence, attempt, owner, started_us) VALUES ('job_1', 1, 1, 'w', 1)",
     "INSERT INTO job_events (job_id, kind, data, created_us) VALUES ('job_1', 'state', '{}', 1)",
 )

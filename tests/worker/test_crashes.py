@@ -221,10 +221,10 @@ def test_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:
     first.wait(60)
     assert time.monotonic() - began_s < 30  # 3 s on an idle machine
     assert first.returncode == 0
-    assert (world.job(job_id).state, world.job(job_id).attempt) == ("QUEUED", 0)
+    assert (world.job(job_id).state, world.job(job_id).failures) == ("QUEUED", 0)
     world.start_worker()
     assert_one_scene(world, job_id, ["released", "succeeded"])
-    assert world.job(job_id).attempt == 1
+    assert (world.job(job_id).attempt, world.job(job_id).failures) == (2, 0)
     wait_until(lambda: not Wakeups(world.settings).waiting(), "no message is left behind")
 
 
@@ -240,7 +240,7 @@ def test_impatient_stop(world: World, brief_drive: Path, signals: list[str]) -> 
     worker.wait(60)
     wait_until(lambda: world.processes() == [], "the end of everything")
     assert world.outcomes(job_id) == ["released"]
-    assert (world.job(job_id).state, world.job(job_id).attempt) == ("QUEUED", 0)
+    assert (world.job(job_id).state, world.job(job_id).failures) == ("QUEUED", 0)
 
 
 def test_all_of_a_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:

@@ -160,7 +160,7 @@ def test_shutting_down(world: World, brief_drive: Path) -> None:
 
     Runner(world.settings, shutting_down=shutting_down).run(job_id)
     job = world.job(job_id)
-    assert (job.state, job.attempt, job.fence) == ("QUEUED", 0, 1)
+    assert (job.state, job.attempt, job.fence) == ("QUEUED", 1, 1)
     assert world.outcomes(job_id) == ["released"]
     assert world.children() == []
 

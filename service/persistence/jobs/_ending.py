@@ -71,8 +71,9 @@ def fail(session: Session, held: Claim, problem: Problem, *, max_attempts: int, 
     if job.cancel_requested_us is not None:
         end(session, held, JobState.CANCELLED, outcome, {}, problem=described)
         return JobState.CANCELLED
-    if problem.retryable and held.attempt < max_attempts:
-        requeue(session, held, outcome, described, not_before_us=clock_us(session) + retry_delay_us)
+    if problem.retryable and job.failures + 1 < max_attempts:
+        not_before_us = clock_us(session) + retry_delay_us
+        requeue(session, held, outcome, described, not_before_us=not_before_us, is_failure=True)
         return JobState.QUEUED
     end(session, held, JobState.FAILED, outcome, {"problem": described}, problem=described)
     return JobState.FAILED
@@ -90,7 +91,9 @@ def cancelled(session: Session, held: Claim) -> None:
 
 
 def release(session: Session, held: Claim) -> None:
-    """Give the job back, for another worker: this one was told to stop. The attempt is not counted.
+    """Give the job back, for another worker: this one was told to stop.
+
+    The attempt is shown as released, and costs none of the job's retries.
 
     A job whose end was asked for ends here: no other worker may come for it.
 
@@ -102,7 +105,7 @@ def release(session: Session, held: Claim) -> None:
     if locked(session, held.job_id).cancel_requested_us is not None:
         cancelled(session, held)
         return
-    requeue(session, held, "released", None, not_before_us=0, counted=False)
+    requeue(session, held, "released", None, not_before_us=0, is_failure=False)
 
 
 def record_findings(session: Session, held: Claim, findings: Sequence[Mapping[str, Any]], *, sound: bool) -> None:
@@ -156,7 +159,7 @@ def requeue(
     problem: Mapping[str, Any] | None,
     *,
     not_before_us: int,
-    counted: bool = True,
+    is_failure: bool,
 ) -> None:
     values: dict[str, Any] = {
         "state": JobState.QUEUED,
@@ -165,8 +168,8 @@ def requeue(
         "not_before_us": not_before_us,
         "enqueued_us": None,
     }
-    if not counted:
-        values["attempt"] = Job.attempt - 1
+    if is_failure:
+        values["failures"] = Job.failures + 1
     require(change(session, held.job_id, held_by(held), values))
     close_attempts(session, held.job_id, outcome, problem)
     tell_state(session, held.job_id)

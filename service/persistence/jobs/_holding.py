@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -93,12 +93,13 @@ def heartbeat(session: Session, held: Claim, *, lease_us: int, note: ProgressNot
     now = clock_us(session)
     values: dict[str, Any] = {"lease_until_us": now + lease_us, "heartbeat_us": now}
     if note is not None:
+        percent = held.children_percent + (1.0 - held.children_percent / 100.0) * note.percent
         values |= {
             "stage": note.stage,
             "done": note.done,
             "total": note.total,
             "unit": note.unit,
-            "percent": held.children_percent + (1.0 - held.children_percent / 100.0) * note.percent,
+            "percent": case((Job.percent > percent, Job.percent), else_=percent),  # never falls within an attempt
             "eta_low_s": note.eta_low_s,
             "eta_high_s": note.eta_high_s,
             "reused": list(note.reused),
@@ -157,8 +158,8 @@ def expire_leases(session: Session, *, max_attempts: int) -> list[str]:
         described = problem.model_dump(mode="json", exclude_none=True)
         if job.cancel_requested_us is not None:
             end(session, held, JobState.CANCELLED, "cancelled", {})
-        elif job.attempt < max_attempts:
-            requeue(session, held, "worker-lost", described, not_before_us=0)
+        elif job.failures + 1 < max_attempts:
+            requeue(session, held, "worker-lost", described, not_before_us=0, is_failure=True)
         else:
             end(session, held, JobState.FAILED, "worker-lost", {"problem": described}, problem=described)
         taken.append(job.id)

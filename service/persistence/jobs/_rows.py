@@ -32,6 +32,7 @@ class Claim:
     map_id: str | None
     settings: dict[str, Any]
     children_percent: float = 0.0
+    failures: int = 0  # of the attempts before
 
 
 def claim_of(job: Job) -> Claim:
@@ -45,6 +46,7 @@ def claim_of(job: Job) -> Claim:
         map_id=job.map_id,
         settings=job.settings,
         children_percent=job.children_percent,
+        failures=job.failures,
     )
 
 

@@ -11,7 +11,7 @@ from service.persistence.tables._drives import Checkpoint, Drive, DriveFile, Upl
 from service.persistence.tables._jobs import TERMINAL, Job, JobAttempt, JobEvent, JobMember, JobState
 from service.persistence.tables._projects import ApiKey, Blob, Project
 from service.persistence.tables._results import Map, MapCheckpoint, MapFile, MapScene, MapVersion, Scene, SceneFile
-from service.persistence.tables._service import IdempotencyKey, WorkerSeen
+from service.persistence.tables._service import IdempotencyKey, Pass, WorkerSeen
 
 __all__ = [
     "TERMINAL",
@@ -32,6 +32,7 @@ __all__ = [
     "MapFile",
     "MapScene",
     "MapVersion",
+    "Pass",
     "Project",
     "Scene",
     "SceneFile",

@@ -43,7 +43,8 @@ class Job(Base):
     settings: Mapped[dict[str, Any]] = mapped_column(default=dict)
     state: Mapped[str] = mapped_column(String(16), default=JobState.QUEUED)
     revision: Mapped[int] = mapped_column(default=1)  # rises with every change that a reader can see
-    attempt: Mapped[int] = mapped_column(default=0)
+    attempt: Mapped[int] = mapped_column(default=0)  # as shown: rises with every claim
+    failures: Mapped[int] = mapped_column(default=0)  # attempts that count against how many a job has
     fence: Mapped[int] = mapped_column(default=0)  # rises with every claim; an older holder can publish nothing
     owner: Mapped[str | None] = mapped_column(Name)
     lease_until_us: Mapped[int | None]
@@ -83,7 +84,7 @@ class JobAttempt(Base):
     owner: Mapped[str] = mapped_column(Name)
     started_us: Mapped[int] = mapped_column(default=now_us)
     finished_us: Mapped[int | None]
-    outcome: Mapped[str | None] = mapped_column(String(40))  # succeeded, cancelled, or a problem's code
+    outcome: Mapped[str | None] = mapped_column(String(40))  # succeeded, cancelled, released, or a problem's code
     problem: Mapped[dict[str, Any] | None]
 
 

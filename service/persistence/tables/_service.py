@@ -36,3 +36,12 @@ class WorkerSeen(Base):
     concurrency: Mapped[int]
     started_us: Mapped[int] = mapped_column(default=now_us)
     seen_us: Mapped[int] = mapped_column(default=now_us)
+
+
+class Pass(Base):
+    """When something that is done rarely was last done, by whichever process."""
+
+    __tablename__ = "passes"
+
+    name: Mapped[str] = mapped_column(String(40), primary_key=True)
+    done_us: Mapped[int]
