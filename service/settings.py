@@ -79,13 +79,16 @@ class Settings(BaseSettings):
 
     # Jobs
     heartbeat_seconds: Seconds = 5.0  # how often a running job reports
-    lease_seconds: Seconds = 45.0  # without a heartbeat for this long, a job is given to another worker
+    lease_seconds: Seconds = 45.0  # without a heartbeat for this long, a job is given away; everywhere the same
     stalled_seconds: Seconds = 20.0  # without a heartbeat for this long, a job is shown as STALLED
     visibility_timeout_seconds: Seconds = 60.0  # the broker delivers a message again after this, unless renewed
     visibility_renew_seconds: Seconds = 15.0
     reconcile_seconds: Seconds = 5.0  # between two passes of the reconciler
     max_attempts: Annotated[int, Field(ge=1, le=10)] = 3  # the first and two retries
     retry_delay_seconds: Seconds = 2.0
+    storage_retry_growth: Annotated[float, Field(ge=1, le=1000)] = 15.0  # of that delay, where a store or disk failed
+    longest_retry_delay_seconds: Seconds = 120.0  # it grows no further
+    storage_patience_seconds: Seconds = 120.0  # a store that is away for so long fails an attempt
     job_timeout_seconds: Seconds = 24 * 3600.0  # of one attempt
     terminate_after_seconds: Seconds = 10.0  # from a cancel to SIGTERM
     kill_after_seconds: Seconds = 30.0  # from a cancel to SIGKILL

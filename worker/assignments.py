@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Protocol
 
 from sqlalchemy.orm import Session
@@ -13,11 +12,11 @@ from schemas.api.jobs import JobKind
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
 from service.persistence import jobs, maps, scenes
-from service.persistence.artifacts import ArtifactStore
+from service.persistence.artifacts import Fetch
 from service.persistence.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.persistence.database import Database
 from service.persistence.drive_files import materialise
-from service.persistence.map_inputs import MapInputs, StoredArtifact, inputs_of
+from service.persistence.map_inputs import MapInputs, inputs_of
 from service.persistence.storing import StoredFile
 from service.persistence.tables import now_us
 from service.settings import Settings
@@ -41,7 +40,7 @@ class Assignment(Protocol):
     def shelf(self) -> Shelf | None:
         """Where its finished stages are kept, once it is laid out."""
 
-    def lay_out(self, folder: AttemptFolder, progress: Counting) -> Attempt:
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
         """Bring what it works on into the attempt's folder.
 
         Raises
@@ -56,17 +55,17 @@ class Assignment(Protocol):
         """Record what it made, of stored files by path, and end the job; for the log, what that is."""
 
 
-def assignment_of(database: Database, artifacts: ArtifactStore, held: jobs.Claim) -> Assignment:
+def assignment_of(database: Database, held: jobs.Claim) -> Assignment:
     """Of a job's kind."""
     of_kind = MapAssignment if held.kind is JobKind.AGGREGATION else DriveAssignment
-    return of_kind(database, artifacts, held)
+    return of_kind(database, held)
 
 
 class DriveAssignment:
     """The check of a drive, or its reconstruction."""
 
-    def __init__(self, database: Database, artifacts: ArtifactStore, held: jobs.Claim) -> None:
-        self._database, self._artifacts, self._held = database, artifacts, held
+    def __init__(self, database: Database, held: jobs.Claim) -> None:
+        self._database, self._held = database, held
         self._drive_id = held.drive_id or ""
 
     @property
@@ -76,10 +75,10 @@ class DriveAssignment:
             return None
         return DriveShelf(self._drive_id, settings_sha256(self._held.settings))
 
-    def lay_out(self, folder: AttemptFolder, progress: Counting) -> Attempt:
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
         """The drive as a folder."""
         drive = folder.root / "drive"
-        materialise(self._database, self._artifacts, self._drive_id, drive, progress=progress)
+        materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
         return Attempt(work=WORK[self._held.kind], drive=drive, settings=self._held.settings)
 
     def publish(
@@ -100,8 +99,8 @@ class DriveAssignment:
 class MapAssignment:
     """An aggregation."""
 
-    def __init__(self, database: Database, artifacts: ArtifactStore, held: jobs.Claim) -> None:
-        self._database, self._artifacts, self._held = database, artifacts, held
+    def __init__(self, database: Database, held: jobs.Claim) -> None:
+        self._database, self._held = database, held
 
     @cached_property
     def _inputs(self) -> MapInputs:
@@ -116,14 +115,15 @@ class MapAssignment:
         ids = self._inputs.scene_ids
         return MapShelf.of(held.map_id or "", held.project_id, scenes=ids, settings=held.settings)
 
-    def lay_out(self, folder: AttemptFolder, progress: Counting) -> Attempt:
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
         """The scenes as folders, and the version that they are added to."""
         inputs, root = self._inputs, folder.root
         into = root / "base" if inputs.base else None
         wanted = [(root / "scenes" / name / file.path, file) for name, files in inputs.scenes.items() for file in files]
         wanted += [(root / "base" / file.path, file) for file in inputs.base]
         for i, (target, file) in enumerate(wanted):
-            self._fetch(target, file)
+            target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            fetch(file.key, target, file.sha256)
             progress(i + 1, len(wanted))
         return Attempt(
             work=Work.AGGREGATION,
@@ -135,10 +135,6 @@ class MapAssignment:
             members=inputs.members,
             leave_out=not inputs.require_all,
         )
-
-    def _fetch(self, target: Path, file: StoredArtifact) -> None:
-        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        self._artifacts.fetch(file.key, target, file.sha256)
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings

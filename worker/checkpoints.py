@@ -6,11 +6,14 @@ import contextvars
 import logging
 import os
 import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
 from service.persistence import checkpoints
-from service.persistence.artifacts import ArtifactStore
+from service.persistence.artifacts import ArtifactStore, Fetch
 from service.persistence.checkpoints import Shelf
 from service.persistence.database import Database
 from service.persistence.storing import file_sha256, store_file
@@ -18,6 +21,21 @@ from service.persistence.storing import file_sha256, store_file
 log = logging.getLogger("mrasfm.worker")
 
 _LOOK_EVERY_S = 1.0
+_FIRST_PAUSE_S = 2.0
+_LONGEST_PAUSE_S = 300.0
+_ENDS_WITHIN_S = 10.0  # a store that hangs holds up neither a stop nor what is to be published
+
+_Identity = tuple[int, int]
+
+
+@dataclass
+class _Trouble:
+    """A file that could not be kept."""
+
+    identity: _Identity
+    sha256: str | None = None
+    pause_s: float = 0.0
+    again_s: float = 0.0
 
 
 class CheckpointKeeper:
@@ -35,15 +53,16 @@ class CheckpointKeeper:
         self._project_id = project_id
         self._folder = folder
         self._spare = spare
-        self._kept: dict[str, tuple[int, int]] = {}
+        self._kept: dict[str, _Identity] = {}
+        self._troubles: dict[str, _Trouble] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(
             target=contextvars.copy_context().run, args=(self._run,), name="checkpoints", daemon=True
         )
 
-    def restore(self) -> None:
+    def restore(self, fetch: Fetch) -> None:
         """Bring what earlier attempts and jobs have finished into the folder."""
-        for name in checkpoints.restore(self._database, self._artifacts, self._shelf, self._folder):
+        for name in checkpoints.restore(self._database, self._shelf, self._folder, fetch=fetch):
             self._kept[name] = _identity(self._folder / name)
 
     def __enter__(self) -> CheckpointKeeper:
@@ -55,39 +74,58 @@ class CheckpointKeeper:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._ended.set()
-        self._thread.join()
+        self._thread.join(_ENDS_WITHIN_S)
 
     def _run(self) -> None:
         while not self._ended.wait(_LOOK_EVERY_S):
             self._look()
-        self._look()
+        self._look(is_last=True)
 
-    def _look(self) -> None:
+    def _look(self, *, is_last: bool = False) -> None:
         for path in sorted(self._folder.glob("*.npz")):
-            try:
+            with suppress(FileNotFoundError):  # the attempt's folder is being removed
                 identity = _identity(path)
                 if self._kept.get(path.name) != identity:
-                    self._keep(path)
-                    self._kept[path.name] = _identity(path)
-            except Exception:  # a checkpoint that is not kept costs time, not the job
-                log.warning("a finished stage could not be kept", exc_info=True, extra={"fields": {"stage": path.stem}})
+                    self._try(path, identity, is_last=is_last)
 
-    def _keep(self, path: Path) -> None:
+    def _try(self, path: Path, identity: _Identity, *, is_last: bool) -> None:
+        trouble = self._troubles.get(path.name)
+        if trouble is None or trouble.identity != identity:
+            trouble = self._troubles[path.name] = _Trouble(identity)
+        if time.monotonic() < trouble.again_s and not is_last:
+            return
+        try:
+            self._keep(path, trouble)
+        except Exception as error:  # a checkpoint that is not kept costs time, not the job
+            is_first = trouble.pause_s == 0.0
+            trouble.pause_s = _FIRST_PAUSE_S if is_first else min(2 * trouble.pause_s, _LONGEST_PAUSE_S)
+            trouble.again_s = time.monotonic() + trouble.pause_s
+            fields = {"stage": path.stem, "again_in_s": trouble.pause_s, "why": type(error).__name__}
+            log.warning("a finished stage could not be kept", exc_info=is_first, extra={"fields": fields})
+        else:
+            del self._troubles[path.name]
+            self._kept[path.name] = identity
+
+    def _keep(self, path: Path, trouble: _Trouble) -> None:
         link = self._spare / path.name
         link.unlink(missing_ok=True)
         os.link(path, link)
+        if _identity(link) != trouble.identity:  # the stage was done again meanwhile: looked at next time
+            raise OSError("the file was replaced")
+        if trouble.sha256 is None:
+            trouble.sha256 = file_sha256(link)
         stored = store_file(
             self._database,
             self._artifacts,
             project_id=self._project_id,
             path=link,
-            sha256=file_sha256(link),
+            sha256=trouble.sha256,
             size_bytes=link.stat().st_size,
         )
         with self._database.write() as session:
             checkpoints.keep(session, self._shelf, {path.name: stored})
 
 
-def _identity(path: Path) -> tuple[int, int]:
+def _identity(path: Path) -> _Identity:
     status = path.stat()
     return status.st_ino, status.st_size

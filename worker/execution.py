@@ -19,7 +19,7 @@ from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.api.resource import Finding
 from service.logs import log_fields
 from service.persistence import jobs
-from service.persistence.artifacts import ArtifactStore
+from service.persistence.artifacts import ArtifactStore, Fetch
 from service.persistence.checkpoints import Shelf
 from service.persistence.database import Database
 from service.persistence.drive_files import DriveGoneError
@@ -30,9 +30,10 @@ from worker.checkpoints import CheckpointKeeper
 from worker.escalation import StopReason
 from worker.heart import Heart
 from worker.outcomes import Abandoned, Cancelled, Failed, Outcome, Succeeded
+from worker.patience import PATIENCE_S, Look, PatientFetch, patiently, watched
 from worker.progress import Progress, ProgressMeter
 from worker.scratch import attempt_folder, sweep
-from worker.settling import PATIENCE_S, patiently, settle
+from worker.settling import settle
 from worker.stages import AttemptFolder, Verdict, run_attempt
 
 log = logging.getLogger("mrasfm.worker")
@@ -119,17 +120,20 @@ class Runner:
             raise
 
     def _do(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> None:
-        publishing = self._counting(heart, meter, "publish")
+        look, publishing = self._looking(heart, meter), self._counting(heart, meter, "publish")
         try:
             outcome = self._attempt(held, folder, heart, meter)
-            self._record(held, outcome, publishing)
+            self._record(held, outcome, publishing, look)
         except _StoppedError as stopped:
-            self._record(held, _of_verdict(stopped.verdict, meter.stage), publishing)
+            self._record(held, _of_verdict(stopped.verdict, meter.stage), publishing, look)
 
     def _attempt(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> Outcome:
-        assignment = assignment_of(self._database, self._artifacts, held)
+        assignment = assignment_of(self._database, held)
+        look = self._looking(heart, meter)
+        fetch = PatientFetch(self._artifacts, patience_s=self._settings.storage_patience_seconds, look=look)
+        count = self._counting(heart, meter, "fetch")
         try:
-            attempt = assignment.lay_out(folder, self._counting(heart, meter, "fetch"))
+            attempt = watched(lambda: assignment.lay_out(folder, fetch, count), look)
         except DriveGoneError:
             return Failed(
                 code="drive-deleted",
@@ -138,7 +142,7 @@ class Runner:
                 retryable=False,
                 stage="fetch",
             )
-        with self._keeping(held, assignment.shelf, folder):
+        with self._keeping(held, assignment.shelf, folder, fetch, look):
             return run_attempt(
                 attempt,
                 scratch=folder.root,
@@ -147,7 +151,9 @@ class Runner:
                 settings=self._settings,
             )
 
-    def _keeping(self, held: jobs.Claim, shelf: Shelf | None, folder: AttemptFolder) -> AbstractContextManager[object]:
+    def _keeping(
+        self, held: jobs.Claim, shelf: Shelf | None, folder: AttemptFolder, fetch: Fetch, look: Look
+    ) -> AbstractContextManager[object]:
         """Finished stages brought, and those that are finished now kept."""
         if shelf is None:
             return nullcontext()
@@ -159,32 +165,42 @@ class Runner:
             folder=folder.finished_stages,
             spare=folder.root / "checkpoints",
         )
-        keeper.restore()
+        watched(lambda: keeper.restore(fetch), look)
         return keeper
 
     def _counting(self, heart: Heart, meter: ProgressMeter, stage: str) -> Counting:
         """A callback for one of the worker's own stages, which stops where a child would be stopped."""
 
+        look = self._looking(heart, meter)
+
         def count(done: int, total: int) -> None:
             meter.update(stage, done, total)
+            look()
+
+        return count
+
+    def _looking(self, heart: Heart, meter: ProgressMeter) -> Look:
+        """What ends the worker's own steps where a child would be stopped."""
+
+        def look() -> None:
             verdict = self._tick(heart, meter.at(time.monotonic()))
             if verdict is not Verdict.GO_ON:
                 raise _StoppedError(verdict)
 
-        return count
+        return look
 
     def _tick(self, heart: Heart, progress: Progress) -> Verdict:
         verdict = heart.tell(progress)
         return Verdict.SHUT_DOWN if verdict is Verdict.GO_ON and self._shutting_down() else verdict
 
-    def _record(self, held: jobs.Claim, outcome: Outcome, progress: Counting) -> None:
+    def _record(self, held: jobs.Claim, outcome: Outcome, progress: Counting, look: Look) -> None:
         match outcome:
             case Succeeded() if held.kind is JobKind.PREFLIGHT:
                 findings, sound = outcome.report["findings"], outcome.report["sound"]
                 settle(self._database, held, lambda s: jobs.record_findings(s, held, findings, sound=sound))
                 log.info("checked", extra={"fields": {"sound": sound}})
             case Succeeded():
-                self._publish(held, outcome, progress)
+                self._publish(held, outcome, progress, look)
             case Failed():
                 self._fail(held, outcome)
             case Cancelled():
@@ -200,6 +216,11 @@ class Runner:
         log.info("released: this worker stops")
 
     def _fail(self, held: jobs.Claim, failed: Failed) -> None:
+        if failed.retryable and self._shutting_down():
+            # What was told to stop with this worker, or is gone with its machine, is not the job's fault.
+            log.warning("failed while this worker stops", extra={"fields": {"code": failed.code, "what": failed.what}})
+            self._release(held)
+            return
         problem = Problem(
             type=PROBLEM_TYPE + failed.code,
             title=_TITLES.get(failed.code) or _FAILED[held.kind],
@@ -219,30 +240,43 @@ class Runner:
                 held,
                 problem,
                 max_attempts=self._settings.max_attempts,
-                retry_delay_us=int(self._settings.retry_delay_seconds * 1e6),
+                retry_delay_us=int(self._retry_delay_s(held, failed) * 1e6),
             ),
         )
         log.error("the attempt failed", extra={"fields": {"code": failed.code, "what": failed.what, "job": state}})
 
-    def _publish(self, held: jobs.Claim, done: Succeeded, progress: Counting) -> None:
+    def _retry_delay_s(self, held: jobs.Claim, failed: Failed) -> float:
+        first_s = self._settings.retry_delay_seconds
+        if not failed.is_storage:
+            return first_s
+        delay_s = first_s * self._settings.storage_retry_growth**held.failures
+        return max(first_s, min(delay_s, self._settings.longest_retry_delay_seconds))
+
+    def _publish(self, held: jobs.Claim, done: Succeeded, progress: Counting, look: Look) -> None:
         found = sorted(_artifacts(done.out).items())
         files = {}
         for i, (name, path) in enumerate(found):
-            files[name] = patiently(lambda path=path: self._store(held, path))  # type: ignore[misc]
+            files[name] = self._store(held, path, look)
             progress(i + 1, len(found))
-        assignment = assignment_of(self._database, self._artifacts, held)
+        assignment = assignment_of(self._database, held)
         made = settle(self._database, held, lambda session: assignment.publish(session, done, files, self._settings))
         log.info("published", extra={"fields": made or {}})
 
-    def _store(self, held: jobs.Claim, path: Path) -> StoredFile:
-        return store_file(
-            self._database,
-            self._artifacts,
-            project_id=held.project_id,
-            path=path,
-            sha256=file_sha256(path),
-            size_bytes=path.stat().st_size,
-        )
+    def _store(self, held: jobs.Claim, path: Path, look: Look) -> StoredFile:
+        sha256, size_bytes = file_sha256(path), path.stat().st_size
+
+        def store() -> StoredFile:
+            return store_file(
+                self._database,
+                self._artifacts,
+                project_id=held.project_id,
+                path=path,
+                sha256=sha256,
+                size_bytes=size_bytes,
+            )
+
+        patience_s = self._settings.storage_patience_seconds
+        return patiently(lambda: watched(store, look), patience_s=patience_s, look=look)
 
     def sweep_scratch(self) -> None:
         """Remove what killed processes of this machine left behind, and end the leases of their jobs at once."""
@@ -289,7 +323,7 @@ def _of_machine(error: Exception, stage: str) -> Failed:
         remedy = "The operator has to free space in the worker's data folder; then retry the job."
     else:
         what = f"the worker could not work on its files: {error.strerror or type(error).__name__}"
-    return Failed(code="storage", what=what, remedy=remedy, retryable=True, stage=stage)
+    return Failed(code="storage", what=what, remedy=remedy, retryable=True, stage=stage, is_storage=True)
 
 
 def _of_worker(stage: str) -> Failed:

@@ -49,6 +49,8 @@ class Failed:
         All that the check of the drive found, where that is what refused it.
     log_tail
         The end of what the child printed.
+    is_storage
+        Whether a store or a disk failed: each further attempt waits longer for it.
     """
 
     code: str
@@ -58,6 +60,7 @@ class Failed:
     stage: str
     findings: list[dict[str, str]] = field(default_factory=list)
     log_tail: str = ""
+    is_storage: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,6 +151,7 @@ def _of_engine(ending: Ending, error: ChildError) -> Failed:
         remedy=error.remedy,
         retryable=error.kind in RETRYABLE,
         findings=error.findings,
+        is_storage=error.kind is ErrorKind.STORAGE,
     )
 
 
@@ -198,6 +202,7 @@ def _failed(
     remedy: str,
     retryable: bool,
     findings: list[dict[str, str]] | None = None,
+    is_storage: bool = False,
 ) -> Failed:
     return Failed(
         code=code,
@@ -206,5 +211,6 @@ def _failed(
         retryable=retryable,
         stage=ending.stage,
         findings=findings or [],
+        is_storage=is_storage,
         log_tail=ending.log_tail,
     )

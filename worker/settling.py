@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.orm import Session
 
 from service.persistence import jobs
 from service.persistence.database import Database
+from worker.patience import PATIENCE_S, patiently
 
 log = logging.getLogger("mrasfm.worker")
-
-PATIENCE_S = 120.0
-
-_FIRST_PAUSE_S = 0.2
-_LONGEST_PAUSE_S = 5.0
 
 T = TypeVar("T")
 
@@ -55,26 +49,6 @@ def settle(
             return None
 
     return patiently(write, patience_s=patience_s)
-
-
-def patiently(step: Callable[[], T], *, patience_s: float = PATIENCE_S) -> T:
-    """Do something that may be done again, until the database takes it or `patience_s` have passed."""
-    end_s = time.monotonic() + patience_s
-    pause_s = _FIRST_PAUSE_S
-    while True:
-        try:
-            return step()
-        except DBAPIError as error:
-            if not _may_pass(error) or time.monotonic() + pause_s > end_s:
-                raise
-            log.warning("the database did not take the end of an attempt", exc_info=True)
-        time.sleep(pause_s)
-        pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-
-
-def _may_pass(error: DBAPIError) -> bool:
-    """Whether the connection, a lock or the server is at fault, and not the statement."""
-    return error.connection_invalidated or isinstance(error, (OperationalError, InterfaceError))
 
 
 def _has_succeeded(database: Database, held: jobs.Claim) -> bool:

@@ -13,7 +13,7 @@ import hashlib
 import os
 import secrets
 import shutil
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -38,6 +38,8 @@ _RETRIES = {"max_retries": 3, "retry_timeout": timedelta(seconds=15)}
 # Whether the store can be used is asked often, and a late answer is of no use.
 _PROBE_PATIENCE = {"connect_timeout": timedelta(seconds=3), "timeout": timedelta(seconds=3)}
 _PROBE_RETRIES = {"max_retries": 0}
+
+Fetch = Callable[[str, Path, str], None]  # as `ArtifactStore.fetch`: key, target, sha256
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,15 @@ class ArtifactStore:
             return None
         return digest.hexdigest()
 
-    def fetch(self, key: str, target: Path, sha256: str) -> None:
+    def fetch(self, key: str, target: Path, sha256: str, *, look: Callable[[], None] = lambda: None) -> None:
         """Put the object's bytes at `target`, read-only; without copying where the file system allows.
+
+        It may be tried again: where it fails, nothing is left at `target`.
+
+        Parameters
+        ----------
+        look
+            Called between pieces; what it raises ends the transfer.
 
         Raises
         ------
@@ -159,14 +168,18 @@ class ArtifactStore:
             except OSError as error:
                 if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP):
                     raise
-                shutil.copy2(self._root / key, target)
+                with _whole_or_gone(target):
+                    shutil.copy2(self._root / key, target)
             return
+        look()
         found = obstore.get(self._store, key)  # first: what is not there leaves no empty file
-        with target.open("xb") as file:
-            for chunk in found.stream(min_chunk_size=_CHUNK_BYTES):
-                file.write(chunk)
-        os.chmod(target, 0o440)
-        os.utime(target, ns=(content_mtime_ns(sha256),) * 2)
+        with _whole_or_gone(target):
+            with target.open("xb") as file:
+                for chunk in found.stream(min_chunk_size=_CHUNK_BYTES):
+                    look()
+                    file.write(chunk)
+            os.chmod(target, 0o440)
+            os.utime(target, ns=(content_mtime_ns(sha256),) * 2)
 
     def read(self, key: str) -> bytes:
         """The whole object, for small ones.
@@ -260,6 +273,15 @@ def _open(url: str, settings: Settings, patience: Mapping[str, Any], retries: Ma
             options["endpoint"] = settings.s3_endpoint
             client["allow_http"] = settings.s3_endpoint.startswith("http://")
     return from_url(url, **options)
+
+
+@contextlib.contextmanager
+def _whole_or_gone(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
 
 
 def _move(path: Path, target: Path) -> None:

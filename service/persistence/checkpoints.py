@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from service.persistence import blobs
-from service.persistence.artifacts import ArtifactStore
+from service.persistence.artifacts import Fetch
 from service.persistence.database import Database
 from service.persistence.storing import StoredFile
 from service.persistence.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
+
+log = logging.getLogger("mrasfm.worker")
 
 
 def settings_sha256(settings: Mapping[str, Any]) -> str:
@@ -61,29 +64,57 @@ class MapShelf:
 
 Shelf = DriveShelf | MapShelf
 _SEAM = "seam"
+_KEPT = (Blob.id, Blob.key, Blob.sha256)
 
 
-def restore(database: Database, artifacts: ArtifactStore, shelf: Shelf, folder: Path) -> list[str]:
-    """Bring finished stages into a folder; the names of the files brought."""
+def restore(database: Database, shelf: Shelf, folder: Path, *, fetch: Fetch) -> list[str]:
+    """Bring finished stages into a folder; the names of the files brought.
+
+    They save time and nothing else: one whose bytes are lost is forgotten, and the stage is done again.
+    """
     with database.read() as session:
         found = _shelved(session, shelf)
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    for name, (key, sha256) in found.items():
-        artifacts.fetch(key, folder / name, sha256)
-    return list(found)
+    brought = []
+    for name, kept in found.items():
+        try:
+            fetch(kept.key, folder / name, kept.sha256)
+        except FileNotFoundError:
+            log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
+            with database.write() as session:
+                _forget(session, kept.id)
+        else:
+            brought.append(name)
+    return brought
 
 
-def _shelved(session: Session, shelf: Shelf) -> dict[str, tuple[str, str]]:
-    """Key and digest of the finished stages, by name."""
+def _forget(session: Session, blob_id: str) -> None:
+    """Drop what refers to lost bytes, and their record: the same bytes are to be stored anew, not found in it."""
+    for table in (Checkpoint, MapCheckpoint):
+        session.execute(delete(table).where(table.blob_id == blob_id))
+    blobs.lose(session, blob_id)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Where a finished stage's bytes are."""
+
+    id: str
+    key: str
+    sha256: str
+
+
+def _shelved(session: Session, shelf: Shelf) -> dict[str, _Kept]:
+    """The finished stages, by name."""
     if isinstance(shelf, DriveShelf):
         mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
-        of_drive = select(Checkpoint.name, Blob.key, Blob.sha256).join(Blob, Checkpoint.blob_id == Blob.id)
-        return {name: (key, sha256) for name, key, sha256 in session.execute(of_drive.where(mine))}
-    of_maps = select(MapCheckpoint.inputs_sha256, Blob.key, Blob.sha256).join(Blob, MapCheckpoint.blob_id == Blob.id)
+        of_drive = select(Checkpoint.name, *_KEPT).join(Blob, Checkpoint.blob_id == Blob.id)
+        return {name: _Kept(*kept) for name, *kept in session.execute(of_drive.where(mine))}
+    of_maps = select(MapCheckpoint.inputs_sha256, *_KEPT).join(Blob, MapCheckpoint.blob_id == Blob.id)
     rows = session.execute(
         of_maps.where(MapCheckpoint.project_id == shelf.project_id).order_by(MapCheckpoint.created_us)
     )
-    known = {inputs: (key, sha256) for inputs, key, sha256 in rows}  # the newest
+    known = {inputs: _Kept(*kept) for inputs, *kept in rows}  # the newest
     return {name: known[inputs] for name, inputs in shelf.slots.items() if inputs in known}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sqlalchemy import select
 
-from service.persistence.artifacts import ArtifactStore
+from service.persistence.artifacts import Fetch
 from service.persistence.database import Database
 from service.persistence.tables import Blob, Drive, DriveFile
 
@@ -20,16 +20,18 @@ class DriveGoneError(Exception):
 
 def materialise(
     database: Database,
-    artifacts: ArtifactStore,
     drive_id: str,
     folder: Path,
     *,
+    fetch: Fetch,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Lay a drive out as a folder that the engine reads: `drive.json` and the files under the names it gives them.
 
     Parameters
     ----------
+    fetch
+        Brings one file.
     progress
         Called as progress(done, total) with each file.
 
@@ -47,9 +49,9 @@ def materialise(
         stored = select(DriveFile.path, Blob.key, Blob.sha256).join(Blob, DriveFile.blob_id == Blob.id)
         files = session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
     folder.mkdir(parents=True, mode=0o700)
-    artifacts.fetch(manifest.key, folder / MANIFEST_NAME, manifest.sha256)
+    fetch(manifest.key, folder / MANIFEST_NAME, manifest.sha256)
     for i, (path, key, sha256) in enumerate(files):
         target = folder / path  # checked when the manifest came: relative, without '..'
         target.parent.mkdir(parents=True, exist_ok=True)
-        artifacts.fetch(key, target, sha256)
+        fetch(key, target, sha256)
         progress(i + 1, len(files))
