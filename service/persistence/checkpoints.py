@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, select
+from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from service.persistence import blobs
+from service.persistence import blobs, jobs
 from service.persistence.artifacts import Fetch
 from service.persistence.database import Database
 from service.persistence.storing import StoredFile
@@ -64,6 +64,7 @@ class MapShelf:
 
 Shelf = DriveShelf | MapShelf
 _SEAM = "seam"
+_SHELVES_A_DRIVE = 3
 _KEPT = (Blob.id, Blob.key, Blob.sha256)
 
 
@@ -141,6 +142,22 @@ def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> No
         else:
             checkpoint.blob_id = blob.id
             checkpoint.created_us = now_us()
+    if isinstance(shelf, DriveShelf):
+        _clear_old_shelves(session, shelf)
+
+
+def _clear_old_shelves(session: Session, shelf: DriveShelf) -> None:
+    """Drop a drive's stages under settings other than the last few, but for those that a job may still need."""
+    session.flush()
+    newest = func.max(Checkpoint.created_us).desc()
+    mine = select(Checkpoint.settings_sha256).where(Checkpoint.drive_id == shelf.drive_id)
+    shelves = session.scalars(mine.group_by(Checkpoint.settings_sha256).order_by(newest)).all()
+    old = set(shelves[_SHELVES_A_DRIVE:]) - {shelf.settings_sha256}
+    if not old:
+        return
+    old -= {settings_sha256(job.settings) for job in session.scalars(jobs.active_of_drive(shelf.drive_id))}
+    dropped = delete(Checkpoint).where(Checkpoint.drive_id == shelf.drive_id, Checkpoint.settings_sha256.in_(old))
+    session.execute(dropped.execution_options(synchronize_session=False))
 
 
 def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoint | None:

@@ -259,3 +259,14 @@ def test_pauses_grow(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         clock[0] = float(second)
         made._look()
     assert tries == [0.0, 2.0, 6.0, 14.0, 30.0, 62.0, 126.0, 254.0, 510.0, 810.0, 1110.0]
+
+
+def test_checkpoints_of_the_last_few_settings(world: World, brief_drive: Path) -> None:
+    """And of those that a job may still need."""
+    drive_id = world.add_drive(brief_drive)
+    waiting = checkpoints.settings_sha256(world.job(world.ask(drive_id, wake=False)).settings)
+    for i, settings in enumerate((waiting, *("abcde"))):
+        keep(world, DriveShelf(drive_id, settings), "features.npz", f"features {i}".encode())
+        time.sleep(0.002)
+    with world.database.read() as session:
+        assert {row.settings_sha256 for row in session.query(Checkpoint)} == {waiting, "c", "d", "e"}
