@@ -14,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.persistence import jobs
 from service.persistence.database import Database
 from service.settings import Settings
+from worker.patience import may_pass
 from worker.progress import Progress
 from worker.stages import Verdict
 
@@ -84,9 +85,11 @@ class Heart:
                 self._beat(news)
             except jobs.FencedError:
                 return
-            except SQLAlchemyError:
+            except SQLAlchemyError as error:
                 log.warning("the database did not take a heartbeat", exc_info=True)
-                if time.monotonic() > sure_until_s:
+                # Where it is away or locked, so it may be for all: nobody else takes the job then, and if somebody has,
+                # this holder learns of it with its next heartbeat and publishes nothing.
+                if not may_pass(error) and time.monotonic() > sure_until_s:
                     return
             else:
                 beat_s, sure_until_s = now_s, now_s + _SURE_SHARE * self._settings.lease_seconds

@@ -6,25 +6,30 @@ import logging
 import threading
 from collections.abc import Callable
 
-from sqlalchemy import delete, select
+from sqlalchemy import ColumnElement, delete, or_, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.logs import log_fields
 from service.persistence import jobs, maps, trees, workers
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.collecting import collect_orphans, collect_unused
-from service.persistence.database import Database
-from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, now_us
+from service.persistence.database import Database, clock_us
+from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, Pass, now_us
 from service.persistence.wakeups import BrokerError, Wakeups, task_id
 from service.settings import Settings
+from worker.silence import Silence
 
 log = logging.getLogger("mrasfm.reconciler")
 
 _HOUR_US = 3600 * 1_000_000
 _SWEEP_EVERY_S = 600.0
-_ORPHANS_FIRST_S = 3600.0  # not with every restart: listing a store costs time and, in the cloud, money
-_ORPHANS_EVERY_S = 86_400.0
+_ORPHANS_FIRST_S = 300.0
+_ORPHANS_LOOK_EVERY_S = 600.0
+_ORPHANS_EVERY_US = 24 * _HOUR_US  # not with every restart: listing a store costs time and, in the cloud, money
+_ORPHANS = "orphans"
 _END_WITHIN_S = 5.0
 _BATCH = 500
+_FEW = 20  # with their files
 
 
 class Reconciler:
@@ -36,6 +41,7 @@ class Reconciler:
         self._artifacts = ArtifactStore(settings)
         self._wakeups = Wakeups(settings)
         self._broker_was_there = True
+        self._silence = Silence(settings.lease_seconds)
 
     def close(self) -> None:
         """Let go of the database."""
@@ -50,7 +56,7 @@ class Reconciler:
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
                 ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
-                ("orphans", self.collect_orphans, _ORPHANS_EVERY_S, _ORPHANS_FIRST_S),
+                ("orphans", self.collect_orphans, _ORPHANS_LOOK_EVERY_S, _ORPHANS_FIRST_S),
             )
         ]
         for thread in threads:
@@ -75,8 +81,7 @@ class Reconciler:
 
     def reconcile_jobs(self) -> None:
         """Free jobs whose worker is silent, and wake workers up for those that wait and have no message."""
-        with self._database.write() as session:
-            lost = jobs.expire_leases(session, max_attempts=self._settings.max_attempts)
+        lost = self._expire_leases()
         trees.tend(self._database)
         for job_id in lost:
             with log_fields(job_id=job_id):
@@ -99,6 +104,17 @@ class Reconciler:
         if missing:
             log.info("woke workers up", extra={"fields": {"jobs": len(missing)}})
 
+    def _expire_leases(self) -> list[str]:
+        chosen = self._settings
+        longest_delay_s = max(chosen.retry_delay_seconds, chosen.longest_retry_delay_seconds)
+        self._silence.ask()
+        with self._database.write() as session:
+            counts = self._silence.counts(clock_us(session))
+            lost = jobs.expire_leases(session, max_attempts=chosen.max_attempts, only_ended=not counts)
+        with self._database.write(durable=False) as session:
+            jobs.bound_times(session, lease_us=int(chosen.lease_seconds * 1e6), delay_us=int(longest_delay_s * 1e6))
+        return lost
+
     def _send(self, missing: list[Job]) -> None:
         self._wakeups.send(missing)
         with self._database.write() as session:
@@ -110,26 +126,56 @@ class Reconciler:
         _tell(collect_unused(self._database, self._artifacts))
 
     def collect_orphans(self) -> None:
-        """Delete bytes that no record names: all of the store is listed for it."""
+        """Delete bytes that no record names, once a day by all reconcilers: all of the store is listed for it."""
+        with self._database.read() as session:
+            last = session.get(Pass, _ORPHANS)
+            age_us = None if last is None else now_us() - last.done_us
+        if age_us is not None and 0 <= age_us < _ORPHANS_EVERY_US:
+            return
         _tell(collect_orphans(self._database, self._artifacts))
+        with self._database.write() as session:
+            session.merge(Pass(name=_ORPHANS, done_us=now_us()))
 
     def _expire(self) -> None:
+        """Each transaction is short: while one deletes, SQLite lets no worker say that it lives."""
         now = now_us()
-        with self._database.write() as session:  # of its own: aggregations lock maps and scenes before drives
-            maps.forget_expired(session, now)
+        # Of their own: aggregations lock maps and scenes before drives.
+        self._in_batches(lambda session: maps.forget_expired(session, now, limit=_FEW))
+        with self._database.read() as session:
+            expired = session.scalars(select(Drive.id).where(Drive.expires_us < now)).all()
+        for drive_id in expired:
+            self._forget_drive(drive_id, now)
+        ended = (Job.expires_us < now) & Job.state.in_(TERMINAL)
+        self._in_batches(lambda session: _delete_some(session, ended, Job.id))
+        unkept = IdempotencyKey.created_us < now - int(self._settings.idempotency_hours * _HOUR_US)
+        self._in_batches(lambda session: _delete_some(session, unkept, IdempotencyKey.project_id, IdempotencyKey.key))
+        with self._database.write() as session:
+            workers.forget(session, unseen_since_us=now - 30 * 24 * _HOUR_US)
+
+    def _in_batches(self, step: Callable[[Session], int]) -> None:
+        """Repeat a transaction until it deletes nothing any more."""
+        deleted = 1
+        while deleted:
+            with self._database.write() as session:
+                deleted = step(session)
+
+    def _forget_drive(self, drive_id: str, now: int) -> None:
         with self._database.write() as session:
             # Locked first: a job that is asked for at this moment has been recorded then, or finds no drive.
-            expired = session.scalars(select(Drive.id).where(Drive.expires_us < now).with_for_update()).all()
-            active = select(Job.drive_id).where(Job.drive_id.is_not(None), Job.state.not_in(TERMINAL))
-            in_map = select(MapScene.drive_id)
+            session.scalar(select(Drive.id).where(Drive.id == drive_id).with_for_update())
+            active = select(Job.id).where(Job.drive_id == drive_id, Job.state.not_in(TERMINAL))
+            in_map = select(MapScene.drive_id).where(MapScene.drive_id == drive_id)
             of_jobs = select(JobMember.drive_id).join(Job, Job.id == JobMember.job_id)
-            wanted = of_jobs.where(Job.state.not_in(TERMINAL))
-            idle = Drive.id.not_in(active) & Drive.id.not_in(in_map) & Drive.id.not_in(wanted)
-            session.execute(delete(Drive).where(Drive.id.in_(expired), idle))
-            session.execute(delete(Job).where(Job.expires_us < now, Job.state.in_(TERMINAL)))
-            kept_us = int(self._settings.idempotency_hours * _HOUR_US)
-            session.execute(delete(IdempotencyKey).where(IdempotencyKey.created_us < now - kept_us))
-            workers.forget(session, unseen_since_us=now - 30 * 24 * _HOUR_US)
+            wanted = of_jobs.where(JobMember.drive_id == drive_id, Job.state.not_in(TERMINAL))
+            idle = ~or_(active.exists(), in_map.exists(), wanted.exists())
+            session.execute(delete(Drive).where(Drive.id == drive_id, Drive.expires_us < now, idle))
+
+
+def _delete_some(session: Session, condition: ColumnElement[bool], *key: InstrumentedAttribute[str]) -> int:
+    """Delete no more than a batch of rows that meet a condition; how many."""
+    some = select(*key).where(condition).limit(_BATCH)
+    dropped = delete(key[0].class_).where(tuple_(*key).in_(some)).execution_options(synchronize_session=False)
+    return int(session.execute(dropped).rowcount)  # type: ignore[attr-defined]
 
 
 def _tell(deleted: int) -> None:

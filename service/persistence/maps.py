@@ -256,13 +256,21 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
         )
 
 
-def forget_expired(session: Session, now: int) -> None:
-    """Delete maps, then scenes, that have passed their retention dates; what a map or a job needs stays."""
+def forget_expired(session: Session, now: int, *, limit: int) -> int:
+    """Delete maps, or where there are none scenes, that have passed their dates; what a map or a job needs stays.
+
+    Returns
+    -------
+    int
+        How many were deleted: no more than `limit`, and 0 where none is left.
+    """
     # Locked first: an aggregation that is asked for at this moment has been recorded then, or finds nothing.
-    session.scalars(select(Map.id).where(Map.expires_us < now).order_by(Map.id).with_for_update()).all()
-    busy = select(Job.map_id).where(Job.map_id.is_not(None), Job.state.not_in(TERMINAL))
-    session.execute(delete(Map).where(Map.expires_us < now, Map.id.not_in(busy)))
-    session.scalars(select(Scene.id).where(Scene.expires_us < now).order_by(Scene.id).with_for_update()).all()
+    busy = select(Job.id).where(Job.map_id == Map.id, Job.state.not_in(TERMINAL)).exists()
+    ripe = select(Map.id).where(Map.expires_us < now, ~busy).order_by(Map.id).limit(limit)
+    found = session.scalars(ripe.with_for_update()).all()
+    dropped = delete(Map).where(Map.id.in_(found), ~busy)
+    if found:
+        return int(session.execute(dropped.execution_options(synchronize_session=False)).rowcount)  # type: ignore[attr-defined]
     in_job = (
         select(JobMember.job_id)
         .join(Job, Job.id == JobMember.job_id)
@@ -270,4 +278,7 @@ def forget_expired(session: Session, now: int) -> None:
     )
     in_map = select(MapScene.map_id).where(MapScene.scene_id == Scene.id)
     unused = ~or_(in_map.exists(), in_job.exists())
-    session.execute(delete(Scene).where(Scene.expires_us < now, unused).execution_options(synchronize_session=False))
+    of_none = select(Scene.id).where(Scene.expires_us < now, unused).order_by(Scene.id).limit(limit)
+    alone = session.scalars(of_none.with_for_update()).all()
+    left = delete(Scene).where(Scene.id.in_(alone), unused).execution_options(synchronize_session=False)
+    return int(session.execute(left).rowcount)  # type: ignore[attr-defined]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import redis
@@ -14,7 +16,7 @@ from sqlalchemy import insert
 import worker.reconciler
 from service.persistence import collecting, jobs
 from service.persistence.storing import file_sha256, store_file
-from service.persistence.tables import Blob, Drive, Job, JobEvent, Project, Scene, new_id, now_us
+from service.persistence.tables import Blob, Drive, IdempotencyKey, Job, JobEvent, Project, Scene, new_id, now_us
 from service.persistence.wakeups import QUEUES, Wakeups
 from tests.worker.service_world import World, wait_until
 from worker.reconciler import Reconciler
@@ -244,8 +246,61 @@ def test_objects_that_no_record_names(world: World, brief_drive: Path, monkeypat
     tomorrow: Callable[[], int] = lambda: now_us() + DAY_US + HOUR_US  # noqa: E731
     monkeypatch.setattr(collecting, "now_us", tomorrow)
     reconciler.collect_orphans()
+    assert unnamed in objects(world), "the store was listed within the day, maybe by a process that is gone"
+    monkeypatch.setattr(worker.reconciler, "now_us", tomorrow)
+    reconciler.collect_orphans()
     assert objects(world) == named
     assert world.drive(drive_id).state == "COMMITTED"
+
+
+def test_retention_of_much(world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In short transactions: while one is under way, SQLite lets no worker say that it lives."""
+    monkeypatch.setattr(worker.reconciler, "_BATCH", 3)
+    monkeypatch.setattr(worker.reconciler, "_FEW", 2)
+    drive_ids = [world.add_drive(brief_drive) for _ in range(3)]
+    kept = world.add_drive(brief_drive)
+    past = now_us() - DAY_US
+    with world.database.write() as session:
+        for drive_id in drive_ids:
+            session.get_one(Drive, drive_id).expires_us = past
+        session.query(Job).filter(Job.drive_id.in_(drive_ids)).update({"expires_us": past})
+        row = {"project_id": world.project_id, "kind": "RECONSTRUCTION", "state": "FAILED", "expires_us": past}
+        session.execute(insert(Job), [{**row, "drive_id": kept} for _ in range(7)])
+        row = {"project_id": world.project_id, "drive_id": kept, "name": "s", "fence": 1, "summary": {}}
+        session.execute(insert(Scene), [{**row, "job_id": new_id("job"), "expires_us": past} for _ in range(5)])
+        session.execute(
+            insert(IdempotencyKey),
+            [
+                {
+                    "project_id": world.project_id,
+                    "key": str(i),
+                    "request_sha256": "0",
+                    "holder": "h",
+                    "held_until_us": 0,
+                    "created_us": past - DAY_US,
+                }
+                for i in range(7)
+            ],
+        )
+    reconciler = Reconciler(world.settings)
+    deleted: list[int] = []
+    real = reconciler._database.engine.dialect.do_commit
+
+    def do_commit(connection: Any) -> None:
+        cursor = connection.cursor()
+        left = (cursor.execute(f"SELECT count(*) FROM {t}").fetchone()[0] for t in ("drives", "jobs", "scenes"))
+        deleted.append(sum(left))
+        cursor.close()
+        real(connection)
+
+    monkeypatch.setattr(reconciler._database.engine.dialect, "do_commit", do_commit)
+    reconciler._expire()
+    with world.database.read() as session:
+        assert [row.id for row in session.query(Drive)] == [kept]
+        assert session.query(Scene).count() == session.query(IdempotencyKey).count() == 0
+        assert {row.drive_id for row in session.query(Job)} == {kept}
+        assert session.query(Job).count() == 1
+    assert max(before - after for before, after in pairwise(deleted)) <= 3
 
 
 def objects(world: World) -> set[str]:

@@ -22,6 +22,7 @@ from service.persistence.jobs._asking import (
 from service.persistence.jobs._ending import cancelled, fail, record_findings, release, succeed
 from service.persistence.jobs._holding import (
     ProgressNote,
+    bound_times,
     cancel_requested,
     claim,
     end_lease,
@@ -41,6 +42,7 @@ __all__ = [
     "ProgressNote",
     "active_of_drive",
     "all_due",
+    "bound_times",
     "cancel_orphan",
     "cancel_requested",
     "cancelled",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import case, func, select
+from sqlalchemy import case, func, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -132,15 +132,35 @@ def has_succeeded(session: Session, held: Claim) -> bool:
     return session.scalar(select(Job.id).where(Job.id == held.job_id, by_holder)) is not None
 
 
-def expire_leases(session: Session, *, max_attempts: int) -> list[str]:
+def bound_times(session: Session, *, lease_us: int, delay_us: int) -> None:
+    """Shorten leases and waits that end later than any that begins now: the clock was set back since they began."""
+    now = clock_us(session)
+    for condition, column, end_us in (
+        (Job.state == JobState.RUNNING, Job.lease_until_us, now + lease_us),
+        (Job.state == JobState.QUEUED, Job.not_before_us, now + delay_us),
+    ):
+        # One that changes at this moment is not waited for: its new time is no longer than it should be.
+        late = session.scalars(select(Job.id).where(condition, column > end_us).with_for_update(skip_locked=True)).all()
+        shorter = update(Job).where(Job.id.in_(late)).values({column: end_us})
+        if late:
+            session.execute(shorter.execution_options(synchronize_session=False))
+
+
+def expire_leases(session: Session, *, max_attempts: int, only_ended: bool = False) -> list[str]:
     """Take jobs from workers that have not been heard of: queued again, or ended where no attempt is left.
+
+    Parameters
+    ----------
+    only_ended
+        Only from those that are known to be dead, see `end_lease`.
 
     Returns
     -------
     list of str
         The jobs taken.
     """
-    lost = select(Job).where(Job.state == JobState.RUNNING, Job.lease_until_us < clock_us(session))
+    before_us = 1 if only_ended else clock_us(session)
+    lost = select(Job).where(Job.state == JobState.RUNNING, Job.lease_until_us < before_us)
     # A job that changes at this moment has a worker that lives, or is another reconciler's.
     lost = lost.with_for_update(skip_locked=True).execution_options(populate_existing=True)
     taken = []
