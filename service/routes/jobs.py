@@ -126,7 +126,7 @@ def cancel_job(
     status_code=202,
     response_model=JobResource,
     summary="Do a job again",
-    responses={**ACCEPTED, **problems(401, 404, 409, 422, 429)},
+    responses={**ACCEPTED, **problems(401, 404, 409, 413, 422, 429)},
 )
 def retry_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
     """Do again what failed or was cancelled, as a new job. Finished stages are reused."""

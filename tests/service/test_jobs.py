@@ -14,7 +14,7 @@ import pytest
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.persistence import jobs
 from service.persistence.keys import revoke_key
-from service.persistence.tables import ApiKey, Job, now_us
+from service.persistence.tables import ApiKey, Job, Project, now_us
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
 
@@ -207,6 +207,22 @@ def test_the_quota_of_jobs(api: Api) -> None:
     client.post(f"/v1/jobs/{job['id']}:cancel")
     client.reconstruct(drive_id)
     problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 429, "too-many-jobs")
+
+
+def test_a_project_without_space_gets_no_jobs(api: Api) -> None:
+    """What jobs make may exceed the quota: so none begins where it is used up."""
+    client = api.client(max_active_jobs=2)
+    drive_id = client.committed()
+    job = client.reconstruct(drive_id)
+    client.post(f"/v1/jobs/{job['id']}:cancel")
+    with client.api.database.write() as session:
+        project = session.get_one(Project, session.get_one(Job, job["id"]).project_id)
+        project.max_bytes = project.used_bytes
+    problem_of(client.post("/v1/reconstructions", json={"drive_id": drive_id}), 413, "quota-full")
+    problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 413, "quota-full")
+    with client.api.database.write() as session:
+        session.get_one(Project, project.id).max_bytes += 1
+    client.reconstruct(drive_id)
 
 
 def check_of(client: Client, drive_id: str) -> dict[str, Any]:

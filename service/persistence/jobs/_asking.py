@@ -50,7 +50,7 @@ def create(
     Raises
     ------
     ServiceError
-        429 where the project has as many active jobs as its quota allows.
+        429 where the project has as many active jobs as its quota allows, 413 where it has no space left.
     """
     if kind is not JobKind.PREFLIGHT:  # a drive's check is part of committing it
         require_places(session, project_id, 1)
@@ -81,10 +81,19 @@ def require_places(session: Session, project_id: str, count: int) -> None:
     Raises
     ------
     ServiceError
-        429.
+        429 for the count; 413 where the project's space is used up: results may exceed it, but each job adds to them.
     """
     # Locked, so that two requests cannot take the last place together.
     project = session.get_one(Project, project_id, with_for_update=True)
+    if project.used_bytes >= project.max_bytes:
+        raise ServiceError(
+            413,
+            "quota-full",
+            "The project's storage quota is full",
+            f"{project.used_bytes} of {project.max_bytes} bytes are used: there is no space for what a job makes",
+            remedy="Delete drives, scenes or maps that are not needed any more (their space is free within about an "
+            "hour), or ask the operator for a larger quota.",
+        )
     mine = (Job.project_id == project_id) & (Job.kind != JobKind.PREFLIGHT) & Job.state.in_(ACTIVE)
     active = session.scalar(select(func.count()).select_from(Job).where(mine)) or 0
     if active + count > project.max_active_jobs:
@@ -147,8 +156,8 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     Raises
     ------
     ServiceError
-        409 where the job has not ended, has succeeded, its drive was deleted or needs no other check; 429 as
-        `create`.
+        409 where the job has not ended, has succeeded, its drive was deleted or needs no other check; 413
+        and 429 as `create`.
     """
     require_failed(job)
     drive = session.get(Drive, job.drive_id or "", with_for_update=True, populate_existing=True)
