@@ -29,7 +29,6 @@ _ORPHANS_EVERY_US = 24 * _HOUR_US  # not with every restart: listing a store cos
 _ORPHANS = "orphans"
 _END_WITHIN_S = 5.0
 _BATCH = 500
-_FEW = 20  # with their files
 
 
 class Reconciler:
@@ -140,7 +139,7 @@ class Reconciler:
         """Each transaction is short: while one deletes, SQLite lets no worker say that it lives."""
         now = now_us()
         # Of their own: aggregations lock maps and scenes before drives.
-        self._in_batches(lambda session: maps.forget_expired(session, now, limit=_FEW))
+        self._in_batches(lambda session: maps.forget_expired(session, now))
         with self._database.read() as session:
             expired = session.scalars(select(Drive.id).where(Drive.expires_us < now)).all()
         for drive_id in expired:

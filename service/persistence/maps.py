@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import delete, or_, select, tuple_, update
+from sqlalchemy import ColumnElement, delete, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from schemas.api.maps import MapSummary
@@ -256,29 +256,33 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
         )
 
 
-def forget_expired(session: Session, now: int, *, limit: int) -> int:
-    """Delete maps, or where there are none scenes, that have passed their dates; what a map or a job needs stays.
+def forget_expired(session: Session, now: int, *, limit: int = 20) -> int:
+    """Delete maps, then scenes, that have passed their retention dates; what a map or a job needs stays.
+
+    Parameters
+    ----------
+    limit
+        Of each no more than this, with their files: the transaction is to be short.
 
     Returns
     -------
     int
-        How many were deleted: no more than `limit`, and 0 where none is left.
+        How many were deleted; 0 where none is left.
     """
-    # Locked first: an aggregation that is asked for at this moment has been recorded then, or finds nothing.
     busy = select(Job.id).where(Job.map_id == Map.id, Job.state.not_in(TERMINAL)).exists()
-    ripe = select(Map.id).where(Map.expires_us < now, ~busy).order_by(Map.id).limit(limit)
-    found = session.scalars(ripe.with_for_update()).all()
-    dropped = delete(Map).where(Map.id.in_(found), ~busy)
-    if found:
-        return int(session.execute(dropped.execution_options(synchronize_session=False)).rowcount)  # type: ignore[attr-defined]
     in_job = (
         select(JobMember.job_id)
         .join(Job, Job.id == JobMember.job_id)
         .where(JobMember.scene_id == Scene.id, Job.state.not_in(TERMINAL))
     )
     in_map = select(MapScene.map_id).where(MapScene.scene_id == Scene.id)
-    unused = ~or_(in_map.exists(), in_job.exists())
-    of_none = select(Scene.id).where(Scene.expires_us < now, unused).order_by(Scene.id).limit(limit)
-    alone = session.scalars(of_none.with_for_update()).all()
-    left = delete(Scene).where(Scene.id.in_(alone), unused).execution_options(synchronize_session=False)
-    return int(session.execute(left).rowcount)  # type: ignore[attr-defined]
+    return _forget(session, Map, (Map.expires_us < now) & ~busy, limit) + _forget(
+        session, Scene, (Scene.expires_us < now) & ~or_(in_map.exists(), in_job.exists()), limit
+    )
+
+
+def _forget(session: Session, table: type[Map] | type[Scene], ripe: ColumnElement[bool], limit: int) -> int:
+    # Locked first: an aggregation that is asked for at this moment has been recorded then, or finds nothing.
+    found = session.scalars(select(table.id).where(ripe).order_by(table.id).limit(limit).with_for_update()).all()
+    dropped = delete(table).where(table.id.in_(found), ripe).execution_options(synchronize_session=False)
+    return int(session.execute(dropped).rowcount)  # type: ignore[attr-defined]
