@@ -68,7 +68,7 @@ def project_of(session: Session, secret: str) -> str | None:
 class KeyRing:
     """Remembers for some seconds which project a key opens: a client that sends files sends many with one key.
 
-    A key that is revoked ends within `KEPT_S`.
+    A key that is revoked ends within `KEPT_S`, and an answer that goes on for long where it asks `find` again.
     """
 
     KEPT_S = 3.0
@@ -81,6 +81,10 @@ class KeyRing:
         """The project's id if the key was looked up a moment ago; never waits."""
         project_id, until_s = self._known.get(secret_sha256(secret), ("", 0.0))
         return project_id if time.monotonic() < until_s else None
+
+    def find(self, secret: str) -> str | None:
+        """The project's id, remembered or looked up."""
+        return self.remembered(secret) or self.look_up(secret)
 
     def look_up(self, secret: str) -> str | None:
         """The project's id from the database; None where the key opens none."""

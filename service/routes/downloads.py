@@ -44,7 +44,7 @@ async def send_file(context: Context, request: Request, blob: Blob, *, media_typ
         "Content-Disposition": content_disposition(name),
         "X-Content-Type-Options": "nosniff",
     }
-    if none_match(request.headers.get("if-none-match"), etag):
+    if none_match(request.headers.getlist("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     asked = None
     if request.method == "GET":

@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Response
+from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Request, Response
+from fastapi.security.utils import get_authorization_scheme_param
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select, tuple_
 from sqlalchemy.orm import Session
@@ -63,7 +64,7 @@ def get_job(
     caller: CallerDep,
     context: ContextDep,
     response: Response,
-    if_none_match: Annotated[str | None, Header(max_length=2000)] = None,
+    if_none_match: Annotated[list[str] | None, Header()] = None,
 ) -> Response | JobResource:
     """One job: poll this every `Retry-After` seconds, with `If-None-Match`, or read its events."""
     with context.database.read() as session:
@@ -125,14 +126,15 @@ def _existing(job_id: str, caller: CallerDep, context: ContextDep) -> str:
 async def stream_events(
     job_id: Annotated[str, Depends(_existing)],
     context: ContextDep,
+    request: Request,
     last_event_id: Annotated[
         int | None, Header(ge=0, lt=2**62, description="go on after this event, as a browser does by itself")
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """The job's changes of state, from the beginning, and its newest progress, until it has ended."""
-    last = last_event_id or 0
+    """The job's changes of state, from the beginning, and its newest progress, until it or the key has ended."""
+    last, secret = last_event_id or 0, get_authorization_scheme_param(request.headers.get("authorization"))[1]
     while True:
-        ended, events = await run_in_threadpool(_news, context, job_id, last)
+        ended, events = await run_in_threadpool(_news, context, secret, job_id, last)
         for event in events:
             last = event.id
             yield ServerSentEvent(id=str(event.id), event=event.kind, data=event.data)
@@ -142,7 +144,9 @@ async def stream_events(
             await asyncio.sleep(context.settings.poll_seconds)
 
 
-def _news(context: Context, job_id: str, last: int) -> tuple[bool, list[JobEvent]]:
+def _news(context: Context, secret: str, job_id: str, last: int) -> tuple[bool, list[JobEvent]]:
+    if context.keys.find(secret) is None:
+        return True, []  # revoked since the stream began
     with context.database.read() as session:
         state = session.scalar(select(Job.state).where(Job.id == job_id))
         ended = state is None or JobState(state) in TERMINAL

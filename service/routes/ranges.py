@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from urllib.parse import quote
 
@@ -56,11 +56,9 @@ def requested_part(headers: Mapping[str, str], *, size_bytes: int, etag: str) ->
     return Part(start, stop)
 
 
-def none_match(if_none_match: str | None, etag: str) -> bool:
-    """Whether the client has this version already."""
-    if if_none_match is None:
-        return False
-    tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
+def none_match(if_none_match: Sequence[str] | None, etag: str) -> bool:
+    """Whether the client has this version already, by all lines of the header."""
+    tags = [tag.strip().removeprefix("W/") for line in if_none_match or () for tag in line.split(",")]
     return etag in tags or "*" in tags
 
 

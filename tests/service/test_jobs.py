@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +13,8 @@ import pytest
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.persistence import jobs
-from service.persistence.tables import Job, now_us
+from service.persistence.keys import revoke_key
+from service.persistence.tables import ApiKey, Job, now_us
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
 
@@ -105,6 +107,10 @@ def test_progress_is_shown_and_polling_costs_nothing_where_nothing_changed(owner
     }
     unchanged = owner.get(url, headers={"If-None-Match": f'W/{third.headers["etag"]}, "x"'})
     assert (unchanged.status_code, unchanged.content) == (304, b"")
+    in_two_lines = [("If-None-Match", third.headers["etag"]), ("If-None-Match", '"x"')]
+    assert owner.get(url, headers=in_two_lines).status_code == 304
+    assert owner.get(url, headers=in_two_lines[::-1]).status_code == 304
+    assert owner.get(url, headers=in_two_lines[1:] * 2).status_code == 200
     assert third.json()["attempts"][0]["worker"] == "worker@test"
 
 
@@ -334,6 +340,22 @@ def test_events_come_as_they_happen(owner: Client, job: dict[str, Any]) -> None:
     assert not thread.is_alive(), "the stream ends with the job"
     assert [event["data"]["state"] for event in seen] == ["QUEUED", "RUNNING", "RUNNING", "CANCELLED"]
     assert seen[2]["data"]["cancel_requested"] is True
+
+
+def test_events_end_with_the_key(api: Api) -> None:
+    client = api.client()
+    job = client.reconstruct(client.committed())
+    with client.stream("GET", f"/v1/jobs/{job['id']}/events") as answer:
+        lines = answer.iter_lines()
+        assert any("QUEUED" in line for line in lines)
+        with api.database.write() as session:
+            (key,) = session.query(ApiKey).filter_by(project_id=client.project_id)
+            assert revoke_key(session, key.id)
+        began_s = time.monotonic()
+        for _ in lines:
+            assert time.monotonic() - began_s < 10, "keys are remembered for 3 s"
+    with api.database.read() as session:
+        assert session.get_one(Job, job["id"]).state == "QUEUED"
 
 
 @pytest.mark.parametrize("last", ["x", "-1", "1.5", "99999999999999999999"])
