@@ -29,6 +29,7 @@ from service.readiness import Readiness
 from service.request_log import RequestLog
 from service.routes import aggregations, drives, files, jobs, maps, operations, reconstructions, scenes, uploads
 from service.routes.documentation import add_documentation
+from service.routes.heads import heads_of
 from service.settings import Settings
 from service.uploads.resumable import sweep as sweep_resumable
 from service.uploads.spool import sweep
@@ -51,7 +52,8 @@ Send a drive (images of a vehicle's cameras, GNSS, calibration), get a metric sc
 5. `GET /v1/scenes/{id}` and its files
 6. `POST /v1/aggregations` with several drives or scenes makes one map of them: `GET /v1/maps/{id}` and its versions
 
-`mrasfm upload` and `mrasfm map` do all of it. Every error is an RFC 9457 problem whose `remedy` says what to do.
+`mrasfm upload` and `mrasfm map` do all of it. HEAD is answered wherever GET is, but for event streams. Every error is
+an RFC 9457 problem whose `remedy` says what to do.
 """
 
 
@@ -70,13 +72,20 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         context.database.close()
 
     app = FastAPI(
-        title="MRASfM", version=version("mrasfm"), description=_ABOUT, lifespan=lifespan, docs_url=None, redoc_url=None
+        title="MRASfM",
+        version=version("mrasfm"),
+        description=_ABOUT,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,  # it would lead whoever asks to the host that the request itself names
     )
     app.state.context = context
     app.state.readiness = Readiness(context)
-    for module in (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, operations):
-        app.include_router(module.router)
-    app.include_router(operations.metrics_route(metrics))
+    modules = (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, operations)
+    routers = [*(module.router for module in modules), operations.metrics_route(metrics)]
+    for router in (*routers, heads_of(routers)):
+        app.include_router(router)
     add_documentation(app)
     _answer_errors(app)
     app.add_middleware(RequestLog, metrics=metrics, failed=_failed)

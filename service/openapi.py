@@ -8,6 +8,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.sse import EventSourceResponse
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
@@ -16,6 +17,7 @@ from service.routes.bodies import documented
 from service.routes.dependencies import problems
 
 _METHODS = ("get", "head", "post", "put", "patch", "delete", "options")
+_EVENTS = EventSourceResponse.media_type
 _CHECKED = ("query", "header")  # where parameters can be wrong; ids in a path are any text, and found or not
 
 
@@ -64,7 +66,10 @@ def allowed_methods(app: FastAPI, path: str) -> list[str]:
     if not matching:
         return []
     meant = paths[max(matching, key=lambda template: len(re.sub(r"{[a-z_]+}", "", template)))]
-    return [name.upper() for name in _METHODS if name in meant]
+    names = [name.upper() for name in _METHODS if name in meant]
+    if "GET" in names and "HEAD" not in names and _EVENTS not in meant["get"]["responses"]["200"].get("content", {}):
+        names.insert(1, "HEAD")
+    return names
 
 
 def _expression(template: str) -> re.Pattern[str]:

@@ -95,8 +95,8 @@ def test_the_example_of_a_manifest_is_accepted(client: Client, page: dict[str, A
 @pytest.mark.parametrize(
     ("path", "allowed"),
     [
-        ("/v1/drives", "GET, POST"),
-        ("/v1/drives/x", "GET, DELETE"),
+        ("/v1/drives", "GET, HEAD, POST"),
+        ("/v1/drives/x", "GET, HEAD, DELETE"),
         ("/v1/drives/x:commit", "POST"),
         ("/v1/jobs/x:cancel", "POST"),
         ("/v1/drives/x/files/a/b", "PUT, DELETE"),
@@ -104,7 +104,8 @@ def test_the_example_of_a_manifest_is_accepted(client: Client, page: dict[str, A
         ("/v1/maps/x/versions/1/files/a/b", "GET, HEAD"),
         ("/v1/maps/x/current-version", "PUT"),
         ("/v1/drives/x/uploads", "POST, OPTIONS"),
-        ("/livez", "GET"),
+        ("/livez", "GET, HEAD"),
+        ("/v1/jobs/x/events", "GET"),
         ("/docs", "GET, HEAD"),
     ],
 )

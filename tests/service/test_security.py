@@ -103,6 +103,28 @@ def test_foreign_ids_are_not_found_at_any_route(api: Api, client: Client, foreig
     assert tried >= 18
 
 
+def test_head_is_get_without_a_body(api: Api, client: Client) -> None:
+    scene_id = client.scene({"points.ply": b"ply"})
+    scene = client.get(f"/v1/scenes/{scene_id}").json()
+    ids = {"scene_id": scene_id, "drive_id": scene["drive_id"], "job_id": scene["job_id"], "path": "points.ply"}
+    drives = [client.frozen(tiny_drive(f"head-{i}", seed=f"head-{i}")) for i in range(2)]
+    ids |= {"map_id": new_version(client, {"points.ply": b"ply"}, drives=drives)["map_id"], "version": "1"}
+    readable = [path for method, path in operations(api) if method == "GET"]
+    assert len(readable) >= 20
+    for path in readable:
+        target = path.format(**ids)
+        if path.endswith("/events"):
+            assert client.head(target).status_code == 405
+            continue
+        got, head = client.get(target), client.head(target)
+        assert (got.status_code, head.status_code, head.content) == (200, 200, b""), path
+        assert head.headers["content-type"] == got.headers["content-type"], path
+        if "content-length" in got.headers and path not in ("/metrics", "/v1/status"):
+            assert head.headers["content-length"] == got.headers["content-length"], path
+        if path not in OPEN:
+            assert api.anonymous().head(target).status_code == 401, path
+
+
 def test_lists_show_nothing_foreign(client: Client, foreign: dict[str, str]) -> None:
     for path in ("/v1/drives", "/v1/jobs", "/v1/scenes"):
         for params in ({}, {"drive_id": foreign["drive_id"]}):
@@ -112,9 +134,16 @@ def test_lists_show_nothing_foreign(client: Client, foreign: dict[str, str]) -> 
 @pytest.mark.parametrize("row_id", ["", "x", "..", "drv_", "%00", "drv_%00", "ÿ", "drv_" + "f" * 500, "' OR 1=1 --"])
 def test_ids_that_are_none(client: Client, row_id: str) -> None:
     for path in ("drives", "jobs", "scenes"):
-        answer = client.get(f"/v1/{path}/{row_id}/")
-        assert answer.status_code in (307, 404), answer.text
+        problem_of(client.get(f"/v1/{path}/{row_id}/"), 404, "not-found")
         assert client.get(f"/v1/{path}/x{row_id}").status_code == 404
+
+
+def test_a_slash_too_many_leads_nowhere(api: Api, client: Client) -> None:
+    """A redirect would go to the host that the request names."""
+    for method in ("GET", "POST", "PUT"):
+        for asking in (client, api.anonymous()):
+            answer = asking.request(method, "/v1/drives/", headers={"Host": "elsewhere.example"})
+            problem_of(answer, 404, "not-found")
 
 
 @pytest.mark.parametrize(
