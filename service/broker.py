@@ -22,7 +22,7 @@ import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from service.data_folder import make_private_folder, write_private_file
+from service.data_folder import make_private_folder, write_state_file
 
 HOST = "127.0.0.1"
 # Below the ports that Linux and macOS give to outgoing connections: a client that keeps reconnecting to a port of
@@ -96,7 +96,7 @@ def prepare(directory: Path) -> EmbeddedBroker:
     password = _password(directory / "password")
     port = _port(directory / "port")
     configuration = directory / "broker.conf"
-    write_private_file(
+    write_state_file(
         configuration,
         CONFIGURATION.format(host=HOST, port=port, password=password, directory=_quoted(str(directory))),
     )
@@ -176,7 +176,7 @@ def _packaged_server() -> Path | None:
 
 def _password(path: Path) -> str:
     if not path.exists():
-        write_private_file(path, secrets.token_urlsafe(PASSWORD_BYTES))
+        write_state_file(path, secrets.token_urlsafe(PASSWORD_BYTES))
     return path.read_text(encoding="ascii")
 
 
@@ -185,7 +185,7 @@ def _port(path: Path) -> int:
     if kept.isdecimal() and int(kept) in PORTS and _is_free(int(kept)):
         return int(kept)
     port = _choose_port()
-    write_private_file(path, str(port))
+    write_state_file(path, str(port))
     return port
 
 

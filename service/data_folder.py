@@ -34,26 +34,31 @@ def make_private_folder(folder: Path) -> None:
         folder.chmod(0o700)
 
 
-def write_private_file(path: Path, text: str) -> None:
-    """Write a file that only its owner may read, whole or not at all.
+def write_state_file(path: Path, text: str) -> None:
+    """As `write_private_file`, in a data folder.
 
     Raises
     ------
     DataFolderError
         Where it cannot be written.
     """
-    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     with _explained(path.parent):
-        descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        try:
-            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            scratch.replace(path)
-        except BaseException:
-            scratch.unlink(missing_ok=True)
-            raise
+        write_private_file(path, text)
+
+
+def write_private_file(path: Path, text: str) -> None:
+    """Write a file that only its owner may read, whole or not at all."""
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        scratch.replace(path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager

@@ -11,7 +11,6 @@ from sqlalchemy.exc import OperationalError
 from mrasfm_engine.aggregation.stages import seam_name
 from schemas.api.jobs import JobKind
 from service.persistence import jobs
-from service.persistence.artifacts import ArtifactStore
 from service.persistence.checkpoints import MapShelf
 from service.persistence.database import Database
 from service.settings import Settings
@@ -26,7 +25,7 @@ def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> 
         job_id="job_1", fence=1, attempt=1, project_id="prj_1", kind=JobKind.AGGREGATION, drive_id=None, map_id="map_1",
         settings={},
     )  # fmt: skip
-    assignment = assignment_of(database, ArtifactStore(settings), held)
+    assignment = assignment_of(database, held)
     with pytest.raises(OperationalError):
         _ = assignment.shelf
     database.close()
