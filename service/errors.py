@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
 from schemas.api.resource import Finding
+from schemas.parsing import DocumentError
 
 
 class ServiceError(Exception):
@@ -54,6 +55,31 @@ class ServiceError(Exception):
             errors=list(errors),
             findings=list(findings),
         )
+
+
+def of_problem(problem: Problem) -> ServiceError:
+    """The error that a problem was the answer to."""
+    return ServiceError(
+        problem.status or 500,
+        problem.type.removeprefix(PROBLEM_TYPE),
+        problem.title,
+        problem.detail,
+        remedy=problem.remedy,
+        errors=problem.errors,
+        findings=problem.findings,
+    )
+
+
+def invalid_document(error: DocumentError, *, what: str) -> ServiceError:
+    """422 with all defects of a document."""
+    return ServiceError(
+        422,
+        "invalid-document",
+        "The document does not follow its contract",
+        f"{what}: {error}",
+        remedy="Correct the fields that are named; /docs describes every field.",
+        errors=[ProblemItem(field=problem.path, detail=problem.what) for problem in error.problems[:100]],
+    )
 
 
 def store_unavailable() -> ServiceError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,6 +76,17 @@ def is_drive_file() -> ColumnElement[bool]:
     return sql_exists().where(DriveFile.blob_id == Blob.id)
 
 
+def lock_project(session: Session, project_id: str) -> None:
+    """Take a project's turn, before the first of its blobs is changed.
+
+    Two transactions with the same contents in another order would otherwise wait for each other, one for the blob, one
+    for the project's space. SQLite's writers take turns anyway.
+    """
+    connection = session.connection()
+    if connection.dialect.name == "postgresql":
+        connection.execute(_LOCK_PROJECT, {"project": project_id})
+
+
 def find(session: Session, project_id: str, sha256: str) -> Blob | None:
     """The project's blob of this content, kept from being collected for a while."""
     blob = session.scalar(select(Blob).where(Blob.project_id == project_id, Blob.sha256 == sha256))
@@ -115,26 +126,68 @@ def record(
     ServiceError
         413 where the project's quota would be exceeded, 503 where the object that was found has been collected since.
     """
+    lock_project(session, project_id)
     connection = session.connection()
-    if connection.dialect.name == "postgresql":
-        # First of all: two transactions with the same contents in another order would otherwise wait for each other,
-        # one for the blob, one for the project's space.
-        connection.execute(_LOCK_PROJECT, {"project": project_id})
     if not is_new:
         return _recorded_before(session, project_id, sha256)
-    values = {
-        "id": new_id("blb"),
-        "project_id": project_id,
-        "sha256": sha256,
-        "size_bytes": size_bytes,
-        "key": key,
-        "written_in_boot": written_in_boot,
-        "touched_us": now_us(),
-    }
-    if connection.execute(_INSERT[connection.dialect.name], values).first() is not None:
+    content = {"sha256": sha256, "size_bytes": size_bytes, "key": key, "written_in_boot": written_in_boot}
+    row = _row(project_id, content, now_us())
+    if connection.execute(_INSERT[connection.dialect.name], row).first() is not None:
         _take_space(session, project_id, size_bytes, within_quota=within_quota)
-        return Recorded(id=str(values["id"]), key=key, size_bytes=size_bytes)
+        return Recorded(id=row["id"], key=key, size_bytes=size_bytes)
     return _recorded_before(session, project_id, sha256)
+
+
+def record_all(
+    session: Session, project_id: str, contents: Sequence[Mapping[str, Any]], *, touched_us: int
+) -> dict[str, Recorded]:
+    """The project's blobs of some hundred contents that were stored anew, by digest; as `record`.
+
+    Parameters
+    ----------
+    contents
+        As `StoredFile.identity` has them; no two alike.
+    touched_us
+        When, and what `take_back` knows them by.
+
+    Raises
+    ------
+    ServiceError
+        413 where the project's quota would be exceeded.
+    """
+    lock_project(session, project_id)
+    connection = session.connection()
+    rows = [_row(project_id, content, touched_us) for content in contents]
+    inserted = set(connection.scalars(_INSERT[connection.dialect.name], rows))
+    recorded = {
+        row["sha256"]: Recorded(id=row["id"], key=row["key"], size_bytes=row["size_bytes"])
+        for row in rows
+        if row["id"] in inserted
+    }
+    if recorded:
+        _take_space(session, project_id, sum(blob.size_bytes for blob in recorded.values()), within_quota=True)
+    known = (Blob.project_id == project_id) & Blob.sha256.in_(
+        row["sha256"] for row in rows if row["id"] not in inserted
+    )
+    session.execute(update(Blob).where(known).values(touched_us=now_us()).execution_options(synchronize_session=False))
+    for blob in session.scalars(select(Blob).where(known)):
+        recorded[blob.sha256] = Recorded(id=blob.id, key=blob.key, size_bytes=blob.size_bytes)
+    return recorded
+
+
+def take_back(session: Session, project_id: str, blob_ids: Sequence[str], *, touched_us: int) -> None:
+    """Forget some hundred blobs that `record_all` recorded for nothing.
+
+    Those that another request has found since stay: it relies on them for a while.
+    """
+    lock_project(session, project_id)
+    _forget(session, Blob.id.in_(blob_ids) & (Blob.touched_us == touched_us) & unused())
+
+
+def _row(project_id: str, content: Mapping[str, Any], touched_us: int) -> dict[str, Any]:
+    names = ("sha256", "size_bytes", "key", "written_in_boot")
+    told = {name: content[name] for name in names}
+    return {"id": new_id("blb"), "project_id": project_id, "touched_us": touched_us, **told}
 
 
 def _recorded_before(session: Session, project_id: str, sha256: str) -> Recorded:
@@ -218,10 +271,14 @@ def forget_unused(session: Session, *, untouched_since_us: int, blob_ids: Sequen
     ripe = _ripe(untouched_since_us)  # asked again: another transaction may have begun to use one
     if blob_ids is not None:
         ripe &= Blob.id.in_(blob_ids)
-    # The projects first, as in `record`, and always in one order.
+    # The projects first, as `lock_project` does, and always in one order.
     owners = select(Project.id).where(Project.id.in_(select(Blob.project_id).where(ripe))).order_by(Project.id)
     session.execute(owners.with_for_update(key_share=True))
-    dropped = delete(Blob).where(ripe).returning(Blob.project_id, Blob.size_bytes, Blob.key)
+    return _forget(session, ripe)
+
+
+def _forget(session: Session, condition: ColumnElement[bool]) -> list[str]:
+    dropped = delete(Blob).where(condition).returning(Blob.project_id, Blob.size_bytes, Blob.key)
     rows = session.execute(dropped.execution_options(synchronize_session=False)).all()
     freed: Counter[str] = Counter()
     for row in rows:

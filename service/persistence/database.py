@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import Engine, create_engine, event, inspect, text
 from sqlalchemy.engine import make_url
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
 from service.persistence.tables import now_us
 from service.settings import Settings
 
+Result = TypeVar("Result")
+
 MIGRATIONS = Path(__file__).parent / "migrations"
+# PostgreSQL ended this transaction for another one's sake: a serialization failure, a deadlock.
+_TRY_AGAIN = frozenset({"40001", "40P01"})
+# An error tells its statement, and not what was given to it: that is the users', and may be a hundred thousand names.
+_ENGINE: dict[str, Any] = {"pool_size": 10, "max_overflow": 30, "hide_parameters": True}
 
 
 class Database:
@@ -70,6 +77,21 @@ class Database:
                 session.connection(execution_options={"mrasfm_begin": "IMMEDIATE", "mrasfm_durable": durable})
             yield session
 
+    def transact(self, work: Callable[[Session], Result], *, durable: bool = True) -> Result:
+        """The result of `work` in a transaction of its own: see `write`.
+
+        Where the database ends the transaction for another one's sake, it is done once more: nothing of it was kept,
+        and the other one is done.
+        """
+        try:
+            with self.write(durable=durable) as session:
+                return work(session)
+        except OperationalError as error:
+            if getattr(error.orig, "sqlstate", None) not in _TRY_AGAIN:
+                raise
+        with self.write(durable=durable) as session:
+            return work(session)
+
     def close(self) -> None:
         """Give all connections back."""
         self.engine.dispose()
@@ -98,14 +120,14 @@ def _server(url: str, patience_s: float) -> Engine:
         "tcp_user_timeout": 20_000,
         "options": f"-c statement_timeout={round(4000 * patience_s)} {chosen}".rstrip(),
     }
-    return create_engine(url, pool_size=10, max_overflow=30, pool_pre_ping=True, connect_args=options)
+    return create_engine(url, pool_pre_ping=True, connect_args=options, **_ENGINE)
 
 
 def _sqlite(url: str, patience_s: float) -> Engine:
     path = make_url(url).database
     if path:
         Path(path).parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    engine = create_engine(url, pool_size=10, max_overflow=30)
+    engine = create_engine(url, **_ENGINE)
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, record: Any) -> None:

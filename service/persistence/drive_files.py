@@ -7,11 +7,10 @@ from pathlib import Path
 
 from sqlalchemy import select
 
+from service.manifest_facts import MANIFEST_NAME
 from service.persistence.artifacts import Fetch
 from service.persistence.database import Database
 from service.persistence.tables import Blob, Drive, DriveFile
-
-MANIFEST_NAME = "drive.json"
 
 
 class DriveGoneError(Exception):

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
 from typing import Any
 
-from sqlalchemy import delete, func, insert, select, tuple_, update
+from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
 from sqlalchemy.orm import Session
 
-from schemas.api.drives import DriveState, FileDeclaration, FileRole, PreflightState
+from schemas.api.drives import DriveState, FileDeclaration, PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import ProblemItem
-from schemas.drive import DriveManifest
 from service.errors import ServiceError
-from service.persistence import blobs, durability, jobs, slots
-from service.persistence.drive_files import MANIFEST_NAME
+from service.manifest_facts import ManifestFacts
+from service.persistence import blobs, bulk, durability, jobs, slots
 from service.persistence.maps import require_unused
 from service.persistence.owned import require
 from service.persistence.storing import StoredFile
@@ -34,29 +32,33 @@ class Stored:
     size_bytes: int
 
 
-def files_of(manifest: DriveManifest) -> dict[str, FileRole]:
-    """Paths of all files that a manifest names. A mask may serve several images, and is one file."""
-    roles: dict[str, FileRole] = {}
-    for frame in manifest.frames:
-        for image in frame.images.values():
-            roles[image.file] = FileRole.IMAGE
-            if image.mask is not None:
-                roles.setdefault(image.mask, FileRole.MASK)
-    return roles
+def rows_of(manifest: ManifestFacts) -> list[str]:
+    """What `create` writes for the files: made before, for in its transaction all others wait who want to write."""
+    return list(bulk.batches(manifest.files))
 
 
 def create(
-    session: Session, *, project_id: str, manifest: DriveManifest, stored: StoredFile, expires_us: int | None
+    session: Session,
+    *,
+    project_id: str,
+    manifest: ManifestFacts,
+    rows: Sequence[str],
+    stored: StoredFile,
+    expires_us: int | None,
 ) -> Drive:
     """Record a drive whose manifest is in the artifact store.
+
+    Parameters
+    ----------
+    rows
+        The `rows_of` the manifest.
 
     Raises
     ------
     ServiceError
-        413 or 429 where a quota of the project is full, 422 where no folder can hold the files under their names.
+        413 or 429 where a quota of the project is full.
     """
-    _require_storable(manifest)
-    project = session.get_one(Project, project_id, with_for_update=True)
+    project = session.get_one(Project, project_id, with_for_update={"key_share": True})
     count = session.scalar(select(func.count()).select_from(Drive).where(Drive.project_id == project_id)) or 0
     if count >= project.max_drives:
         raise ServiceError(
@@ -68,49 +70,25 @@ def create(
             "('mrasfm projects set').",
         )
     blob = blobs.record(session, project_id=project_id, **stored.identity)
-    roles = files_of(manifest)
     drive = Drive(
         id=new_id("drv"),
         project_id=project_id,
         name=manifest.name,
         manifest_blob_id=blob.id,
-        cameras=len(manifest.rig.cameras),
-        frames=len(manifest.frames),
-        files_expected=len(roles),
-        has_gnss=manifest.gnss is not None,
+        cameras=manifest.cameras,
+        frames=manifest.frames,
+        files_expected=manifest.files_expected,
+        has_gnss=manifest.has_gnss,
         expires_us=expires_us,
     )
     session.add(drive)
     session.flush()
-    rows = [{"drive_id": drive.id, "path": path, "role": role} for path, role in roles.items()]
-    if rows:
-        session.execute(insert(DriveFile), rows)
+    given = bulk.given(session, "path", "role")
+    files = select(bindparam("drive", drive.id), given.c.path, given.c.role)
+    files_of_drive = insert(DriveFile).from_select(["drive_id", "path", "role"], files)
+    for batch in rows:
+        session.connection().execute(files_of_drive, {"rows": batch})
     return drive
-
-
-def _require_storable(manifest: DriveManifest) -> None:
-    """Refuse what a worker could not lay out as a folder, and what a database could not hold."""
-    if not manifest.name.isprintable():
-        raise _unusable("name", "holds control characters", "Give the drive a name that can be printed.")
-    paths = set(files_of(manifest))
-    for path in sorted(paths):
-        if path == MANIFEST_NAME:
-            raise _unusable(path, "is the manifest's own name", "Give the image or mask another name.")
-        above = next((str(folder) for folder in PurePosixPath(path).parents if str(folder) in paths), None)
-        if above is not None or path.startswith(MANIFEST_NAME + "/"):
-            what = f"lies in a folder that has the name of the file {above or MANIFEST_NAME!r}"
-            raise _unusable(path, what, "Give one of the two another name.")
-
-
-def _unusable(field: str, what: str, remedy: str) -> ServiceError:
-    return ServiceError(
-        422,
-        "invalid-document",
-        "The document does not follow its contract",
-        f"the manifest cannot be used: {field!r} {what}",
-        remedy=remedy,
-        errors=[ProblemItem(field=field, detail=what)],
-    )
 
 
 def get(session: Session, project_id: str, drive_id: str, *, lock: bool = False) -> Drive:
@@ -170,19 +148,18 @@ def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) ->
     if unknown:
         raise slots.not_in_manifest(drive.id, unknown[0])
     known = known_files(session, drive.project_id, sorted({file.sha256 for file in wanted.values()}))
-    stored, to_send = [], []
+    stored, to_send, taken = [], [], {}
     for path, file in wanted.items():
         blob = known.get(file.sha256)
         if present[path] == file.sha256:
             stored.append(path)
         elif present[path] is None and blob is not None and blob.size_bytes == file.size_bytes:
             require_open(drive)
-            values = {"blob_id": blob.id, "stored_us": now_us()}
-            mine = (DriveFile.drive_id == drive.id) & (DriveFile.path == path)
-            session.execute(update(DriveFile).where(mine).values(**values))
+            taken[path] = blob.id
             stored.append(path)
         else:
             to_send.append(path)
+    slots.set_all(session, drive.id, taken)
     return stored, to_send
 
 
@@ -199,6 +176,8 @@ def _identities(session: Session, drive: Drive, paths: Sequence[str]) -> dict[st
 def known_files(session: Session, project_id: str, digests: Sequence[str]) -> dict[str, Blob]:
     """Files of the project's drives, by their contents; they are kept from being collected for a while."""
     found: dict[str, Blob] = {}
+    if digests:
+        blobs.lock_project(session, project_id)
     for i in range(0, len(digests), _BATCH):
         some = (Blob.project_id == project_id) & Blob.sha256.in_(digests[i : i + _BATCH]) & blobs.is_drive_file()
         session.execute(update(Blob).where(some).values(touched_us=now_us()))
@@ -206,17 +185,8 @@ def known_files(session: Session, project_id: str, digests: Sequence[str]) -> di
     return found
 
 
-def commit(
-    session: Session, drive: Drive, findings: Sequence[dict[str, Any]], *, job_expires_us: int | None = None
-) -> Job:
-    """Freeze a complete drive, and ask for the check of its images.
-
-    Parameters
-    ----------
-    findings
-        Of the manifest's check, all of them warnings.
-    job_expires_us
-        When the record of the images' check is deleted.
+def require_complete(session: Session, drive: Drive) -> None:
+    """Refuse to freeze a drive whose files are not all here.
 
     Raises
     ------
@@ -239,6 +209,26 @@ def commit(
             remedy="Upload them, then commit again.",
             errors=[ProblemItem(field=path, detail="has not been uploaded") for path in paths],
         )
+
+
+def commit(
+    session: Session, drive: Drive, findings: Sequence[dict[str, Any]], *, job_expires_us: int | None = None
+) -> Job:
+    """Freeze a complete drive, and ask for the check of its images.
+
+    Parameters
+    ----------
+    findings
+        Of the manifest's check, all of them warnings.
+    job_expires_us
+        When the record of the images' check is deleted.
+
+    Raises
+    ------
+    ServiceError
+        409 where files are missing or still being written, or the drive is committed.
+    """
+    require_complete(session, drive)
     if durability.unsynced_of(session, drive.id, limit=1):
         raise ServiceError(
             409,

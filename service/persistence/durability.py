@@ -51,6 +51,7 @@ def secure_drive(database: Database, artifacts: ArtifactStore, drive_id: str) ->
                 return
             survived = list(pool.map(lambda blob: _secure(artifacts, blob), found))
             with database.write() as session:
+                blobs.lock_project(session, found[0].project_id)
                 safe = [blob.id for blob, there in zip(found, survived, strict=True) if there]
                 session.execute(update(Blob).where(Blob.id.in_(safe)).values(written_in_boot=None))
                 for blob, there in zip(found, survived, strict=True):

@@ -53,6 +53,8 @@ def once(
 
     Parameters
     ----------
+    effect
+        May be run a second time, where nothing of the first is left: see `Database.transact`.
     key
         The client's; None runs the effect.
     request_sha256
@@ -72,8 +74,7 @@ def once(
     if key is None:
         if prepare is not None:
             prepare()
-        with database.write() as session:
-            return effect(session)
+        return database.transact(effect)
     holder = new_id("idk")
     hold_us = _HELD_FOR_US if prepare is None else _HELD_TO_PREPARE_US
     with database.write() as session:
@@ -82,16 +83,19 @@ def once(
         )
     if replay is not None:
         return replay
+
+    def recorded_effect(session: Session) -> Answer:
+        answer = effect(session)
+        values = {"status": answer.status, "headers": dict(answer.headers), "body": json.dumps(answer.body)}
+        mine = update(IdempotencyKey).where(*_mine(project_id, key, holder))
+        if not session.execute(mine.values(**values)).rowcount:  # type: ignore[attr-defined]
+            raise _in_flight(key)  # it took so long that another request took the key over
+        return answer
+
     with _freed_on_error(database, project_id, key, holder):
         if prepare is not None:
             prepare()
-        with database.write() as session:
-            answer = effect(session)
-            values = {"status": answer.status, "headers": dict(answer.headers), "body": json.dumps(answer.body)}
-            mine = update(IdempotencyKey).where(*_mine(project_id, key, holder))
-            if not session.execute(mine.values(**values)).rowcount:  # type: ignore[attr-defined]
-                raise _in_flight(key)  # it took so long that another request took the key over
-    return answer
+        return database.transact(recorded_effect)
 
 
 def _mine(project_id: str, key: str, holder: str) -> tuple[Any, ...]:

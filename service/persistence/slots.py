@@ -5,6 +5,7 @@ A long drive has a hundred thousand of these, so an upload's statements are few,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sqlalchemy import bindparam, select, update
@@ -50,16 +51,14 @@ _FIND = (
 # Shared: uploads into one drive go side by side, and its commit, which locks it for itself, waits for them.
 _FIND_AND_LOCK = _FIND.with_for_update(read=True, of=Drive)
 
-_FILL = (
+_SET = (
     update(DriveFile)
-    .where(
-        DriveFile.drive_id == bindparam("drive"),
-        DriveFile.path == bindparam("name"),
-        DriveFile.blob_id.is_not_distinct_from(bindparam("before")),
-    )
+    .where(DriveFile.drive_id == bindparam("drive"), DriveFile.path == bindparam("name"))
     .values(blob_id=bindparam("after"), stored_us=bindparam("now"))
     .execution_options(synchronize_session=False)
 )
+_FILL = _SET.where(DriveFile.blob_id.is_not_distinct_from(bindparam("before")))
+_BLOBS_OF = select(DriveFile.path, DriveFile.blob_id).where(DriveFile.drive_id == bindparam("drive"))
 
 
 def find(session: Session, project_id: str, drive_id: str, path: str, *, lock: bool = False) -> Slot:
@@ -131,11 +130,50 @@ def fill(session: Session, slot: Slot, stored: StoredFile, *, replace: bool) -> 
         return None
     if not slot.is_open:
         raise drive_committed(slot.drive_id)
-    if slot.sha256 is not None and not replace:
-        raise _occupied(slot, f"is stored with SHA-256 {slot.sha256}, these bytes have {stored.sha256}")
+    _require_free(slot, stored, replace=replace)
     blob = blobs.record(session, project_id=slot.project_id, **stored.identity)
-    _put(session, slot, blob.id)
+    while not _put(session, slot, blob.id):
+        # Another upload was here since the slot was looked at. PostgreSQL lets both look before one of them writes.
+        slot = find(session, slot.project_id, slot.drive_id, slot.path)
+        if slot.sha256 == stored.sha256:
+            return None
+        _require_free(slot, stored, replace=replace)
     return blob
+
+
+def fill_all(session: Session, drive: Drive, blob_ids: Mapping[str, str], *, replace: bool) -> None:
+    """Give many slots of a drive, which the session has locked, their bytes: all of them, or none.
+
+    Parameters
+    ----------
+    blob_ids
+        By the names that the manifest gives.
+
+    Raises
+    ------
+    ServiceError
+        409 where the drive is committed or another content is stored under one of the names.
+    """
+    # Of the whole drive: PostgreSQL, which does not know yet how large a new drive is, would go through it for each
+    # batch of names.
+    rows = session.connection().execute(_BLOBS_OF, {"drive": drive.id})
+    before = {path: blob_id for path, blob_id in rows if path in blob_ids}
+    changed = {path: blob_id for path, blob_id in blob_ids.items() if before[path] != blob_id}
+    if changed and drive.state != DriveState.OPEN:
+        raise drive_committed(drive.id)
+    occupied = None if replace else next((path for path in changed if before[path] is not None), None)
+    if occupied is not None:
+        others, given = (session.get_one(Blob, blob_id) for blob_id in (before[occupied], blob_ids[occupied]))
+        raise _occupied(occupied, before=others.sha256, given=given.sha256)
+    set_all(session, drive.id, changed)
+
+
+def set_all(session: Session, drive_id: str, blob_ids: Mapping[str, str]) -> None:
+    """Give many slots their bytes, by name, whatever they have."""
+    if blob_ids:
+        now = now_us()
+        values = [{"drive": drive_id, "name": path, "after": blob_id, "now": now} for path, blob_id in blob_ids.items()]
+        session.connection().execute(_SET, values)
 
 
 def empty(session: Session, slot: Slot) -> None:
@@ -148,14 +186,20 @@ def empty(session: Session, slot: Slot) -> None:
     """
     if not slot.is_open:
         raise drive_committed(slot.drive_id)
-    _put(session, slot, None)
+    while not _put(session, slot, None):
+        slot = find(session, slot.project_id, slot.drive_id, slot.path)
 
 
-def _put(session: Session, slot: Slot, blob_id: str | None) -> None:
+def _put(session: Session, slot: Slot, blob_id: str | None) -> bool:
+    """Whether the slot was still as it was found, and has these bytes now."""
     values = {"drive": slot.drive_id, "name": slot.path, "before": slot.blob_id, "after": blob_id}
     values["now"] = None if blob_id is None else now_us()  # type: ignore[assignment]
-    if not session.connection().execute(_FILL, values).rowcount:
-        raise _occupied(slot, "was stored by another upload at this moment")
+    return bool(session.connection().execute(_FILL, values).rowcount)
+
+
+def _require_free(slot: Slot, stored: StoredFile, *, replace: bool) -> None:
+    if slot.sha256 is not None and not replace:
+        raise _occupied(slot.path, before=slot.sha256, given=stored.sha256)
 
 
 def not_in_manifest(drive_id: str, path: str) -> ServiceError:
@@ -180,12 +224,12 @@ def drive_committed(drive_id: str) -> ServiceError:
     )
 
 
-def _occupied(slot: Slot, what: str) -> ServiceError:
+def _occupied(path: str, *, before: str, given: str) -> ServiceError:
     return ServiceError(
         409,
         "file-exists",
         "Another content is stored under this name",
-        f"{slot.path!r} {what}",
+        f"{path!r} is stored with SHA-256 {before}, these bytes have {given}",
         remedy="If these are the right ones, send them again with ?replace=true; if not, see who else writes this "
         "drive.",
     )

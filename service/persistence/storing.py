@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from sqlalchemy.orm import Session
 
 from service.persistence import blobs
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.database import Database
 from service.persistence.durability import boot_id
-from service.persistence.tables import Blob
+from service.persistence.tables import Blob, now_us
 
 _CHUNK_BYTES = 1 << 20
 _BATCH = 500
@@ -110,7 +112,9 @@ class Storing:
         self._database = database
         self._artifacts = artifacts
         self._project_id = project_id
-        self._new: list[str] = []
+        self._new: set[str] = set()
+        self._recorded_us = now_us()
+        self._unused: list[blobs.Recorded] = []
 
     def __call__(self, path: Path, *, sha256: str, size_bytes: int) -> StoredFile:
         """Make a file of the spool an object; the file is gone afterwards.
@@ -119,18 +123,51 @@ class Storing:
         Where it has, recording it returns the older blob, and this object is taken back.
         """
         key = blobs.new_key(self._project_id, sha256)
-        self._new.append(key)
+        self._new.add(key)
         return _adopt(self._artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=self._durable)
 
     def recorded(self, key: str) -> None:
         """Note that a transaction that has committed names this object."""
-        if key in self._new:
-            self._new.remove(key)
+        self._new.discard(key)
+
+    def record(self, files: Sequence[StoredFile]) -> dict[str, blobs.Recorded]:
+        """Blobs of stored files, by digest, before anything refers to them.
+
+        In several short transactions, so that others write in between. What is recorded is taken back at the block's
+        end, unless `used` says that it is needed; where the process is killed before, it is collected later.
+
+        Raises
+        ------
+        ServiceError
+            413 where the project's quota would be exceeded.
+        """
+        found: dict[str, blobs.Recorded] = {}
+        unlike = list({file.sha256: file for file in files}.values())
+        for i in range(0, len(unlike), _BATCH):
+            contents = [file.identity for file in unlike[i : i + _BATCH]]
+
+            def batch(session: Session, contents: list[dict[str, Any]] = contents) -> dict[str, blobs.Recorded]:
+                return blobs.record_all(session, self._project_id, contents, touched_us=self._recorded_us)
+
+            recorded = self._database.transact(batch, durable=False)
+            self._unused += [blob for blob in recorded.values() if blob.key in self._new]
+            found.update(recorded)
+        return found
+
+    def used(self) -> None:
+        """Note that a transaction that has committed refers to all that was recorded."""
+        self._new.difference_update(blob.key for blob in self._unused)
+        self._unused = []
 
     def take_back(self) -> None:
-        """Remove the objects that no blob names: nobody else knows their keys."""
-        for i in range(0, len(self._new), _BATCH):
-            keys = self._new[i : i + _BATCH]
+        """Forget what was recorded for nothing, and remove objects that no blob names: nobody else knows their keys."""
+        for i in range(0, len(self._unused), _BATCH):
+            ids = [blob.id for blob in self._unused[i : i + _BATCH]]
+            with self._database.write(durable=False) as session:
+                blobs.take_back(session, self._project_id, ids, touched_us=self._recorded_us)
+        new = sorted(self._new)
+        for i in range(0, len(new), _BATCH):
+            keys = new[i : i + _BATCH]
             with self._database.read() as session:
                 known = blobs.known_keys(session, keys)
             self._artifacts.delete(set(keys) - known)

@@ -82,7 +82,7 @@ def _require_room(session: Session, project_id: str, size_bytes: int) -> None:
 
     Uploads into a drive that was committed meanwhile come to nothing, and count nothing.
     """
-    project = session.get_one(Project, project_id, with_for_update=True)
+    project = session.get_one(Project, project_id, with_for_update={"key_share": True})
     still_open = (Upload.project_id == project_id) & ~Upload.is_done & (Upload.expires_us > now_us())
     announced = select(func.count(), func.coalesce(func.sum(Upload.size_bytes), 0)).select_from(Upload)
     announced = announced.join(Drive, Drive.id == Upload.drive_id).where(still_open, Drive.state == DriveState.OPEN)

@@ -13,23 +13,24 @@ from fastapi import Request
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.problems import ProblemItem
 from schemas.parsing import DocumentError, parse_document
+from service.bounded_process import LARGE_BYTES
 from service.context import Context
-from service.errors import ServiceError
+from service.errors import ServiceError, invalid_document
 from service.settings import Settings
 
 Model = TypeVar("Model", bound=BaseModel)
+Value = TypeVar("Value")
 
-LARGE_BYTES = 2_000_000
+BODY = "the request's body"  # what errors call it
 _LARGE_WITHIN_S = 300.0  # 64 MB over 1.7 Mbit/s
 
 
 @dataclass(frozen=True)
-class Body(Generic[Model]):
+class Body(Generic[Value]):
     """A parsed body and the bytes that it came as."""
 
-    value: Model
+    value: Value
     raw: bytes
 
 
@@ -38,19 +39,32 @@ def json_body(
 ) -> Callable[[Request], AsyncIterator[Body[Model]]]:
     """A dependency that reads a JSON body as `model`.
 
-    FastAPI's own parsing would hold a body of any size in memory, and takes NaN and repeated keys. Few large bodies are
-    held at one time, and one of them is parsed and recorded: it takes ten times its size until it is answered.
+    FastAPI's own parsing would hold a body of any size in memory, and takes NaN and repeated keys.
     """
 
-    async def read(request: Request) -> AsyncIterator[Body[Model]]:
+    def parse(context: Context, raw: bytes) -> Model:
+        try:
+            return parse_document(raw, model)
+        except DocumentError as error:
+            raise invalid_document(error, what=BODY) from None
+
+    return parsed_body(parse, max_bytes)
+
+
+def parsed_body(
+    parse: Callable[[Context, bytes], Value], max_bytes: Callable[[Settings], int]
+) -> Callable[[Request], AsyncIterator[Body[Value]]]:
+    """A dependency that reads a body and what `parse`, which may block, makes of it.
+
+    Few large bodies are held at one time, and one of them is parsed and recorded: it takes ten times its size until it
+    is answered.
+    """
+
+    async def read(request: Request) -> AsyncIterator[Body[Value]]:
         context: Context = request.app.state.context
         async with AsyncExitStack() as turns:
             raw = await _read(request, max_bytes(context.settings), context, turns)
-            try:
-                value = await run_in_threadpool(parse_document, raw, model)
-            except DocumentError as error:
-                raise invalid(error, what="the request's body") from None
-            yield Body(value, raw)
+            yield Body(await run_in_threadpool(parse, context, raw), raw)
 
     return read
 
@@ -111,22 +125,12 @@ def _too_large(size: str, max_bytes: int) -> ServiceError:
     )
 
 
-def invalid(error: DocumentError, *, what: str) -> ServiceError:
-    """422 with all defects of a document."""
-    return ServiceError(
-        422,
-        "invalid-document",
-        "The document does not follow its contract",
-        f"{what}: {error}",
-        remedy="Correct the fields that are named; /docs describes every field.",
-        errors=[ProblemItem(field=problem.path, detail=problem.what) for problem in error.problems[:100]],
-    )
-
-
 def request_sha256(request: Request, raw: bytes) -> str:
     """Tells requests apart that are made under one idempotency key."""
     target = f"{request.method} {request.url.path}?{request.url.query}\n"
-    return hashlib.sha256(target.encode() + raw).hexdigest()
+    digest = hashlib.sha256(target.encode())
+    digest.update(raw)
+    return digest.hexdigest()
 
 
 # Models that bodies are parsed as: the OpenAPI page describes them.

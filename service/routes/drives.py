@@ -15,7 +15,9 @@ from schemas.api.resource import Finding, Page
 from schemas.drive import DriveManifest
 from service.context import Context
 from service.errors import ServiceError
-from service.manifest_check import checked_manifest
+from service.manifest_check import checked_manifest, stored_manifest
+from service.manifest_facts import ManifestFacts
+from service.manifest_reading import read_manifest
 from service.persistence import drives
 from service.persistence.collecting import collect_unused
 from service.persistence.drives import Stored
@@ -24,7 +26,7 @@ from service.persistence.idempotency import Answer
 from service.persistence.storing import StoredFile, Storing, storing
 from service.persistence.tables import Blob, Drive, now_us
 from service.routes.answers import gives, problems
-from service.routes.bodies import Body, describe, json_body, json_content
+from service.routes.bodies import BODY, Body, describe, json_content, parsed_body
 from service.routes.dependencies import (
     CallerDep,
     ContextDep,
@@ -40,7 +42,7 @@ from service.uploads.spool import SpoolWriter
 
 router = APIRouter(prefix="/v1/drives", tags=["drives"])
 
-read_manifest = json_body(DriveManifest, lambda settings: settings.max_manifest_bytes)
+read_facts = parsed_body(partial(read_manifest, what=BODY), lambda settings: settings.max_manifest_bytes)
 
 
 @router.post(
@@ -52,11 +54,12 @@ read_manifest = json_body(DriveManifest, lambda settings: settings.max_manifest_
     openapi_extra=describe(DriveManifest),
 )
 async def create_drive(
-    once: OnceDep, caller: CallerDep, context: ContextDep, body: Annotated[Body[DriveManifest], Depends(read_manifest)]
+    once: OnceDep, caller: CallerDep, context: ContextDep, body: Annotated[Body[ManifestFacts], Depends(read_facts)]
 ) -> Response:
     """Create a drive from its manifest, `drive.json`. Then upload the files that it names, and commit."""
 
     def create() -> Response:
+        rows = drives.rows_of(body.value)
         with storing(context.database, context.artifacts, project_id=caller.project_id, durable=True) as store:
             stored = _store_manifest(context, store, body.raw)
 
@@ -65,6 +68,7 @@ async def create_drive(
                     session,
                     project_id=caller.project_id,
                     manifest=body.value,
+                    rows=rows,
                     stored=stored,
                     expires_us=expiry_us(now_us(), context.settings.drive_retention_days),
                 )
@@ -78,7 +82,7 @@ async def create_drive(
 def _store_manifest(context: Context, store: Storing, raw: bytes) -> StoredFile:
     writer = SpoolWriter(context.settings.spool_dir, min_free_bytes=context.settings.min_free_disk_bytes)
     try:
-        spooled = writer.finish(bytearray(raw))
+        spooled = writer.finish(raw)
         return store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
     finally:
         writer.discard()
@@ -110,14 +114,14 @@ def get_drive(drive_id: str, caller: CallerDep, context: ContextDep) -> DriveRes
     "/{drive_id}/manifest",
     response_class=Response,
     summary="Show a drive's manifest",
-    responses={**gives(200, "The manifest", content=json_content(DriveManifest)), **problems(401, 404)},
+    responses={**gives(200, "The manifest", content=json_content(DriveManifest)), **problems(401, 404, 503)},
 )
 def get_drive_manifest(drive_id: str, caller: CallerDep, context: ContextDep) -> Response:
     """The drive's manifest, byte for byte as it was sent."""
     with context.database.read() as session:
         drive = drives.get(session, caller.project_id, drive_id)
         key = session.get_one(Blob, drive.manifest_blob_id).key
-    return Response(context.artifacts.read(key), media_type="application/json")
+    return Response(stored_manifest(context, key), media_type="application/json")
 
 
 @router.delete(
@@ -156,6 +160,8 @@ async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context:
         with context.database.read() as session:
             drive = drives.get(session, caller.project_id, drive_id)
             key = session.get_one(Blob, drive.manifest_blob_id).key
+            if drive.state == DriveState.OPEN:
+                drives.require_complete(session, drive)
         if drive.state == DriveState.OPEN:
             found.extend(checked_manifest(context, key))
             secure_drive(context.database, context.artifacts, drive_id)
@@ -163,6 +169,7 @@ async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context:
     def effect(session: Session) -> Answer:
         drive = drives.get(session, caller.project_id, drive_id, lock=True)
         if any(finding.severity == "error" for finding in found):
+            drives.require_complete(session, drive)  # what is missing is said first; bytes may prove to be lost
             raise rejected(drive_id, found)
         job = drives.commit(
             session,

@@ -7,15 +7,17 @@ from contextlib import contextmanager, nullcontext
 
 import anyio.from_thread
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from schemas.api.drives import DriveFileResource, StoredFiles
 from schemas.parsing import DocumentError, parse_json
+from service.bounded_process import LARGE_BYTES
 from service.context import Context
 from service.errors import ServiceError
+from service.manifest_check import stored_manifest
 from service.persistence import blobs, drives, slots
 from service.persistence.storing import storing
 from service.persistence.tables import Blob, DriveFile, Project
-from service.routes.bodies import LARGE_BYTES
 from service.uploads.archive import unpack
 from service.uploads.archive_limits import ArchiveLimits
 from service.uploads.images import check_image
@@ -90,9 +92,12 @@ def keep_file(
         raise
     with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
         stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
-        with context.database.write(durable=False) as session:  # the drive's commit makes it so
+
+        def record(session: Session) -> tuple[slots.Slot, blobs.Recorded | None]:
             slot = slots.find(session, project_id, drive_id, path, lock=True)
-            blob = slots.fill(session, slot, stored, replace=replace)
+            return slot, slots.fill(session, slot, stored, replace=replace)
+
+        slot, blob = context.database.transact(record, durable=False)  # the drive's commit makes it so
         if blob is not None:
             store.recorded(blob.key)
     return blob is not None, DriveFileResource.model_validate(
@@ -110,7 +115,7 @@ def keep_archive(context: Context, project_id: str, drive_id: str, archive: Spoo
     unpacked = unpack(
         archive.path,
         expected,
-        same_manifest=lambda raw: _same_manifest(context, raw, context.artifacts.read(manifest_key)),
+        same_manifest=lambda raw: _same_manifest(context, raw, stored_manifest(context, manifest_key)),
         folder=settings.spool_dir,
         limits=ArchiveLimits(
             max_entries=3 * len(expected) + 1000,
@@ -135,13 +140,21 @@ def _keep_all(
             (name, store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes))
             for name, spooled in unpacked
         ]
-        with context.database.write() as session:
+        # An archive may hold a hundred thousand files, and in SQLite all others who write wait for each transaction:
+        # what takes long comes before the one that lets all files appear together.
+        recorded = store.record([file for _, file in stored])
+        blob_ids = {name: recorded[file.sha256].id for name, file in stored}
+
+        def fill(session: Session) -> None:
             drive = drives.get(session, project_id, drive_id, lock=True)
-            for name, file in stored:
-                slot = slots.find(session, project_id, drive_id, name)
-                slots.fill(session, slot, file, replace=replace)
-            count = drives.stored_of(session, [drive_id])[drive_id].files
-            return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
+            slots.fill_all(session, drive, blob_ids, replace=replace)
+
+        context.database.transact(fill)
+        store.used()
+    with context.database.read() as session:
+        drive = drives.get(session, project_id, drive_id)
+        count = drives.stored_of(session, [drive_id])[drive_id].files
+    return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
 
 
 def _same_manifest(context: Context, raw: bytes, stored: bytes) -> bool:

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,15 @@ def page(api: Api) -> dict[str, Any]:
     """The OpenAPI page."""
     with api.anonymous() as client:
         return dict(client.get("/openapi.json").json())
+
+
+@pytest.fixture(scope="session")
+def postgres_api(tmp_path_factory: pytest.TempPathFactory, postgres_url: str) -> Iterator[Api]:
+    """As `api`, over PostgreSQL."""
+    with _postgres_database(postgres_url) as url:
+        settings = settings_of(tmp_path_factory.mktemp("postgres-api"), database_url=url)
+        with api_in_thread(settings) as running:
+            yield running
 
 
 @pytest.fixture
@@ -98,11 +107,16 @@ def database_settings(request: pytest.FixtureRequest, tmp_path: Path) -> Iterato
     if request.param == "sqlite":
         yield settings_of(tmp_path)
         return
-    server = request.getfixturevalue("postgres_url")
+    with _postgres_database(request.getfixturevalue("postgres_url")) as url:
+        yield settings_of(tmp_path, database_url=url)
+
+
+@contextmanager
+def _postgres_database(server: str) -> Iterator[str]:
+    """URL of an empty database."""
     name = new_id("t")
     _on_server(server, f'CREATE DATABASE "{name}"')
-    url = make_url(server).set(database=name).render_as_string(hide_password=False)
-    yield settings_of(tmp_path, database_url=url)
+    yield make_url(server).set(database=name).render_as_string(hide_password=False)
     _on_server(server, f'DROP DATABASE "{name}" WITH (FORCE)')
 
 

@@ -13,6 +13,7 @@ import pytest
 from schemas.api.resource import Finding
 from service import manifest_check
 from service.persistence import jobs
+from service.persistence.tables import Blob, Drive
 from tests.service.conftest import StartApi
 from tests.service.live_api import Api, Client, problem_of, wait_until
 from tests.service.tiny_drive import manifest, tiny_drive
@@ -90,6 +91,26 @@ def test_a_commit_lists_the_missing_files(client: Client) -> None:
     assert [item["field"] for item in problem["errors"]] == rest
     assert "5 of 6 files" in problem["detail"]
     assert client.get(f"/v1/drives/{drive_id}").json()["state"] == "OPEN"
+
+
+def test_what_is_missing_is_said_before_what_the_manifest_has_wrong(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive_id = client.create()
+    monkeypatch.setattr(manifest_check, "_COMMAND", ("/no/such/python",))  # nothing is checked before
+    problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 409, "drive-incomplete")
+
+
+def test_a_manifest_that_the_store_misses(client: Client) -> None:
+    drive_id = client.filled()
+    with client.api.database.read() as session:
+        key = session.get_one(Blob, session.get_one(Drive, drive_id).manifest_blob_id).key
+    client.api.context.artifacts.delete([key])
+    problem_of(client.get(f"/v1/drives/{drive_id}/manifest"), 503, "store-unavailable")
+    problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 503, "store-unavailable")
+    manifest = {"drive.json": tiny_drive().raw}
+    archive = client.put(f"/v1/drives/{drive_id}/archive", content=tiny_drive().zipped(**manifest))
+    problem_of(archive, 503, "store-unavailable")
 
 
 def test_a_committed_drive_is_frozen(client: Client) -> None:
@@ -208,15 +229,14 @@ def test_names_that_no_folder_can_hold_are_refused(client: Client, image: str, m
     assert client.api.objects(client.project_id) == [], "nothing of it stays"
 
 
-LARGE = tiny_drive(frames=20_000).raw
-
-
 @pytest.mark.parametrize(("bound", "value"), [("_MEMORY_MB", 1), ("_TIMEOUT_S", 0.05)])
 def test_a_manifest_whose_check_costs_too_much_has_to_be_split(
     client: Client, monkeypatch: pytest.MonkeyPatch, bound: str, value: float
 ) -> None:
+    drive = tiny_drive()
+    drive_id = client.post("/v1/drives", content=drive.raw + b" " * 3_000_000).json()["id"]
+    assert client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped()).is_success
     monkeypatch.setattr(manifest_check, bound, value)
-    drive_id = client.post("/v1/drives", content=LARGE).json()["id"]
     problem = problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 422, "manifest-too-large")
     assert "Split the drive" in problem["remedy"]
     assert client.get(f"/v1/drives/{drive_id}").json()["state"] == "OPEN"

@@ -6,17 +6,29 @@ import base64
 import hashlib
 import json
 import threading
+from collections.abc import Sequence
+from typing import Any
 from urllib.parse import quote
 
 import httpx
 import pytest
+from sqlalchemy import event
 
+from service.persistence.blobs import Recorded
+from service.persistence.storing import StoredFile, Storing
 from tests.service.live_api import Api, Client, forget_all, problem_of
 from tests.service.tiny_drive import TinyDrive, png, png_of, tiny_drive, zip_of
 
 
 def digest(data: bytes) -> str:
     return f"sha-256=:{base64.b64encode(hashlib.sha256(data).digest()).decode()}:"
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def api(request: pytest.FixtureRequest, api: Api) -> Api:
+    """One over each database."""
+    served: Api = api if request.param == "sqlite" else request.getfixturevalue("postgres_api")
+    return served
 
 
 @pytest.fixture
@@ -171,6 +183,54 @@ def test_an_archive_brings_all_files(client: Client, drive: TinyDrive, drive_id:
     again = client.put(f"/v1/drives/{drive_id}/archive", content=content, headers={"Content-Digest": digest(content)})
     assert again.status_code == 200
     assert client.api.spooled() == []
+
+
+def test_an_archive_of_many_files_lets_others_write_in_between(api: Api, client: Client) -> None:
+    drive = tiny_drive(seed="many", frames=800)
+    drive_id = client.create(drive)
+    statements = [0]
+
+    def begun(connection: Any) -> None:
+        statements.append(0)
+
+    def executed(*given: Any) -> None:
+        statements[-1] += 1
+
+    engine = api.context.database.engine
+    event.listen(engine, "begin", begun)
+    event.listen(engine, "after_cursor_execute", executed)
+    try:
+        answer = client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped())
+    finally:
+        event.remove(engine, "begin", begun)
+        event.remove(engine, "after_cursor_execute", executed)
+    assert answer.json() == {"stored": 1600, "files_stored": 1600, "files_expected": 1600}
+    assert max(statements) < 20, "of one transaction"
+
+
+def test_what_an_archive_was_refused_for_stays_with_others(api: Api, client: Client) -> None:
+    """What it recorded before is forgotten, but not what another drive has begun to use."""
+    drive = tiny_drive(seed="shared")
+    mine, others = client.create(drive), client.create(drive)
+    used_bytes = api.project(client.project_id).used_bytes
+    path, *_, last = sorted(drive.files)
+    put(client, mine, last, png(seed="in the way"))
+    way_bytes = len(png(seed="in the way"))
+    record, found = Storing.record, []
+
+    def record_and_send(self: Storing, files: Sequence[StoredFile]) -> dict[str, Recorded]:
+        recorded = record(self, files)
+        found.append(put(client, others, path, drive.files[path]).status_code)
+        return recorded
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Storing, "record", record_and_send)
+        problem_of(client.put(f"/v1/drives/{mine}/archive", content=drive.zipped()), 409, "file-exists")
+    assert found == [201]
+    assert api.project(client.project_id).used_bytes == used_bytes + way_bytes + len(drive.files[path])
+    names = sorted(file.name[:64] for file in api.objects(client.project_id))
+    kept = [drive.raw, png(seed="in the way"), drive.files[path]]
+    assert names == sorted(hashlib.sha256(data).hexdigest() for data in kept)
 
 
 def test_an_archive_with_one_conflict_changes_nothing(client: Client, drive: TinyDrive, drive_id: str) -> None:

@@ -19,6 +19,7 @@ from sqlalchemy import update
 
 from service.app import sweep_uploads
 from service.persistence import durability
+from service.persistence import uploads as upload_records
 from service.persistence.tables import Drive, Upload, now_us
 from service.routes import upload_writing
 from service.uploads.resumable import PartialFile, sweep
@@ -328,6 +329,15 @@ def begun(client: Client, method: str, url: str, **headers: str) -> tuple[int, b
         return answer.status, answer.read()
     finally:
         connection.close()
+
+
+def test_the_quota_of_open_uploads(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(upload_records, "MAX_OPEN", 2)
+    drive_id = client.create()
+    urls = [create(client, drive_id, 100, path=PATH).headers["location"] for _ in range(2)]
+    problem_of(create(client, drive_id, 100, path=PATH), 429, "too-many-uploads")
+    assert client.delete(urls[0], headers=VERSION).status_code == 204
+    assert create(client, drive_id, 100, path=PATH).status_code == 201
 
 
 @pytest.mark.parametrize("method", ["PATCH", "HEAD"])

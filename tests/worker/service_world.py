@@ -16,6 +16,7 @@ import psutil
 from schemas.api.jobs import JobKind
 from schemas.parsing import parse_manifest
 from service import broker
+from service.manifest_facts import facts_of
 from service.persistence import drives, jobs, slots
 from service.persistence.artifacts import ArtifactStore
 from service.persistence.database import Database, migrate
@@ -181,12 +182,17 @@ class World:
 
     def add_unchecked_drive(self, folder: Path) -> tuple[str, str]:
         """Store a drive; its id, and that of the job that checks it."""
-        manifest = parse_manifest((folder / "drive.json").read_bytes())
+        manifest = facts_of(parse_manifest((folder / "drive.json").read_bytes()))
         stored = self._store(folder / "drive.json")
-        files = {path: self._store(folder / path) for path in drives.files_of(manifest)}
+        files = {path: self._store(folder / path) for path, _ in manifest.files}
         with self.database.write() as session:
             drive = drives.create(
-                session, project_id=self.project_id, manifest=manifest, stored=stored, expires_us=None
+                session,
+                project_id=self.project_id,
+                manifest=manifest,
+                rows=drives.rows_of(manifest),
+                stored=stored,
+                expires_us=None,
             )
             for path, file in files.items():
                 slots.fill(session, slots.find(session, self.project_id, drive.id, path), file, replace=False)

@@ -1,0 +1,77 @@
+"""Programs that read documents from outside, each in a process of its own.
+
+A monstrous document can take down nothing but the process that reads it, and the memory that it took is given back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+LARGE_BYTES = 2_000_000  # beyond, one document is read at a time
+
+_one_large = threading.Lock()
+# Of the environment a program gets what it runs with; the rest may hold the API's secrets.
+_KEPT = frozenset({"PATH", "HOME", "USER", "LANG", "TZ", "LD_LIBRARY_PATH", "VIRTUAL_ENV"})
+_KEPT_PREFIXES = ("LC_", "PYTHON", "PROJ_", "XDG_")
+# How a process ends that is refused memory: by its own allocator, or by the system.
+_OUT_OF_MEMORY = frozenset({-signal.SIGABRT, -signal.SIGSEGV, -signal.SIGKILL})
+
+
+class TooCostlyError(Exception):
+    """The program was refused memory, or took too long."""
+
+
+def run_on_document(
+    command: Sequence[str],
+    *,
+    size_bytes: int,
+    folder: Path,
+    timeout_s: float,
+    given: bytes = b"",
+) -> subprocess.CompletedProcess[bytes]:
+    """The ended program. It bounds its memory itself; large documents wait for each other.
+
+    Parameters
+    ----------
+    size_bytes
+        Of the document.
+    folder
+        Where it runs.
+    given
+        Its standard input.
+
+    Raises
+    ------
+    TooCostlyError
+        Where it took too much memory or time.
+    OSError
+        Where it cannot be started.
+    """
+    kept = {name: value for name, value in os.environ.items() if name in _KEPT or name.startswith(_KEPT_PREFIXES)}
+    with _one_large if size_bytes > LARGE_BYTES else contextlib.nullcontext():
+        try:
+            done = subprocess.run(
+                command,
+                cwd=folder,
+                env=kept,
+                input=given,
+                capture_output=True,
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise TooCostlyError from None
+    if done.returncode in _OUT_OF_MEMORY or b"MemoryError" in done.stderr:
+        raise TooCostlyError
+    return done
+
+
+def end_of_log(done: subprocess.CompletedProcess[bytes]) -> str:
+    """The last that an ended program said."""
+    return done.stderr[-2000:].decode(errors="replace")
