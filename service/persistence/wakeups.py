@@ -9,16 +9,16 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from typing import Any
-
-import redis
-from celery import Celery
-from redis.backoff import NoBackoff
-from redis.retry import Retry
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 from schemas.api.jobs import JobKind
 from service.persistence.tables import Job
 from service.settings import Settings
+
+if TYPE_CHECKING:
+    import redis
+    from celery import Celery
 
 TASK = "mrasfm.run_job"
 QUEUES = {
@@ -65,19 +65,27 @@ def celery_options(settings: Settings) -> dict[str, Any]:
 class Wakeups:
     """Sends messages, and sees which are waiting.
 
-    Every method raises `BrokerError` within seconds where the broker does not answer.
+    Every method raises `BrokerError` within seconds where the broker does not answer. What speaks to the broker takes
+    17 MB, and is loaded with the first message: processes that only take uploads send none.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._celery = Celery("mrasfm", set_as_current=False)
-        self._celery.conf.update(celery_options(settings))
-        self._celery.conf.broker_transport_options |= {
+        self._options = celery_options(settings)
+        self._url = self._options["broker_url"]
+        self._silent_until_s = -math.inf
+
+    @cached_property
+    def _celery(self) -> Celery:
+        from celery import Celery
+
+        app = Celery("mrasfm", set_as_current=False)
+        app.conf.update(self._options)
+        app.conf.broker_transport_options |= {
             "socket_timeout": _ANSWER_WITHIN_S,
             "retry_on_timeout": False,
             "max_retries": 0,
         }
-        self._url = self._celery.conf.broker_url
-        self._silent_until_s = -math.inf
+        return app
 
     def send(self, jobs: list[Job]) -> None:
         """Wake a worker up for each of the jobs."""
@@ -105,23 +113,31 @@ class Wakeups:
 
         Reads kombu's keys: lists named as the queues, and the hash `unacked`.
         """
+        from redis import RedisError
+
         try:
             with self._client() as client:
                 queued = [item for queue in set(QUEUES.values()) for item in client.lrange(queue, 0, -1)]
                 delivered = client.hvals("unacked")
-        except redis.RedisError as error:
+        except RedisError as error:
             raise BrokerError(str(error)) from error
         return set(_ids(queued, delivered))
 
     def require_broker(self) -> None:
         """Ask whether the broker answers."""
+        from redis import RedisError
+
         try:
             with self._client() as client:
                 client.ping()
-        except redis.RedisError as error:
+        except RedisError as error:
             raise BrokerError(str(error)) from error
 
     def _client(self) -> redis.Redis:
+        import redis
+        from redis.backoff import NoBackoff
+        from redis.retry import Retry
+
         if not self._url:
             raise BrokerError("no broker is configured")
         url = self._url.replace("redis+socket://", "unix://").replace("virtual_host=", "db=")

@@ -210,7 +210,10 @@ def test_a_deadlock_is_no_error(database: Database, project_id: str, database_se
         database.transact(work)
 
     assert in_threads(lambda: rename(project_id, other_id), lambda: rename(other_id, project_id)) == []
-    assert len(runs) == (2 if database.engine.dialect.name == "sqlite" else 3)
+    if database.engine.dialect.name == "sqlite":
+        assert len(runs) == 2
+    else:
+        assert len(runs) >= 3, "both may be ended, where both look for deadlocks at one moment"
     with database.read() as session:
         before, after = database_settings.project_max_drives, session.get_one(Project, other_id).max_drives
     assert after == before + 2
