@@ -5,17 +5,16 @@ A monstrous document can take down nothing but the process that reads it, and th
 
 from __future__ import annotations
 
-import contextlib
+import fcntl
 import os
 import signal
 import subprocess
-import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 LARGE_BYTES = 2_000_000  # beyond, one document is read at a time
 
-_one_large = threading.Lock()
 # Of the environment a program gets what it runs with; the rest may hold the API's secrets.
 _KEPT = frozenset({"PATH", "HOME", "USER", "LANG", "TZ", "LD_LIBRARY_PATH", "VIRTUAL_ENV"})
 _KEPT_PREFIXES = ("LC_", "PYTHON", "PROJ_", "XDG_")
@@ -42,7 +41,7 @@ def run_on_document(
     size_bytes
         Of the document.
     folder
-        Where it runs.
+        Where it runs; the API's processes that share it take turns.
     given
         Its standard input.
 
@@ -54,7 +53,7 @@ def run_on_document(
         Where it cannot be started.
     """
     kept = {name: value for name, value in os.environ.items() if name in _KEPT or name.startswith(_KEPT_PREFIXES)}
-    with _one_large if size_bytes > LARGE_BYTES else contextlib.nullcontext():
+    with _turn(folder) if size_bytes > LARGE_BYTES else nullcontext():
         try:
             done = subprocess.run(
                 command,
@@ -70,6 +69,17 @@ def run_on_document(
     if done.returncode in _OUT_OF_MEMORY or b"MemoryError" in done.stderr:
         raise TooCostlyError
     return done
+
+
+@contextmanager
+def _turn(folder: Path) -> Iterator[None]:
+    """One at a time of all processes: a lock of the folder, which ends with whoever holds it."""
+    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
 
 
 def end_of_log(done: subprocess.CompletedProcess[bytes]) -> str:
