@@ -318,6 +318,7 @@ def test_a_disk_that_is_full(small_disk: Path) -> None:
         assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
 
 
+@pytest.mark.slow
 def test_a_kill_in_the_middle_of_an_upload(tmp_path: Path) -> None:
     """What was accepted is there; what was not can be sent again; what was left is swept."""
     drive = tiny_drive()

@@ -95,6 +95,7 @@ def test_a_reader_that_cannot_run_is_the_services_fault(
     problem_of(client.post("/v1/drives", content=LARGE), 503, "check-failed")
 
 
+@pytest.mark.slow
 def test_a_large_manifest_leaves_the_memory_to_others(tmp_path: Path) -> None:
     """To parse it takes twenty times its size."""
     raw = tiny_drive(frames=20_000).raw

@@ -418,6 +418,7 @@ threading.Thread(target=server.serve_forever, daemon=True).start()
 """
 
 
+@pytest.mark.slow
 def test_a_child_that_hangs_is_killed_and_starts_again(world: World) -> None:
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))

@@ -140,6 +140,7 @@ def test_unknown_setting(small_drive: Path, scratch: Path, settings: Settings) -
     assert "gravity" in outcome.what
 
 
+@pytest.mark.slow
 def test_models_are_looked_for_where_the_worker_says(
     small_drive: Path, scratch: Path, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -134,6 +134,7 @@ def test_reconstruction_asked_for_while_the_broker_is_down(
         assert [scene["job_id"] for scene in client.get("/v1/scenes").json()["items"]] == [job_id]
 
 
+@pytest.mark.slow
 def test_store_that_is_not_to_be_had(world: World, brief_drive: Path, tmp_path: Path) -> None:
     """A worker without it leaves jobs to the others, and works as soon as it has it."""
     mount = tmp_path / "mount"

@@ -50,6 +50,7 @@ def test_stage_is_killed(world: World, brief_drive: Path) -> None:
     assert_one_scene(world, job_id, ["out-of-memory", "succeeded"])
 
 
+@pytest.mark.slow
 def test_worker_is_killed(world: World, brief_drive: Path, tmp_path: Path) -> None:
     """Main process alone: what it started dies with it, and another machine goes on after the last finished stage."""
     first = world.start_worker()
@@ -107,6 +108,7 @@ def test_worker_that_is_started_again_ends_the_lease(make_world: Callable[..., W
     assert_one_scene(world, job_id, ["worker-lost", "succeeded"])
 
 
+@pytest.mark.slow
 def test_pool_process_is_killed(make_world: Callable[..., World], brief_drive: Path) -> None:
     """The message comes back at once and finds the lease; the process that takes the dead one's place ends it.
 

@@ -131,6 +131,7 @@ def test_delivered_message_is_not_sent_again(world: World, brief_drive: Path) ->
     child.kill()
 
 
+@pytest.mark.slow
 def test_broker_that_is_away(world: World, brief_drive: Path) -> None:
     """Accepted meanwhile, and run after its return: a worker and a reconciler have waited for it."""
     world.start_worker()
