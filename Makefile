@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 ACCEPTANCE ?=
 
-.PHONY: help setup demo test check acceptance lock schema clean
+.PHONY: help setup demo test check docs acceptance lock schema clean
 
 help: ## what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -23,15 +23,19 @@ demo: setup ## render two drives of a street, get their scenes and the map of bo
 	$(BIN)/mrasfm demo --out demo
 
 test: setup ## the fast suite and one real drive
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder
 
-check: setup ## lint, types, import contracts
+check: setup ## lint, types, import contracts, links and generated pages of the documentation
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.documentation --check
 
-acceptance: setup ## every figure that the README claims, as a table (real drives needed; ACCEPTANCE="--only 1,2", ACCEPTANCE=--thorough)
+docs: setup ## rewrite the generated pages of docs/
+	$(BIN)/python -m tests.documentation
+
+acceptance: setup ## every figure of README.md and docs/, as a table (real drives needed; ACCEPTANCE="--only 1,2", ACCEPTANCE=--thorough)
 	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)
 
 lock: ## renew the locks from pyproject.toml: all, and what the container image needs (needs uv)

@@ -10,24 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mrasfm_engine import stages
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
 from mrasfm_engine.errors import CancelledError, InputError, ReconstructionError
 from mrasfm_engine.evaluation.pose_errors import TOLERANCE_US, PoseErrors, compare_scene
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, match_timestamps
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.stage_store import Arrays, StageStore
 from mrasfm_engine.io.trajectory_file import Trajectory
-from mrasfm_engine.registration import incremental
+from mrasfm_engine.mapping import incremental_mapping
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 FULL = "full"
 WARM_UP_UNITS = 5
@@ -248,7 +244,9 @@ def warm_up(
     poses = None if prior.world_from_rig is None else prior.world_from_rig[:WARM_UP_UNITS]
     pairs = [p for p in matches if p.image_b < images]
     try:
-        incremental.map_units(few, Keypoints.of(few, features[:images]), pairs, poses, run.config, cancel=run.cancel)
+        incremental_mapping.map_units(
+            few, Keypoints.of(few, features[:images]), pairs, poses, run.config, cancel=run.cancel
+        )
     except CancelledError:
         raise
     except ReconstructionError:

@@ -12,18 +12,23 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one subcommand.
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `mrasfm` with all subcommands.
 
     Subcommands are modules of the entry-point group `mrasfm.commands` with a function
     `register(subparsers)` that adds a parser whose default `run` takes the parsed arguments.
     """
     parser = argparse.ArgumentParser(prog="mrasfm", description="Multi-camera drives to metric maps.")
-    parser.add_argument("--version", action="version", version=version("mrasfm"))
+    parser.add_argument("--version", action="version", version=version("mrasfm"), help="print the version and exit")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for entry in sorted(entry_points(group="mrasfm.commands"), key=lambda entry: entry.name):
         entry.load().register(subparsers)
-    arguments = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one subcommand."""
+    arguments = build_parser().parse_args(argv)
     try:
         return int(arguments.run(arguments) or 0)
     except CancelledError as error:

@@ -18,7 +18,7 @@ from numba.core import event
 
 @dataclass
 class Compilation:
-    """What was compiled while it was watched; functions that were found compiled do not count."""
+    """Record of the functions compiled while watched; functions from the cache do not count."""
 
     functions: int = 0
     seconds: float = 0.0

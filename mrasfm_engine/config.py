@@ -1,4 +1,4 @@
-"""Settings of the engine, one comment a field. `--config FILE` takes a TOML file with the same sections and names."""
+"""Settings of the engine. `--config FILE` takes a TOML file with the same sections and names."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ Threshold = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
 
+def _available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -24,124 +28,223 @@ class _Section(BaseModel):
 class FeatureConfig(_Section):
     """Extraction of keypoints."""
 
-    extractor: Literal["sift", "superpoint", "aliked", "xfeat"] = "sift"  # all but SIFT need a model
-    model: str | None = None  # name of the model, see `mrasfm models list`; the extractor's usual one if not given
-    min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's keypoints; the usual if not given
-    max_keypoints: Count = 2048  # a image; 1024 costs accuracy
-    spread: bool = True  # a network's keypoints are taken all over the image first; false: the strongest wherever
-    refine: bool = True  # xfeat: keypoints are moved to the nearest detail, those without one are dropped
-    contrast_threshold: Positive = 0.02  # half of SIFT's usual value, so that asphalt and shade yield keypoints too
-    class_margin_px: Annotated[int, Field(ge=0)] = 2  # keypoints nearer to the border of a class in the mask have none
-    max_side_px: Count = 1600  # larger images are extracted at reduced size; coordinates stay those of the full image
+    extractor: Literal["sift", "superpoint", "aliked", "xfeat"] = Field(
+        "sift", description="every extractor but `sift` needs a model, see `mrasfm models list`"
+    )
+    model: str | None = Field(
+        None, description="name of the extractor's model; by default the usual one of the extractor"
+    )
+    min_score: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None, description="lowest score of a network's keypoints; by default the model's usual one"
+    )
+    max_keypoints: Count = Field(2048, description="per image; 1024 costs accuracy")
+    spread: bool = Field(
+        True,
+        description="a network's keypoints are taken all over the image first; `false` takes the strongest",
+    )
+    refine: bool = Field(
+        True, description="`xfeat`: keypoints move to the nearest detail, and those without one are dropped"
+    )
+    contrast_threshold: Positive = Field(
+        0.02, description="of SIFT; half of its usual value, so that asphalt and shade yield keypoints too"
+    )
+    class_margin_px: Annotated[int, Field(ge=0)] = Field(
+        2, description="keypoints nearer than this to the border of a class in the mask have no class"
+    )
+    max_side_px: Count = Field(
+        1600, description="larger images are extracted at reduced size; coordinates stay those of the full image"
+    )
 
 
 class PairConfig(_Section):
-    """Which image pairs are matched."""
+    """Selection of the image pairs that are matched."""
 
-    selection: bool = True  # by overlap of views; false: all images of units at most window_units apart
-    window_units: Count = 4  # without a prior: how many following units a camera is matched with
-    cross_window_units: Annotated[int, Field(ge=0)] = 2  # the same across cameras that look in similar directions
-    pairs_per_image: Count = 16  # with a prior: best pairs by overlap an image
-    max_depth_m: Positive = 50.0  # viewing frustums end here
-    max_view_angle_deg: Positive = 75.0  # between optical axes
-    min_overlap: Share = 0.08  # fraction of one image's frustum samples seen by the other
-    revisit_pairs_per_unit: Annotated[int, Field(ge=0)] = 3  # without a prior: similar units outside the window
+    selection: bool = Field(
+        True,
+        description="pairs are selected by overlap; `false` matches all images of units at most `window_units` apart",
+    )
+    window_units: Count = Field(
+        4, description="without a prior trajectory: number of following units that a camera is matched with"
+    )
+    cross_window_units: Annotated[int, Field(ge=0)] = Field(
+        2, description="the same across cameras that look in similar directions"
+    )
+    pairs_per_image: Count = Field(16, description="with GNSS or rough poses: the pairs of largest overlap per image")
+    max_depth_m: Positive = Field(50.0, description="viewing frustums end here")
+    max_view_angle_deg: Positive = Field(75.0, description="largest angle between optical axes")
+    min_overlap: Share = Field(
+        0.08, description="smallest share of one image's frustum samples that the other image sees"
+    )
+    revisit_pairs_per_unit: Annotated[int, Field(ge=0)] = Field(
+        3, description="without a prior trajectory: similar units outside the window"
+    )
 
 
 class MatchConfig(_Section):
-    """Matching of image pairs and its verification."""
+    """Matching of image pairs and verification of the matches."""
 
-    matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] = "nearest"  # all but nearest need a model
-    model: str | None = None  # name of the model; the usual one for the extractor if not given
-    max_keypoints: Count = 1024  # first of an image that a network matches: time grows with the square
-    min_score: Annotated[float, Field(ge=0, le=1)] | None = None  # of a network's matches; the usual if not given
-    ratio: Share = 0.8  # nearest: of the distances to the best and second best descriptor
-    min_matches: Count = 15  # pairs with fewer matches or inliers are dropped
-    same_class: bool = True  # drop matches whose ends lie on different classes of the masks
-    max_error_px: Positive = 2.0  # epipolar distance of an inlier
-    calibration_error_px: Positive = 8.0  # the same between cameras of one unit, where calibration gives the geometry
+    matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] = Field(
+        "nearest", description="every matcher but `nearest` needs a model, see `mrasfm models list`"
+    )
+    model: str | None = Field(
+        None, description="name of the matcher's model; by default the usual one for the extractor"
+    )
+    max_keypoints: Count = Field(
+        1024, description="number of an image's first keypoints that a network matches; time grows with its square"
+    )
+    min_score: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None, description="lowest score of a network's matches; by default the model's usual one"
+    )
+    ratio: Share = Field(
+        0.8, description="`nearest`: largest ratio of the distances to the best and the second best descriptor"
+    )
+    min_matches: Count = Field(15, description="pairs with fewer matches or fewer inliers are dropped")
+    same_class: bool = Field(True, description="matches between different classes of the masks are dropped")
+    max_error_px: Positive = Field(2.0, description="largest epipolar distance of an inlier")
+    calibration_error_px: Positive = Field(
+        8.0, description="the same between cameras of one unit, where the calibration gives the geometry"
+    )
 
 
 class MappingConfig(_Section):
-    """The incremental loop."""
+    """Incremental mapping."""
 
-    camera_set_registration: bool = True  # false: every image by its own PnP, as without a rig; for comparison
-    keyframe_motion_px: Threshold = 2.0  # units whose keypoints moved less are registered at the end; 0: map with all
-    motion_compensation: bool = True  # images (and rows, where a readout time is declared) are posed at their own times
-    max_error_px: Positive = 4.0  # reprojection error of an observation while poses still settle
-    filter_error_px: Positive = 3.0  # and in the final scene
-    min_angle_deg: Positive = 1.0  # of a point's rays; below it depth is mostly noise
-    min_pnp_inliers: Count = 20  # of a unit over all its cameras
-    min_pnp_inlier_ratio: Share = 0.2
-    local_units: Count = 6  # units that vary in local adjustment
-    local_every: Count = 2  # registered units between local adjustments
-    pose_observations: int = Field(default=400, ge=0)  # of an image, for its pose while the scene grows; 0: all
-    semantic_triangulation: bool = True  # points of the road that are off its surface are dropped
-    road_patch_m: Positive = 8.0  # radius of a plane patch of the road's surface
-    road_sigmas: Positive = 3.0  # how far from the surface a point of the road may be, in its own uncertainty
-    road_max_offset_m: Positive = 0.05  # farther ones are dropped however uncertain they are, except on rough roads
-    global_growth: Positive = 0.4  # global adjustment when this fraction of units was registered since the last
+    camera_set_registration: bool = Field(
+        True, description="`false` registers every image by its own PnP, as without a rig; for comparison"
+    )
+    keyframe_motion_px: Threshold = Field(
+        2.0, description="units whose keypoints moved less are registered in the finished scene; 0 maps with all units"
+    )
+    motion_compensation: bool = Field(
+        True, description="images, and rows where a readout time is declared, are posed at their own times"
+    )
+    max_error_px: Positive = Field(
+        4.0, description="largest reprojection error of an observation while the scene grows"
+    )
+    filter_error_px: Positive = Field(
+        3.0, description="largest reprojection error of an observation in the finished scene"
+    )
+    min_angle_deg: Positive = Field(
+        1.0, description="smallest angle between a point's rays; below it depth is mostly noise"
+    )
+    min_pnp_inliers: Count = Field(20, description="of a unit, over all its cameras")
+    min_pnp_inlier_ratio: Share = Field(0.2, description="of a unit, over all its cameras")
+    local_units: Count = Field(6, description="units that vary in local adjustment")
+    local_every: Count = Field(2, description="registered units between two local adjustments")
+    pose_observations: Annotated[int, Field(ge=0)] = Field(
+        400, description="observations of an image that its pose uses while the scene grows; 0 uses all"
+    )
+    semantic_triangulation: bool = Field(True, description="points of the road that are off its surface are dropped")
+    road_patch_m: Positive = Field(8.0, description="radius of a plane patch of the road's surface")
+    road_sigmas: Positive = Field(
+        3.0, description="largest distance of a road point from the surface, in standard deviations of the point"
+    )
+    road_max_offset_m: Positive = Field(
+        0.05, description="points farther off are dropped however uncertain they are, except on rough roads"
+    )
+    global_growth: Positive = Field(
+        0.4, description="global adjustment runs when this share of units was registered since the last"
+    )
 
 
 class AdjustmentConfig(_Section):
     """Camera set bundle adjustment."""
 
-    camera_set_adjustment: bool = True  # false: every image is adjusted on its own, as without a rig
-    priors: bool = True  # of calibration, positions and gravity; without them GNSS aligns the scene and does no more
-    loss_scale: Positive = 2.0  # of the Cauchy loss, in standard deviations of an observation
-    sigma_rotation_deg: Positive = 2.0  # prior of rig_from_cam where the manifest gives none
-    sigma_translation_m: Positive = 0.05
-    sigma_focal: Positive = 0.002  # prior of a focal length relative to itself, where focal lengths vary
-    refine_calibration: bool = True  # rig_from_cam, where motion or GNSS make it observable
-    refine_focal: bool = False  # one factor for fx and fy a camera, with its prior, where rig_from_cam varies too
-    min_heading_change_deg: Positive = 15.0  # without GNSS, calibration is held on straighter drives
-    max_scale_sigma: Positive = 0.1  # calibration is held where freeing it would leave scale more uncertain than this
+    camera_set_adjustment: bool = Field(
+        True, description="`false` adjusts every image on its own, as without a rig; for comparison"
+    )
+    priors: bool = Field(
+        True, description="of calibration, positions and gravity; without them GNSS aligns the scene and does no more"
+    )
+    loss_scale: Positive = Field(2.0, description="of the Cauchy loss, in standard deviations of an observation")
+    sigma_rotation_deg: Positive = Field(2.0, description="prior of `rig_from_cam` where the manifest declares none")
+    sigma_translation_m: Positive = Field(0.05, description="prior of `rig_from_cam` where the manifest declares none")
+    sigma_focal: Positive = Field(
+        0.002, description="prior of a focal length relative to itself, where focal lengths vary"
+    )
+    refine_calibration: bool = Field(True, description="`rig_from_cam` varies where motion or GNSS make it observable")
+    refine_focal: bool = Field(
+        False,
+        description="one factor for fx and fy of each camera varies, with its prior, where `rig_from_cam` varies too",
+    )
+    min_heading_change_deg: Positive = Field(15.0, description="without GNSS, calibration is held on straighter drives")
+    max_scale_sigma: Positive = Field(
+        0.1, description="calibration is held where freeing it would leave the scale more uncertain than this"
+    )
 
 
 class GnssConfig(_Section):
     """Use of the receiver's positions."""
 
-    correlation_time_s: Positive = 1.0  # samples closer than this share most of their error
-    outlier_sigmas: Positive = 4.0  # residuals over this many sigmas after alignment are rejected
-    max_time_gap_s: Positive = 2.0  # no interpolation across larger gaps
+    correlation_time_s: Positive = Field(1.0, description="samples closer in time share most of their error")
+    outlier_sigmas: Positive = Field(
+        4.0, description="samples whose residual after alignment exceeds this are rejected, in standard deviations"
+    )
+    max_time_gap_s: Positive = Field(2.0, description="positions are not interpolated across larger gaps")
 
 
 class AggregationConfig(_Section):
-    """Putting scenes together to a map."""
+    """Aggregation of scenes to a map."""
 
-    candidates: Count = 3  # scenes that each scene is compared with: those whose views overlap most
-    position_error_m: Positive = 12.0  # how far positions of two scenes may be off against one another
-    max_depth_m: Positive = 40.0  # footprints of views end here
-    max_view_angle_deg: Positive = 50.0  # between optical axes: farther apart, nothing looks alike
-    probe_spacing_m: Positive = 4.0  # between units that are compared to find how two scenes lie
-    pairs_per_image: Count = 3  # of images between two scenes, once it is known how they lie
-    max_pairs: Count = 1200  # of images between two scenes
-    consensus: bool = True  # several units must agree how two scenes lie; false: the best one decides, for comparison
-    min_units: Count = 3  # of a scene that must agree
-    min_unit_inliers: Count = 12  # of a unit's image points, for its pose in the other scene
-    min_inliers: Count = 60  # points that two scenes share at a seam
-    max_scale_error: Positive = 0.05  # by which lengths of two scenes may differ, beyond what is uncertain about them
-    joint: bool = True  # seams that make loops are adjusted together; false: one scene after the other, for comparison
-    final_adjustment: Literal["overlap", "all", "none"] = "overlap"  # which units vary on their own in the end
+    candidates: Count = Field(
+        3, description="number of scenes that each scene is compared with: those of largest overlap of views"
+    )
+    position_error_m: Positive = Field(
+        12.0, description="largest error of the positions of two scenes against one another"
+    )
+    max_depth_m: Positive = Field(40.0, description="footprints of views end here")
+    max_view_angle_deg: Positive = Field(
+        50.0, description="largest angle between optical axes; images farther apart in direction do not match"
+    )
+    probe_spacing_m: Positive = Field(
+        4.0, description="distance between units that are relocalised to find the transform between two scenes"
+    )
+    pairs_per_image: Count = Field(
+        3, description="image pairs between two scenes per image, once their transform is known"
+    )
+    max_pairs: Count = Field(1200, description="image pairs between two scenes")
+    consensus: bool = Field(
+        True,
+        description="several units must agree on a seam's transform; `false` takes the best unit's, for comparison",
+    )
+    min_units: Count = Field(3, description="units of a scene that must agree on the transform of a seam")
+    min_unit_inliers: Count = Field(12, description="image points of a unit for its pose in the other scene")
+    min_inliers: Count = Field(60, description="points that two scenes share at a seam")
+    max_scale_error: Positive = Field(
+        0.05, description="largest difference of the scales of two scenes, beyond their uncertainty"
+    )
+    joint: bool = Field(
+        True,
+        description="seams in loops are adjusted together; `false` adjusts one scene after the other, for comparison",
+    )
+    final_adjustment: Literal["overlap", "all", "none"] = Field(
+        "overlap", description="units that vary on their own in the last adjustment"
+    )
 
 
 class OutputConfig(_Section):
-    """What is written besides the scene itself."""
+    """Files besides the scene itself."""
 
-    pictures: bool = True  # the road from above before and after recalibration, as PNG; reads every image again
+    pictures: bool = Field(
+        True, description="the road from above before and after recalibration, as PNG; reads every image again"
+    )
 
 
 class SemanticsConfig(_Section):
     """Masks of images that come without one."""
 
-    model: str | None = None  # name of a model for segmentation; no masks are made if not given
+    model: str | None = Field(
+        None, description="name of a segmentation model for images without a mask; by default no masks are made"
+    )
 
 
 class ModelsConfig(_Section):
-    """Where trained models lie and what runs them."""
+    """Trained models and their execution."""
 
-    folder: Path | None = None  # MRASFM_MODELS or the user's data folder if not given
-    gpu: bool = True  # where onnxruntime has a provider for one that starts
+    folder: Path | None = Field(
+        None, description="folder of the trained models; by default `MRASFM_MODELS` or the user's data folder"
+    )
+    gpu: bool = Field(True, description="a GPU is used where onnxruntime has a provider for one that starts")
 
 
 class EngineConfig(_Section):
@@ -157,9 +260,11 @@ class EngineConfig(_Section):
     output: OutputConfig = OutputConfig()
     semantics: SemanticsConfig = SemanticsConfig()
     models: ModelsConfig = ModelsConfig()
-    use_gnss: bool = True
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    threads: Count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    use_gnss: bool = Field(True, description="`false` ignores GNSS everywhere")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of everything that is drawn at random")
+    threads: Count = Field(
+        default_factory=_available_cores, description="by default one for each core that the process may use"
+    )
 
 
 def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
@@ -177,7 +282,9 @@ def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}", remedy="Give an existing file.") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{path} is not TOML: {error}", remedy="See the README for an example.") from error
+            raise InputError(
+                f"{path} is not TOML: {error}", remedy="`mrasfm describe settings` prints a file with all settings."
+            ) from error
     try:
         return EngineConfig.model_validate(values | overrides)
     except ValidationError as error:
@@ -185,5 +292,5 @@ def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
         field = ".".join(str(part) for part in first["loc"])
         raise InputError(
             f"{path or 'settings'}: {field}: {first['msg']}",
-            remedy="The settings and their meaning stand in mrasfm_engine/config.py.",
+            remedy="`mrasfm describe settings` prints all settings and their meaning.",
         ) from error

@@ -1,6 +1,9 @@
-"""What can go wrong, as exceptions whose message names the thing and the remedy."""
+"""Errors whose message names the thing and the remedy."""
 
 from __future__ import annotations
+
+import errno
+from pathlib import Path
 
 
 class MrasfmError(Exception):
@@ -50,3 +53,12 @@ class StorageError(MrasfmError):
     """The disk is full or cannot be written."""
 
     code = "storage"
+
+
+def storage_error(path: Path, error: OSError) -> StorageError:
+    """The error to raise when writing `path` failed."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return StorageError(f"no space left to write {path}", remedy="Free disk space, then run it again.")
+    return StorageError(
+        f"cannot write {path}: {error.strerror or error}", remedy="Check that the folder exists and may be written."
+    )

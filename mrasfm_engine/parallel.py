@@ -12,7 +12,8 @@ from functools import cache
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mrasfm_engine.types import Ints
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,7 +30,7 @@ def in_ranges(threads: int, count: int, work: Callable[[int, int, int], None]) -
     in_parts(np.linspace(0, count, threads + 1).astype(np.int64), work)
 
 
-def in_parts(bounds: NDArray[np.int64], work: Callable[[int, int, int], None]) -> None:
+def in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:
     """Run `work(lo, hi, part)` between any two neighbouring bounds, each in a thread."""
     parts = len(bounds) - 1
     if parts == 1:

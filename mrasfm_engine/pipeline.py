@@ -10,9 +10,10 @@ from mrasfm_engine import stages
 from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.io.drive_bundle import read_drive
-from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
+from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.types import StageProgress
 
 
 def reconstruct(
@@ -20,8 +21,9 @@ def reconstruct(
     out: Path,
     config: EngineConfig,
     *,
-    progress: stages.Progress = lambda stage, done, total: None,
+    progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
+    is_new: bool = False,
 ) -> dict[str, Any]:
     """Reconstruct a drive and write the scene into the folder `out`.
 
@@ -32,9 +34,12 @@ def reconstruct(
     drive_folder
         Holds `drive.json` and the images.
     progress
-        Called as progress(stage, done, total).
+        Called as progress(stage, done, total): with 0 of 0 when a stage begins and 1 of 1 when it ends, whatever it
+        counts between. A stage that is taken from an earlier run only ends.
     cancel
         Asked now and then; where it answers True the run ends with CancelledError.
+    is_new
+        Whether the folder is a user's, and no drive that was accepted before: see `read_drive`.
 
     Returns
     -------
@@ -52,7 +57,7 @@ def reconstruct(
             remedy="Give the scene a folder of its own with --out.",
             code="not-a-scene",
         )
-    drive = read_drive(drive_folder)
+    drive = read_drive(drive_folder, is_new=is_new)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
@@ -69,5 +74,7 @@ def reconstruct(
     if cancel():
         raise CancelledError
     run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
+    run.begin("export")
     write_scene(scene, out, run.report, pictures)
+    run.progress("export", 1, 1)
     return run.report

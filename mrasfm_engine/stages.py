@@ -6,7 +6,7 @@ Each takes its input, leaves its result and a report in the store, and is skippe
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,31 +16,32 @@ import numpy as np
 
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.calibration_check import require_calibration_direction
-from mrasfm_engine.correspondence.features import extract_features
-from mrasfm_engine.correspondence.pairs import pairs_from_poses, pairs_from_window, pairs_without_selection
-from mrasfm_engine.correspondence.plugins import Plugins, load_plugins
-from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory, prior_trajectory
-from mrasfm_engine.correspondence.revisits import revisit_pairs
-from mrasfm_engine.correspondence.search import match_pairs
 from mrasfm_engine.errors import CancelledError, ReconstructionError
-from mrasfm_engine.io.findings import as_json
-from mrasfm_engine.io.preflight import require_sound
-from mrasfm_engine.io.preflight_content import inspect_drive
+from mrasfm_engine.features.extraction import extract_features
+from mrasfm_engine.findings import as_json
+from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
-from mrasfm_engine.registration import incremental, mapping_report, wrong_camera
-from mrasfm_engine.registration.keyframes import register_between_keyframes
-from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.refine import refine
-from mrasfm_engine.registration.scene_builder import build_scene
-from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
+from mrasfm_engine.mapping.keyframes import register_between_keyframes
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.scene_builder import build_scene
+from mrasfm_engine.matching.calibration_check import require_calibration_direction
+from mrasfm_engine.matching.pair_matching import match_pairs
+from mrasfm_engine.matching.pair_selection import pairs_from_poses, pairs_from_window, pairs_without_selection
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
+from mrasfm_engine.matching.retrieval import revisit_pairs
+from mrasfm_engine.preflight.drive_check import require_sound
+from mrasfm_engine.preflight.image_content import inspect_drive
+from mrasfm_engine.registry import Plugins, load_plugins
+from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.row_bands import Shots
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import count_classes
-from mrasfm_engine.scene.shots import Shots
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
-from mrasfm_engine.views.pictures import draw_pictures
+from mrasfm_engine.types import CountProgress, StageProgress
+from mrasfm_engine.visualization.pictures import draw_pictures
 
-Progress = Callable[[str, int, int], None]  # stage, done, total
 PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 STATE_ARRAYS = (
@@ -56,7 +57,7 @@ class Run:
     drive: Drive
     config: EngineConfig
     store: StageStore
-    progress: Progress
+    progress: StageProgress
     cancel: Callable[[], bool]
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
     key: str = ""  # fingerprint of what has been done so far; of the files of the drive where it is empty
@@ -73,9 +74,13 @@ class Run:
         models = self.plugins.fingerprint_of("extractor", "segmenter")
         return [config.features.model_dump(), config.semantics.model_dump(), models]
 
-    def step(self, stage: str) -> Callable[[int, int], None]:
+    def step(self, stage: str) -> CountProgress:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
+
+    def begin(self, stage: str) -> None:
+        """Tell that a stage begins, of which nothing is done yet."""
+        self.progress(stage, 0, 0)
 
     def next_key(self, name: str, settings: object) -> str:
         """The fingerprint of a stage that follows those done so far."""
@@ -95,6 +100,7 @@ class Run:
         found = self.store.load(name, self.key)
         reused = found is not None
         if found is None:
+            self.begin(name)
             found = work()
             self.store.save(name, self.key, *found)
         arrays, report = found
@@ -112,9 +118,11 @@ def load_models(run: Run) -> None:
 
 def preflight(run: Run) -> None:
     """Check manifest, files and a sample of the images; refuse what cannot work before any long work."""
+    run.begin("preflight")
     findings = inspect_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"), cancel=run.cancel)
     run.report["findings"] = [as_json(finding) for finding in findings]
     require_sound(findings)
+    run.progress("preflight", 1, 1)
 
 
 def prior(run: Run) -> PriorTrajectory:
@@ -142,6 +150,8 @@ def probe(run: Run) -> None:
         segmenter=run.plugins.segmenter,
         cancel=run.cancel,
     )
+    if all(f.left_out for f in features):
+        return  # the extraction says whether there are others
     require_calibration_direction(run.drive, images, features, run.plugins.matcher, run.config.matching)
 
 
@@ -168,18 +178,34 @@ def features(run: Run) -> list[ImageFeatures]:
                 "made_by_model": sum(f.made_mask is not None for f in found),
             },
             "images_with_under_100_keypoints": [
-                run.drive.images[i].file for i in np.flatnonzero(arrays["counts"] < 100)
+                run.drive.images[i].file for i in np.flatnonzero(arrays["counts"] < 100) if not found[i].left_out
+            ],
+            "images_left_out": [
+                {"file": image.file, "reason": str(f.left_out)}
+                for image, f in zip(run.drive.images, found, strict=True)
+                if f.left_out
             ],
         }
 
-    arrays, _ = run.stage("features", run.feature_settings, work)
+    arrays, report = run.stage("features", run.feature_settings, work)
+    left_out = {image["file"]: Incomplete(image["reason"]) for image in report["images_left_out"]}
+    _say_left_out(run, left_out)
+    if len(left_out) == len(run.drive.images):
+        raise left_out_images.nothing_left(left_out)
     if not arrays["counts"].sum():
         raise ReconstructionError(
             "no image of the drive has a keypoint",
             remedy="Check that the images are not empty, and that masks do not cover everything.",
             code="no-features",
         )
-    return _unpack_features(arrays)
+    return _unpack_features(arrays, [left_out.get(image.file) for image in run.drive.images])
+
+
+def _say_left_out(run: Run, left_out: Mapping[str, Incomplete]) -> None:
+    """The preflight's findings are of a sample, these are of all images: they take their place."""
+    findings = [finding for finding in run.report.get("findings", []) if finding["code"] not in left_out_images.CODES]
+    found = left_out_images.left_out_findings(left_out, len(run.drive.images))
+    run.report["findings"] = findings + [as_json(finding) for finding in found]
 
 
 def _pack_features(found: Sequence[ImageFeatures]) -> Arrays:
@@ -193,7 +219,7 @@ def _pack_features(found: Sequence[ImageFeatures]) -> Arrays:
     }
 
 
-def _unpack_features(arrays: Arrays) -> list[ImageFeatures]:
+def _unpack_features(arrays: Arrays, left_out: Sequence[Incomplete | None]) -> list[ImageFeatures]:
     parts = {
         name: np.split(arrays[name], np.cumsum(arrays["counts"])[:-1])
         for name in (*FEATURE_ARRAYS, "scores")
@@ -201,7 +227,11 @@ def _unpack_features(arrays: Arrays) -> list[ImageFeatures]:
     }
     masks = np.split(arrays["masks"], np.cumsum(arrays["mask_bytes"])[:-1])
     return [
-        ImageFeatures(**{name: part[i] for name, part in parts.items()}, made_mask=mask if len(mask) else None)
+        ImageFeatures(
+            **{name: part[i] for name, part in parts.items()},
+            made_mask=mask if len(mask) else None,
+            left_out=left_out[i],
+        )
         for i, mask in enumerate(masks)
     ]
 
@@ -277,7 +307,7 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
     keypoints = Keypoints.of(run.drive, found, shots)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        model, log = incremental.map_units(
+        model, log = incremental_mapping.map_units(
             run.drive,
             keypoints,
             pairs,
@@ -286,6 +316,7 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             progress=run.step("mapping"),
             cancel=run.cancel,
         )
+        model.missing |= np.array([f.left_out is not None for f in found])
         arrays = {
             "of_keypoint": model.tracks.of_keypoint,
             "registered": model.registered,
@@ -318,6 +349,7 @@ def scene(
 ) -> Scene:
     """Georeferencing, the final adjustment with all priors, and how certain the result is."""
     started = time.perf_counter()
+    run.begin("refinement")
     refinement = refine(
         model,
         gnss=known.gnss,
@@ -330,11 +362,12 @@ def scene(
     if refinement.placement is not None:
         run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
     run.report["findings"] += [
-        as_json(wrong_camera.finding(run.drive.cameras[wrong.camera].name, wrong)) for wrong in refinement.wrong_cameras
+        as_json(miscalibration.finding(run.drive.cameras[wrong.camera].name, wrong))
+        for wrong in refinement.wrong_cameras
     ]
     if refinement.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
-        run.report["findings"].append(as_json(wrong_camera.pair_finding(names, refinement.wrong_pair)))
+        run.report["findings"].append(as_json(miscalibration.pair_finding(names, refinement.wrong_pair)))
     run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(model)]
     run.report["stages"].append(
         {
@@ -345,7 +378,9 @@ def scene(
             **mapping_report.describe_between(model, between),
         }
     )
-    return build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)
+    result = build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)
+    run.progress("refinement", 1, 1)
+    return result
 
 
 def pictures(run: Run, result: Scene) -> dict[str, bytes]:
@@ -359,6 +394,7 @@ def pictures(run: Run, result: Scene) -> dict[str, bytes]:
         run.progress("pictures", done, total)
 
     started = time.perf_counter()
+    run.begin("pictures")
     files, report = draw_pictures(result, seed=run.config.seed, progress=step)
     seconds = round(time.perf_counter() - started, 3)
     run.report["stages"].append({"stage": "pictures", "seconds": seconds, "reused": False, **report})

@@ -16,7 +16,7 @@ from schemas.drive import (
     RoughTrajectory,
     SemanticClass,
 )
-from schemas.parsing import DocumentError, FieldProblem, parse_manifest
+from schemas.parsing import DocumentError, FieldProblem, parse_manifest, parse_new_manifest
 
 __all__ = [
     "CAMERA_MODELS",
@@ -36,4 +36,5 @@ __all__ = [
     "RoughTrajectory",
     "SemanticClass",
     "parse_manifest",
+    "parse_new_manifest",
 ]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Never, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from schemas.drive import DriveManifest
+from schemas.file_names import name_problems
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
 # 100,000 frames of 8 cameras and a million GNSS samples have 9 million values, in 3 million objects and lists.
@@ -19,6 +23,8 @@ MAX_KEYS = 256
 MAX_PROBLEMS = 100
 MAX_PROBLEMS_SHOWN = 5
 MAX_KEY_SHOWN = 80
+
+_INTEGER = re.compile("0|[1-9][0-9]*")
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -52,7 +58,7 @@ class DocumentError(ValueError):
 
 
 def parse_manifest(raw: bytes) -> DriveManifest:
-    """The manifest in the bytes of a `drive.json`.
+    """The manifest in the bytes of a `drive.json` that was accepted once, perhaps by an earlier version.
 
     Raises
     ------
@@ -62,8 +68,55 @@ def parse_manifest(raw: bytes) -> DriveManifest:
     return parse_document(raw, DriveManifest)
 
 
+def parse_new_manifest(raw: bytes) -> DriveManifest:
+    """The manifest in the bytes of a `drive.json` that a drive is made of.
+
+    Rules that came later hold here alone, so that what was accepted before them can still be read.
+
+    Raises
+    ------
+    DocumentError
+        As `parse_manifest`; for numbers in another form than their schema's, and for files that cannot lie in one
+        folder on every system.
+    """
+    manifest = parse_document(raw, DriveManifest, look=_numbers_in_another_form)
+    problems = list(islice(file_problems(manifest), MAX_PROBLEMS))
+    if problems:
+        raise DocumentError(problems)
+    return manifest
+
+
+def file_problems(manifest: DriveManifest) -> Iterator[FieldProblem]:
+    """Files of a manifest that cannot lie in one folder with the others on every system, by path."""
+    images = [image for frame in manifest.frames for image in frame.images.values()]
+    paths = {path for image in images for path in (image.file, image.mask) if path is not None}
+    return (FieldProblem(path, what) for path, what in name_problems(paths))
+
+
+def _numbers_in_another_form(document: Any) -> list[FieldProblem]:
+    """Of a manifest, what pydantic takes for the number that is meant."""
+    if not isinstance(document, dict):
+        return []
+    problems = []
+    version = document.get("version", 1)
+    if version == 1 and type(version) is not int:
+        problems.append(FieldProblem("version", f"must be the integer 1, is {json.dumps(version)}"))
+    label_map = document.get("label_map")
+    ids = label_map.get("ids") if isinstance(label_map, dict) else None
+    for key in ids if isinstance(ids, dict) else ():
+        if not _INTEGER.fullmatch(key):
+            what = f"{_shortened(key)} must be an integer without sign, spaces and zeros before it"
+            problems.append(FieldProblem("label_map.ids", what))
+    return problems
+
+
 def parse_document(
-    raw: bytes, model: type[Model], *, strict: bool = True, max_bytes: int = MAX_MANIFEST_BYTES
+    raw: bytes,
+    model: type[Model],
+    *,
+    strict: bool = True,
+    max_bytes: int = MAX_MANIFEST_BYTES,
+    look: Callable[[Any], list[FieldProblem]] = lambda document: [],
 ) -> Model:
     """A pydantic model from JSON bytes.
 
@@ -74,6 +127,8 @@ def parse_document(
     strict
         Whether types must match exactly (no numbers in strings, no true for 1) and keys may not repeat nor be more
         than `MAX_KEYS` in one object. Large tables of published datasets are read faster without.
+    look
+        Of a strict reading: finds defects in the document as JSON has it.
 
     Raises
     ------
@@ -81,16 +136,20 @@ def parse_document(
         If the text is too large, no valid UTF-8 or JSON, holds NaN or Infinity, too many keys or one twice in one
         object, or does not fit the model.
     """
+    found: list[FieldProblem] = []
     if strict:
-        parse_json(raw, max_bytes=max_bytes)
+        found = look(parse_json(raw, max_bytes=max_bytes))
     else:
         _require_bounded(raw, max_bytes)
     try:
-        return model.model_validate_json(raw.removeprefix(b"\xef\xbb\xbf"), strict=strict)
+        read = model.model_validate_json(raw.removeprefix(b"\xef\xbb\xbf"), strict=strict)
     except ValidationError as error:
         details = error.errors(include_url=False, include_context=False)
-        problems = [_problem(dict(detail)) for detail in details[:MAX_PROBLEMS]]
-        raise DocumentError(problems, count=len(details)) from None
+        problems = [*found, *(_problem(dict(detail)) for detail in details[:MAX_PROBLEMS])]
+        raise DocumentError(problems[:MAX_PROBLEMS], count=len(found) + len(details)) from None
+    if found:
+        raise DocumentError(found)
+    return read
 
 
 def parse_json(raw: bytes, *, max_bytes: int = MAX_MANIFEST_BYTES) -> Any:

@@ -77,9 +77,14 @@ def invalid_document(error: DocumentError, *, what: str) -> ServiceError:
         "invalid-document",
         "The document does not follow its contract",
         f"{what}: {error}",
-        remedy="Correct the fields that are named; /docs describes every field.",
+        remedy="Correct the fields that are named; the page /docs of this service describes every field.",
         errors=[ProblemItem(field=problem.path, detail=problem.what) for problem in error.problems[:100]],
     )
+
+
+def too_slow(detail: str, *, remedy: str, headers: Mapping[str, str] | None = None) -> ServiceError:
+    """408: something of the request did not come in time."""
+    return ServiceError(408, "too-slow", "The request took too long", detail, remedy=remedy, headers=headers)
 
 
 def store_unavailable() -> ServiceError:

@@ -7,13 +7,14 @@ Everything has a default that suits one machine; production sets `MRASFM_DATABAS
 from __future__ import annotations
 
 import operator
+import re
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
-from pydantic import Field, SecretStr, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL
 
@@ -24,8 +25,16 @@ Hours = Annotated[float, Field(gt=0, le=24 * 365, allow_inf_nan=False)]
 Days = Annotated[float, Field(gt=0, le=36_500, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, le=7 * 86400, allow_inf_nan=False)]
 Ratio = Annotated[float, Field(gt=1, le=1e6, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
+
+def _sendable(token: SecretStr) -> SecretStr:
+    if not re.fullmatch(r"[A-Za-z0-9._~+/-]{16,}=*", token.get_secret_value()):
+        raise ValueError("must have at least 16 letters, digits and -._~+/ only: make one with 'openssl rand -hex 24'")
+    return token
+
+
+Token = Annotated[SecretStr, AfterValidator(_sendable)]
+Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
 _FITS: Mapping[str, Callable[[float, float], bool]] = {
     "at most half of": lambda first, second: 2 * first <= second,
@@ -42,64 +51,112 @@ _IN_STEP = (
 
 
 class Settings(BaseSettings):
-    """One comment a field. Sizes in bytes, times in seconds."""
+    """Settings of one process. Sizes are in bytes, times in the unit of the name."""
 
-    model_config = SettingsConfigDict(env_prefix="MRASFM_", frozen=True, extra="ignore")
+    # Errors name the variable and not what it holds: that may be a secret.
+    model_config = SettingsConfigDict(env_prefix="MRASFM_", frozen=True, extra="ignore", hide_input_in_errors=True)
 
-    # Where things are
-    data_dir: Path = Path("mrasfm-data")  # state of this machine: spool, scratch, and the embedded database and store
-    database_url: SecretStr | None = None  # SQLAlchemy's; default: SQLite in data_dir
-    artifacts_url: str | None = (
-        None  # obstore's: file:///..., s3://bucket/prefix, gs://..., az://...; default: data_dir
+    # Storage and broker
+    data_dir: Path = Field(
+        Path("mrasfm-data"), description="state of this machine: spool, scratch, and the embedded database and store"
     )
-    redis_url: SecretStr | None = None  # redis://..., rediss://... or redis+socket:///...; standalone starts its own
-    s3_endpoint: str | None = None  # of an S3-compatible store; credentials come from AWS_ACCESS_KEY_ID and so on
-    s3_region: str = "us-east-1"
+    database_url: SecretStr | None = Field(None, description="SQLAlchemy's URL; by default SQLite in the data folder")
+    artifacts_url: str | None = Field(
+        None,
+        description="obstore's URL: `file:///...`, `s3://bucket/prefix`, `gs://...`, `az://...`; else the data folder",
+    )
+    redis_url: SecretStr | None = Field(
+        None,
+        description="`redis://...`, `rediss://...` or `redis+socket:///...`; `mrasfm standalone` starts its own broker",
+    )
+    s3_endpoint: str | None = Field(
+        None, description="of an S3-compatible store; credentials come from `AWS_ACCESS_KEY_ID` and so on"
+    )
+    s3_region: str = Field("us-east-1", description="of the S3-compatible store")
 
     # API
-    host: str = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535)] = 8000
-    api_processes: Annotated[int, Field(ge=0, le=64)] = 0  # that take requests; 0: one a core, at most 2
-    max_manifest_bytes: Bytes = 64_000_000
-    max_json_bytes: Bytes = 8_000_000  # of every other JSON body
-    max_file_bytes: Bytes = 256_000_000  # one image or mask
-    max_archive_bytes: Bytes = 50_000_000_000  # one zip or tar, and what it unpacks to
-    max_compression_ratio: Ratio = 200.0  # of one archive entry; images hardly compress
-    min_free_disk_bytes: Annotated[int, Field(ge=0, le=_MAX_BYTES)] = 1_000_000_000  # below, uploads are refused (507)
-    max_concurrent_writes: Count = 8  # uploads that write to disk at one time; the others wait their turn
-    upload_hours: Hours = 24.0  # a resumable upload that nobody goes on with ends
-    upload_idle_seconds: Seconds = 60.0  # a request of whose body nothing comes ends; resumable uploads keep what came
-    # how often an event stream looks for news, and whether its key is still valid
-    poll_seconds: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 1.0
+    host: str = Field("127.0.0.1", description="address that the API listens on")
+    port: Annotated[int, Field(ge=0, le=65535)] = Field(8000, description="port that the API listens on")
+    api_processes: Annotated[int, Field(ge=0, le=64)] = Field(
+        0, description="processes that take requests; 0: one for each core, at most 2"
+    )
+    max_manifest_bytes: Bytes = Field(64_000_000, description="a drive's manifest")
+    max_json_bytes: Bytes = Field(8_000_000, description="every other JSON body")
+    max_file_bytes: Bytes = Field(256_000_000, description="one image or mask")
+    max_archive_bytes: Bytes = Field(50_000_000_000, description="one zip or tar, and its unpacked content")
+    max_compression_ratio: Ratio = Field(200.0, description="of one archive entry; images hardly compress")
+    min_free_disk_bytes: Annotated[int, Field(ge=0, le=_MAX_BYTES)] = Field(
+        1_000_000_000, description="with less free disk space, uploads are refused (507)"
+    )
+    max_concurrent_writes: Count = Field(
+        8, description="uploads that write to disk at one time; the others wait for their turn"
+    )
+    upload_hours: Hours = Field(24.0, description="a resumable upload ends after this time without a request")
+    upload_idle_seconds: Seconds = Field(
+        60.0,
+        description="a request whose body sends nothing for this long ends; resumable uploads keep what was received",
+    )
+    metrics_token: Token | None = Field(
+        None, description="bearer token that Prometheus sends to read `/metrics`; by default anybody may read it"
+    )
+    poll_seconds: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = Field(
+        1.0, description="an event stream checks for news, and whether its key is still valid, at this interval"
+    )
 
     # Quotas of a new project
-    project_max_bytes: Bytes = 1_000_000_000_000
-    project_max_active_jobs: Count = 1_000
-    project_max_drives: Count = 100_000
+    project_max_bytes: Bytes = Field(1_000_000_000_000, description="stored bytes of a new project")
+    project_max_active_jobs: Count = Field(1_000, description="queued and running jobs of a new project")
+    project_max_drives: Count = Field(100_000, description="drives of a new project")
 
     # Jobs
-    heartbeat_seconds: Seconds = 5.0  # how often a running job reports
-    lease_seconds: Seconds = 45.0  # without a heartbeat for this long, a job is given away; everywhere the same
-    stalled_seconds: Seconds = 20.0  # without a heartbeat for this long, a job is shown as STALLED
-    visibility_timeout_seconds: Seconds = 60.0  # the broker delivers a message again after this, unless renewed
-    visibility_renew_seconds: Seconds = 15.0
-    reconcile_seconds: Seconds = 5.0  # between two passes of the reconciler
-    max_attempts: Annotated[int, Field(ge=1, le=10)] = 3  # the first and two retries
-    retry_delay_seconds: Seconds = 2.0
-    storage_retry_growth: Annotated[float, Field(ge=1, le=1000)] = 15.0  # of that delay, where a store or disk failed
-    longest_retry_delay_seconds: Seconds = 120.0  # it grows no further
-    storage_patience_seconds: Seconds = 120.0  # a store that is away for so long fails an attempt
-    job_timeout_seconds: Seconds = 24 * 3600.0  # of one attempt
-    terminate_after_seconds: Seconds = 10.0  # from a cancel to SIGTERM
-    kill_after_seconds: Seconds = 30.0  # from a cancel to SIGKILL
-    engine_threads: Annotated[int, Field(ge=0, le=1024)] = 0  # of one reconstruction; 0: all cores
+    heartbeat_seconds: Seconds = Field(5.0, description="interval of a running job's heartbeat")
+    lease_seconds: Seconds = Field(
+        45.0,
+        description="a job without a heartbeat for this long is given to another worker; the same in all processes",
+    )
+    stalled_seconds: Seconds = Field(20.0, description="a job without a heartbeat for this long is shown as `STALLED`")
+    visibility_timeout_seconds: Seconds = Field(
+        60.0, description="the broker delivers a message again after this time, unless it is renewed"
+    )
+    visibility_renew_seconds: Seconds = Field(15.0, description="interval at which a worker renews its messages")
+    reconcile_seconds: Seconds = Field(5.0, description="time between two passes of the reconciler")
+    max_attempts: Annotated[int, Field(ge=1, le=10)] = Field(
+        3, description="attempts that count against a job: the first and two retries"
+    )
+    max_losses: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        20, description="lost workers and kills without a finished stage in between, after which a job ends"
+    )
+    retry_delay_seconds: Seconds = Field(2.0, description="delay before the first retry")
+    storage_retry_growth: Annotated[float, Field(ge=1, le=1000)] = Field(
+        15.0, description="factor of that delay after a failure of a store or disk"
+    )
+    longest_retry_delay_seconds: Seconds = Field(120.0, description="upper bound of the delay between retries")
+    storage_patience_seconds: Seconds = Field(
+        120.0, description="a store that does not answer for this long fails an attempt"
+    )
+    job_timeout_seconds: Seconds = Field(24 * 3600.0, description="of one attempt")
+    terminate_after_seconds: Seconds = Field(10.0, description="time from a cancel to SIGTERM")
+    kill_after_seconds: Seconds = Field(30.0, description="time from a cancel to SIGKILL")
+    engine_threads: Annotated[int, Field(ge=0, le=1024)] = Field(
+        0, description="threads of one reconstruction; 0: all cores"
+    )
 
-    # Retention; None keeps for ever
-    drive_retention_days: Days | None = None
-    scene_retention_days: Days | None = None
-    map_retention_days: Days | None = None  # since its newest version
-    job_retention_days: Days | None = None  # also of maps that have no version
-    idempotency_hours: Hours = 24.0
+    # Retention
+    drive_retention_days: Days | None = Field(None, description="drives are deleted after this time; by default never")
+    scene_retention_days: Days | None = Field(None, description="scenes are deleted after this time; by default never")
+    map_retention_days: Days | None = Field(
+        None, description="maps are deleted this long after their newest version; by default never"
+    )
+    job_retention_days: Days | None = Field(
+        None, description="jobs, and maps without a version, are deleted after this time; by default never"
+    )
+    idempotency_hours: Hours = Field(24.0, description="answers to an `Idempotency-Key` are kept for this time")
+
+    @field_validator("metrics_token", mode="before")
+    @classmethod
+    def _is_given(cls, value: object) -> object:
+        """Compose passes what nobody has set as an empty text."""
+        return None if value == "" else value
 
     @field_validator(*{name for first, _, second in _IN_STEP for name in (first, second)})
     @classmethod
@@ -136,6 +193,16 @@ class Settings(BaseSettings):
     def uploads_dir(self) -> Path:
         """Where the bytes of resumable uploads gather until all are there; of the spool's file system."""
         return self.data_dir.resolve() / "uploads"
+
+    @cached_property
+    def metrics_dir(self) -> Path:
+        """Where the processes of one API count together."""
+        return self.data_dir.resolve() / "metrics"
+
+    @cached_property
+    def temporary_dir(self) -> Path:
+        """Temporary files of the worker's main processes, a folder each."""
+        return self.data_dir.resolve() / "temporary"
 
     @cached_property
     def scratch_dir(self) -> Path:

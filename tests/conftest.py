@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import json
 import os
+import platform
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +21,74 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 # What a shell starts in the background ignores interrupts, and so would every process that the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# Kernels are compiled once for all test processes, while these run the tests that need none.
+_KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
+_WITHOUT_KERNELS = (REPOSITORY / "tests" / "service", REPOSITORY / "tests" / "unit" / "schemas")
+_compiler = pytest.StashKey[subprocess.Popen[bytes]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Begin to compile before the test processes begin."""
+    several = getattr(config.option, "numprocesses", None)
+    if "PYTEST_XDIST_WORKER" in os.environ or not several or _is_compiled(config):
+        return
+    path = Path(config.cache.mkdir("kernels")) / "lock" if config.cache else REPOSITORY / ".kernels.lock"
+    with path.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        config.stash[_compiler] = subprocess.Popen(
+            [sys.executable, "-m", "tests.helpers.compile_kernels"],
+            cwd=REPOSITORY,
+            pass_fds=(lock.fileno(),),  # the lock ends with the process
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    os.environ[_KERNEL_LOCK] = str(path)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remember that the kernels are compiled."""
+    process = config.stash.get(_compiler, None)
+    if process is None:
+        return
+    if process.poll() is None:
+        process.kill()
+    if process.wait() == 0 and config.cache:
+        config.cache.set(_CACHED, _kernel_version())
+
+
+_CACHED = "mrasfm/kernels"
+
+
+def _is_compiled(config: pytest.Config) -> bool:
+    return config.cache is not None and config.cache.get(_CACHED, None) == _kernel_version()
+
+
+def _kernel_version() -> str:
+    """Of the sources that numba compiles, and of what it compiles them for."""
+    digest = hashlib.sha256(f"{platform.python_version()} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
+    for path in sorted((REPOSITORY / "mrasfm_engine").rglob("*.py")):
+        digest.update(f"{path} {path.stat().st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests first that need no kernels."""
+    items.sort(key=_needs_kernels)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Wait for the kernels before the first test that needs them."""
+    path = os.environ.get(_KERNEL_LOCK) if _needs_kernels(item) else None
+    if path is not None:
+        with open(path) as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH)
+        del os.environ[_KERNEL_LOCK]
+
+
+def _needs_kernels(item: pytest.Item) -> bool:
+    return not any(item.path.is_relative_to(folder) for folder in _WITHOUT_KERNELS)
 
 
 @pytest.fixture(scope="session")

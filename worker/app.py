@@ -12,11 +12,11 @@ from typing import Any
 from celery import Celery, signals
 from celery.exceptions import Reject
 
+from service.job_queue import TASK, celery_options
 from service.logs import configure
-from service.parent_death import end_with_parent
-from service.persistence.wakeups import TASK, celery_options
+from service.pdeathsig import end_with_parent
 from service.settings import Settings
-from worker.execution import Runner
+from worker.job_execution import Runner
 from worker.lease import RenewLeases, ReportPresence
 
 log = logging.getLogger("mrasfm.worker")

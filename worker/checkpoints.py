@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from service.persistence import checkpoints
-from service.persistence.artifacts import ArtifactStore, Fetch
-from service.persistence.checkpoints import Shelf
-from service.persistence.database import Database
-from service.persistence.storing import file_sha256, store_file
+from service.database.connections import Database
+from service.domain import checkpoints, jobs
+from service.domain.checkpoints import Shelf
+from service.storage.artifacts import ArtifactStore, Fetch
+from service.storage.blob_writer import file_sha256, store_file
 
 log = logging.getLogger("mrasfm.worker")
 
@@ -45,12 +45,12 @@ class CheckpointKeeper:
     """
 
     def __init__(
-        self, database: Database, artifacts: ArtifactStore, shelf: Shelf, *, project_id: str, folder: Path, spare: Path
+        self, database: Database, artifacts: ArtifactStore, shelf: Shelf, *, held: jobs.Claim, folder: Path, spare: Path
     ) -> None:
         self._database = database
         self._artifacts = artifacts
         self._shelf = shelf
-        self._project_id = project_id
+        self._held = held
         self._folder = folder
         self._spare = spare
         self._kept: dict[str, _Identity] = {}
@@ -117,13 +117,14 @@ class CheckpointKeeper:
         stored = store_file(
             self._database,
             self._artifacts,
-            project_id=self._project_id,
+            project_id=self._held.project_id,
             path=link,
             sha256=trouble.sha256,
             size_bytes=link.stat().st_size,
         )
         with self._database.write() as session:
-            checkpoints.keep(session, self._shelf, {path.name: stored})
+            if checkpoints.keep(session, self._shelf, {path.name: stored}):
+                jobs.note_finished_stage(session, self._held)
 
 
 def _identity(path: Path) -> _Identity:

@@ -15,14 +15,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from service.parent_death import end_with_parent
-from worker.messages import ChildRequest
+from service.pdeathsig import end_with_parent
+from worker.child_protocol import ChildRequest
 
 EXIT_DONE = 0  # there is a result
 EXIT_CRASHED = 70
 EXIT_OUT_OF_MEMORY = 71
 EXIT_ORPHANED = 72
 
+_NICE = 5  # a third of the weight of what serves requests or keeps leases; all of the machine where nobody else works
 _OOM_SCORE = 500  # as if half of the machine's memory more were used: the kernel's choice before any supervisor
 
 
@@ -33,6 +34,7 @@ def main(argv: Sequence[str]) -> int:
     if os.getppid() != request.parent_pid:
         return EXIT_ORPHANED  # it died before the kernel knew that this one should follow
     _be_expendable()
+    _give_way()
     try:
         # The engine takes a second and 200 MB to load, and nothing above needs it.
         from worker.engine import work
@@ -55,6 +57,16 @@ def _be_expendable() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE))
+
+
+def _give_way() -> None:
+    """Let the API and the worker's own processes run first where they share the machine.
+
+    Linux may weigh sessions instead of processes, and this process leads one.
+    """
+    os.nice(_NICE)
+    with suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(_NICE))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from worker.log_paths import LogPaths
+
 FILE_BYTES = 4_000_000
 TAIL_BYTES = 16_000  # of an abort: the Python stacks of all threads, and below them those of C++
 
@@ -19,13 +21,14 @@ class ChildOutput:
     Parameters
     ----------
     path
-        Of the file; where it cannot be written there is only the tail.
+        Of the file, in the folder of an attempt; where it cannot be written there is only the tail.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._left = FILE_BYTES
         self._tail = b""
+        self._paths = LogPaths([path.parent, path.parent.parent])
 
     def add(self, data: bytes) -> None:
         """Take in a piece."""
@@ -37,7 +40,8 @@ class ChildOutput:
                 file.write(kept)
 
     def tail(self) -> str:
-        """The last lines, at most TAIL_BYTES of UTF-8."""
+        """The last lines, of at most TAIL_BYTES of UTF-8. Users see them: paths of this machine are shortened."""
         text = _CONTROL.sub("", self._tail.decode("utf-8", "ignore").replace("\r\n", "\n"))
         # Where the beginning is cut off, so is the first line.
-        return text.partition("\n")[2] if len(self._tail) == TAIL_BYTES and "\n" in text else text
+        whole = text.partition("\n")[2] if len(self._tail) == TAIL_BYTES and "\n" in text else text
+        return self._paths.shorten(whole)

@@ -12,15 +12,15 @@ from mrasfm_engine import stages
 from mrasfm_engine.aggregation import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
-from mrasfm_engine.io.drive_bundle import read_drive
-from mrasfm_engine.io.findings import as_json, error
-from mrasfm_engine.io.preflight import UnsoundDriveError, is_sound
-from mrasfm_engine.io.preflight_content import inspect_drive
+from mrasfm_engine.findings import as_json, error
 from mrasfm_engine.learned.model_folder import default_folder
 from mrasfm_engine.pipeline import reconstruct
+from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
+from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from worker.child_protocol import ChildError, ChildRequest, ChildResult, ErrorKind, Work
 from worker.engine_settings import engine_config
-from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
 from worker.progress_pipe import ProgressWriter
 
 CANCEL_INTERVAL_S = 0.2
@@ -67,28 +67,13 @@ class CancelFile:
 def _reconstruct(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    last = "pictures" if config.output.pictures else "refinement"
-
-    def report(stage: str, done: int, total: int) -> None:
-        progress(stage, done, total)
-        if stage == last and done == total:
-            progress("export", 0, 1)
-
-    reconstruct(_drive_of(request), request.out, config, progress=report, cancel=cancelled)
-    progress("export", 1, 1)
+    reconstruct(_drive_of(request), request.out, config, progress=progress, cancel=cancelled)
     return _written_report(request.out)
 
 
 def _aggregate(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    last = "pictures" if config.output.pictures else "adjustment"
-
-    def report(stage: str, done: int, total: int) -> None:
-        progress(stage, done, total)
-        if stage == last and done == total:
-            progress("export", 0, 1)
-
     aggregate(
         request.scenes,
         request.out,
@@ -96,7 +81,7 @@ def _aggregate(
         into=request.into,
         remove=request.remove,
         leave_out=request.leave_out,
-        progress=report,
+        progress=progress,
         cancel=cancelled,
     )
     written = _written_report(request.out)
@@ -107,7 +92,6 @@ def _aggregate(
     partial = path.with_name(".report.json.partial")
     partial.write_text(json.dumps(written, indent=1, allow_nan=False), encoding="utf-8")
     partial.replace(path)
-    progress("export", 1, 1)
     return {**written, "map": _figures(json.loads((request.out / "map.json").read_text(encoding="utf-8")))}
 
 

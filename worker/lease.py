@@ -17,8 +17,8 @@ from typing import Any
 from celery import bootsteps
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.persistence import workers
-from service.persistence.database import Database
+from service.database.connections import Database
+from service.domain import workers
 from service.settings import Settings
 
 log = logging.getLogger("mrasfm.worker")

@@ -1,36 +1,101 @@
-"""Whether the kernel has killed for lack of memory in this process's control group."""
+"""How often the kernel has killed for lack of memory around this process."""
 
 from __future__ import annotations
 
+import json
 import re
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 _COUNT = re.compile(r"^oom_kill (\d+)$", re.MULTILINE)
+_PROC = Path("/proc")
+_MOUNTS = Path("/sys/fs/cgroup")
 
 
-def oom_kills(*, groups: Path = Path("/proc/self/cgroup"), mounts: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """How many processes of this control group the kernel has killed so far; None where it does not say.
+@dataclass(frozen=True)
+class MemoryKills:
+    """The kernel's count of processes that it killed for lack of memory, at one moment.
+
+    Attributes
+    ----------
+    counter
+        Which counter that is: another control group, and the same one after the machine started again, count anew.
+    count
+        Since the counter began.
+    """
+
+    counter: str
+    count: int
+
+    def since(self, before: MemoryKills | None) -> int | None:
+        """How many were killed since an earlier moment; None where that is another counter's, or is not known."""
+        if before is None or before.counter != self.counter or before.count > self.count:
+            return None
+        return self.count - before.count
+
+    def write(self, path: Path) -> None:
+        """Leave the count for whoever finds this process dead.
+
+        Raises
+        ------
+        OSError
+            Where it cannot be written.
+        """
+        path.write_text(json.dumps(asdict(self)), encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path) -> MemoryKills | None:
+        """What `write` left; None where it did not come so far."""
+        with suppress(OSError, ValueError, TypeError):
+            found = cls(**json.loads(path.read_text(encoding="utf-8")))
+            if isinstance(found.counter, str) and isinstance(found.count, int):
+                return found
+        return None
+
+
+def memory_kills(*, proc: Path = _PROC, mounts: Path = _MOUNTS) -> MemoryKills | None:
+    """The count of this process's control group; without one, that of the machine; None where the kernel has neither.
 
     Reads both versions of control groups. In a container the group's path is often the host's: then its counts are at
     the mount's root.
     """
+    for path in (*_group_files(proc, mounts), proc / "vmstat"):
+        count = _count(path)
+        if count is not None:
+            return MemoryKills(f"{_boot(proc)}:{path.stat().st_dev}:{path.stat().st_ino}", count)
+    return None
+
+
+def kills_since(before: MemoryKills | None) -> int | None:
+    """How many the kernel has killed since; None where it does not say."""
+    now = memory_kills()
+    return None if now is None else now.since(before)
+
+
+def _group_files(proc: Path, mounts: Path) -> list[Path]:
     try:
-        lines = groups.read_text(encoding="utf-8").splitlines()
+        lines = (proc / "self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return None
+        return []
+    files = []
     for line in lines:
         number, controllers, path = line.split(":", 2)
         if number == "0":
-            mount, file = mounts, "memory.events"
+            mount, name = mounts, "memory.events"
         elif "memory" in controllers.split(","):
-            mount, file = mounts / "memory", "memory.oom_control"
+            mount, name = mounts / "memory", "memory.oom_control"
         else:
             continue
-        for folder in (mount / path.lstrip("/"), mount):
-            count = _count(folder / file)
-            if count is not None:
-                return count
-    return None
+        files += [folder / name for folder in (mount / path.lstrip("/"), mount)]
+    return files
+
+
+def _boot(proc: Path) -> str:
+    try:
+        return (proc / "sys/kernel/random/boot_id").read_text(encoding="utf-8").strip()
+    except OSError:
+        return "unknown"
 
 
 def _count(path: Path) -> int | None:

@@ -7,12 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from service.domain import jobs
 from worker.child import EXIT_DONE, EXIT_OUT_OF_MEMORY
-from worker.escalation import StopReason
-from worker.messages import ChildError, ChildResult, ErrorKind
+from worker.child_protocol import ChildError, ChildResult, ErrorKind
+from worker.termination import StopReason
 
 RETRYABLE = frozenset({ErrorKind.STORAGE, ErrorKind.OTHER})
 
+_KILLED = (
+    "Retry the job: finished stages are reused. If it happens again in one stage, a program that watches memory may "
+    "have killed it: then ask for fewer keypoints (settings.max_keypoints) or smaller images (settings.max_side_px)."
+)
 _TRY_AGAIN = "Retry the job: finished stages are reused. If it fails again, report it with the end of its log."
 
 
@@ -40,7 +45,7 @@ class Failed:
     Attributes
     ----------
     code
-        The engine's own, or out-of-memory, engine-abort, timeout, storage.
+        The engine's own, or out-of-memory, engine-killed, engine-abort, timeout, storage.
     retryable
         Whether another attempt may succeed.
     stage
@@ -51,6 +56,8 @@ class Failed:
         The end of what the child printed.
     is_storage
         Whether a store or a disk failed: each further attempt waits longer for it.
+    blame
+        How much the attempt counts against its job, see `service.domain.jobs`.
     """
 
     code: str
@@ -61,6 +68,7 @@ class Failed:
     findings: list[dict[str, str]] = field(default_factory=list)
     log_tail: str = ""
     is_storage: bool = False
+    blame: float = jobs.FULL_BLAME
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +108,7 @@ class Ending:
         What the child left, if it got so far.
     stage
         The last it reported.
-    oom_kills
+    memory_kills
         How many processes the kernel has killed for lack of memory meanwhile; None where it does not say.
     """
 
@@ -109,7 +117,7 @@ class Ending:
     result: ChildResult | None
     stage: str
     log_tail: str
-    oom_kills: int | None
+    memory_kills: int | None
     out: Path
     timeout_s: float
 
@@ -158,17 +166,24 @@ def _of_engine(ending: Ending, error: ChildError) -> Failed:
 def _of_exit(ending: Ending) -> Failed:
     """There is no result: what the exit code or signal says."""
     killed = ending.returncode == -signal.SIGKILL
-    if killed or ending.returncode == EXIT_OUT_OF_MEMORY:
-        known = ending.oom_kills or not killed
+    if ending.returncode == EXIT_OUT_OF_MEMORY or (killed and ending.memory_kills):
         return _failed(
             ending,
             code="out-of-memory",
-            what=f"memory ran out {_where(ending)}"
-            if known
-            else f"the engine's process was killed {_where(ending)}, most often because memory ran out",
-            remedy="Ask for fewer keypoints (settings.max_keypoints) or smaller images (settings.max_side_px), split "
-            "the drive, or give the worker more memory.",
+            what=f"memory ran out {_where(ending)}",
+            remedy=jobs.LESS_MEMORY,
             retryable=True,
+        )
+    if killed:
+        unknown = ending.memory_kills is None
+        return _failed(
+            ending,
+            code="engine-killed",
+            what=f"the engine's process was killed {_where(ending)}"
+            + (", most often because memory ran out" if unknown else ", and not by the kernel for lack of memory"),
+            remedy=jobs.LESS_MEMORY if unknown else _KILLED,
+            retryable=True,
+            blame=jobs.blame_of_loss(engine_ran=True, memory_kills=ending.memory_kills),
         )
     return _failed(
         ending,
@@ -203,6 +218,7 @@ def _failed(
     retryable: bool,
     findings: list[dict[str, str]] | None = None,
     is_storage: bool = False,
+    blame: float = jobs.FULL_BLAME,
 ) -> Failed:
     return Failed(
         code=code,
@@ -212,5 +228,6 @@ def _failed(
         stage=ending.stage,
         findings=findings or [],
         is_storage=is_storage,
+        blame=blame,
         log_tail=ending.log_tail,
     )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from worker.messages import Work
+from worker.child_protocol import Work
 
 # Shares of the time, measured on drives of 100 images; what counts is that nothing seems to stand still. `fetch` and
 # `publish` are the worker's own: the drive from the artifact store, and the results into it.
@@ -110,7 +110,7 @@ class ProgressMeter:
         if reused:
             self._skipped += self._weights.get(stage, 0.0)
         elif done == total == 1 and stage in REUSABLE:
-            done = total = now.total
+            done = total = max(now.total, 1)
         self._progress = Progress(
             stage=stage,
             done=done,

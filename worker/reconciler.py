@@ -9,15 +9,15 @@ from collections.abc import Callable
 from sqlalchemy import ColumnElement, delete, or_, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
+from service.database.connections import Database, clock_us
+from service.database.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, Pass, now_us
+from service.domain import job_trees, jobs, maps, workers
+from service.job_queue import BrokerError, Wakeups, task_id
 from service.logs import log_fields
-from service.persistence import jobs, maps, trees, workers
-from service.persistence.artifacts import ArtifactStore
-from service.persistence.collecting import collect_orphans, collect_unused
-from service.persistence.database import Database, clock_us
-from service.persistence.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, Pass, now_us
-from service.persistence.wakeups import BrokerError, Wakeups, task_id
 from service.settings import Settings
-from worker.silence import Silence
+from service.storage.artifacts import ArtifactStore
+from service.storage.garbage_collection import collect_orphans, collect_unused
+from worker.clock_guard import Silence
 
 log = logging.getLogger("mrasfm.reconciler")
 
@@ -41,6 +41,7 @@ class Reconciler:
         self._wakeups = Wakeups(settings)
         self._broker_was_there = True
         self._silence = Silence(settings.lease_seconds)
+        self._limits = jobs.RetryLimits.from_settings(settings)
 
     def close(self) -> None:
         """Let go of the database."""
@@ -81,7 +82,7 @@ class Reconciler:
     def reconcile_jobs(self) -> None:
         """Free jobs whose worker is silent, and wake workers up for those that wait and have no message."""
         lost = self._expire_leases()
-        trees.tend(self._database)
+        job_trees.tend(self._database)
         for job_id in lost:
             with log_fields(job_id=job_id):
                 log.warning("the worker was not heard of any more")
@@ -109,8 +110,7 @@ class Reconciler:
         self._silence.ask()
         with self._database.write() as session:
             counts = self._silence.counts(clock_us(session))
-            lost = jobs.expire_leases(session, max_attempts=chosen.max_attempts, only_ended=not counts)
-        with self._database.write(durable=False) as session:
+            lost = jobs.expire_leases(session, limits=self._limits, only_ended=not counts)
             jobs.bound_times(session, lease_us=int(chosen.lease_seconds * 1e6), delay_us=int(longest_delay_s * 1e6))
         return lost
 

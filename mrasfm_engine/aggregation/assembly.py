@@ -7,17 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.problem import Observations, ShotMotion
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.bundle_adjustment.problem import Observations, ShotMotion
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.scene.state import State
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools, Floats, Ints
 
 
 def _offsets(counts: Sequence[int]) -> Ints:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -15,8 +14,7 @@ from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, common_view, nearest_
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,15 +8,12 @@ is scale. So calibrations settle with the units, as far as their scene left them
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.priors import CameraPosePrior
 from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior
 from mrasfm_engine.config import AdjustmentConfig
 from mrasfm_engine.scene.state import State
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools
 
 MAX_COUPLINGS = 500_000  # of cameras that vary with units and with one another: the solver holds some 400 bytes of each
 

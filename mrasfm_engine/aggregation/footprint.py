@@ -8,15 +8,12 @@ points of every footprint. Where a camera sees no ground, points on its optical 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.geometry.frustum import mutual_overlap
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats, Ints
 
 GRID = (5, 6)  # rays across and down an image
 RANGES = (0.15, 0.35, 0.65, 1.0)  # of the depth, along rays that do not meet the ground before it ends

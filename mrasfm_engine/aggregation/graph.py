@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.aggregation.association import component_labels
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.registration.pose_graph import Edges, optimise_pose_graph
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.mapping.pose_graph import Edges, optimise_pose_graph
+from mrasfm_engine.types import Floats
 
 MAX_CLOSING_M, MAX_CLOSING_DEG = 0.6, 1.5  # of a loop of seams, for each of them
 LEAST_SIGMA_DEG, LEAST_SIGMA_M = 0.02, 0.01  # of a seam: scenes are bent by more than their images' noise says

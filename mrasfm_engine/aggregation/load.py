@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from mrasfm_engine.aggregation.source import SourceScene, unit_from_images
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.read_model import ModelImage, read_images, read_points
 from mrasfm_engine.scene.drive import matrix_from_pose
+from mrasfm_engine.types import Bytes, Floats, Floats32, Ints
 from schemas import Camera, DriveManifest, Pose
-
-Floats = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
 MIN_UNITS = 2
@@ -272,7 +270,7 @@ def _poses(entries: Sequence[dict[str, Any]], key: str) -> Floats:
     return result
 
 
-def _point_classes(path: Path, count: int) -> NDArray[np.uint8]:
+def _point_classes(path: Path, count: int) -> Bytes:
     types = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
     head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii").splitlines()]
@@ -284,7 +282,7 @@ def _point_classes(path: Path, count: int) -> NDArray[np.uint8]:
 
 def _keypoints(
     folder: Path, model: Mapping[int, ModelImage], images: int, points: int
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], NDArray[np.uint8]]:
+) -> tuple[Ints, Floats32, Ints, Bytes]:
     """First keypoint of every image, positions, points, and the descriptors of keypoints with a point, as bytes."""
     counts, xy, point, descriptors = np.zeros(images, dtype=np.int64), [], [], []
     with closing(sqlite3.connect(f"file:{folder / 'features.db'}?mode=ro&immutable=1", uri=True)) as db:

@@ -8,27 +8,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.solver import Report
 from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
-from mrasfm_engine.aggregation.final import FinalResult
 from mrasfm_engine.aggregation.graph import Chain
+from mrasfm_engine.aggregation.map_adjustment import FinalResult
 from mrasfm_engine.aggregation.map_scene import map_scene
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.export.calibration import settled_document
+from mrasfm_engine.export.map import MapContent
+from mrasfm_engine.export.picture_files import png_of
+from mrasfm_engine.export.scene import PICTURES
+from mrasfm_engine.findings import warning
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.io.export_calibration import settled_document
-from mrasfm_engine.io.export_map import MapContent
-from mrasfm_engine.io.export_pictures import png_of
-from mrasfm_engine.io.export_scene import PICTURES
-from mrasfm_engine.io.findings import warning
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 CONNECTED, BY_POSITIONS = "connected", "placed by positions"
 BEFORE, AFTER = "before", "after"
@@ -195,6 +193,7 @@ def _moved(result: MapResult, seam: Seam) -> float:
 def map_pictures(run: stages.Run, result: MapResult) -> dict[str, bytes]:
     """Pictures of every accepted seam, as positions put its scenes and in the map, as PNG files by name."""
     started = time.perf_counter()
+    run.begin("pictures")
     pictures: dict[str, bytes] = {}
     shown = [seam for seam in result.seams if seam.accepted]
     for done, seam in enumerate(shown, 1):

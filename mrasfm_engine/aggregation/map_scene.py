@@ -6,18 +6,15 @@ Cameras and files are called SCENE/NAME; units and images are numbered through, 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.final import MapModel
+from mrasfm_engine.aggregation.map_adjustment import MapModel
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.scene.semantics import majority_class
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
-
-Floats = NDArray[np.float64]
 
 
 def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Scene:

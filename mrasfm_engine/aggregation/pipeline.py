@@ -8,27 +8,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
-from mrasfm_engine.aggregation.final import FinalResult, adjust_map
 from mrasfm_engine.aggregation.graph import Chain, SeamGraph
-from mrasfm_engine.aggregation.joint import adjust_jointly, joined_owner, placed
 from mrasfm_engine.aggregation.load import name_scenes
+from mrasfm_engine.aggregation.map_adjustment import FinalResult, adjust_map
 from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
+from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner, placed
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.io.export_map import write_map
-from mrasfm_engine.io.publishing import COMPLETE_MARK
+from mrasfm_engine.export.map import write_map
+from mrasfm_engine.export.publishing import COMPLETE_MARK
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.io.stage_store import StageStore
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats, StageProgress
 
 
 def aggregate(
@@ -39,7 +37,7 @@ def aggregate(
     into: Path | None = None,
     remove: Sequence[str] = (),
     leave_out: bool = False,
-    progress: stages.Progress = lambda stage, done, total: None,
+    progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Put scenes together to a map, and write it into the folder `out`.
@@ -93,7 +91,10 @@ def aggregate(
     pictures = map_pictures(run, result) if config.output.pictures else {}
     if cancel():
         raise CancelledError
-    return write_map(map_content(run, result, pictures), out, run.report)
+    run.begin("export")
+    report = write_map(map_content(run, result, pictures), out, run.report)
+    run.progress("export", 1, 1)
+    return report
 
 
 def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Seam]) -> tuple[SeamGraph, list[Chain]]:
@@ -126,6 +127,7 @@ def _adjusted(
     chains: Sequence[Chain],
 ) -> MapResult:
     started = time.perf_counter()
+    run.begin("joint")
     poses, chained = known.map_from_scene.copy(), known.map_from_scene.copy()
     middle = np.stack([scene.midpoint_m for scene in found])
     reports = []
@@ -173,6 +175,7 @@ def _final(
     run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
 ) -> FinalResult:
     started = time.perf_counter()
+    run.begin("adjustment")
     assembly = Assembly(scenes=found)
     positions = {
         k: p

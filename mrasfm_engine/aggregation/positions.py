@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mrasfm_engine.adjustment.priors import PositionPrior
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.bundle_adjustment.priors import PositionPrior
 from mrasfm_engine.config import GnssConfig
-from mrasfm_engine.correspondence.prior_trajectory import prior_trajectory
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median
+from mrasfm_engine.matching.prior_trajectory import prior_trajectory
 from mrasfm_engine.scene.state import State
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats
 
 MIN_POSITIONS = 3
 USUAL_LENGTH = 1.54  # median length of a standard normal 3-vector

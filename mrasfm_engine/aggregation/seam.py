@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.consensus import Consensus, Relocaliser, Sightings, sightings
-from mrasfm_engine.aggregation.fine import (
+from mrasfm_engine.aggregation.pairs import guided_pairs, probes
+from mrasfm_engine.aggregation.relocalization import Consensus, Relocaliser, Sightings, sightings
+from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
+from mrasfm_engine.aggregation.seam_refinement import (
     FineResult,
     Shared,
     adjust_transform,
@@ -20,16 +21,12 @@ from mrasfm_engine.aggregation.fine import (
     merge_points,
     scale_ratio,
 )
-from mrasfm_engine.aggregation.matching import CrossMatcher, CrossMatches
-from mrasfm_engine.aggregation.pairs import guided_pairs, probes
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.matching import Matcher
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.matching.nearest_neighbour import Matcher
+from mrasfm_engine.types import CountProgress, Floats, Ints
 
 BATCH_UNITS = 4  # that are looked for before it is asked whether they agree
 ENOUGH_AGREEING = 4  # units, after which no more are looked for
@@ -79,7 +76,7 @@ def find_seam(
     config: EngineConfig,
     *,
     cancel: Callable[[], bool],
-    progress: Callable[[int, int], None],
+    progress: CountProgress,
 ) -> Seam:
     """Look for how two scenes lie to one another, from where their positions put them.
 
@@ -115,7 +112,7 @@ def _relocalise(
     config: EngineConfig,
     *,
     cancel: Callable[[], bool],
-    progress: Callable[[int, int], None],
+    progress: CountProgress,
 ) -> tuple[Consensus, int]:
     """Look for units of b in a, a few at a time, until enough agree; and how many were looked for."""
     wanted = probes(a, b, coarse, config.aggregation)
@@ -147,7 +144,7 @@ def _assemble(
     config: EngineConfig,
     *,
     cancel: Callable[[], bool],
-    progress: Callable[[int, int], None],
+    progress: CountProgress,
 ) -> FineResult | None:
     """Match, merge and adjust in turns, each time from the better transform."""
     a, b = assembly.scenes

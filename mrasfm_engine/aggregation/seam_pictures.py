@@ -6,12 +6,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from mrasfm_engine.views.drawing import framed
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+from mrasfm_engine.types import Bytes, Floats, Ints
+from mrasfm_engine.visualization.drawing import framed
 
 MARGIN_M = 15.0
 LARGEST_SIDE_M = 120.0
@@ -25,7 +22,7 @@ def seam_picture(
     ways_m: tuple[Floats, Floats],
     centre_m: Floats,
     side_m: float,
-) -> Picture:
+) -> Bytes:
     """A picture (h, w, 3) of the ground around a place, east to the right and north up.
 
     Parameters
@@ -38,7 +35,7 @@ def seam_picture(
     cell_m = side_m / SIDE_PX
     picture = np.full((SIDE_PX, SIDE_PX, 3), 255.0)
 
-    def pixels(xyz: Floats) -> NDArray[np.int64]:
+    def pixels(xyz: Floats) -> Ints:
         u = (xyz[:, 0] - centre_m[0]) / cell_m + SIDE_PX / 2
         v = SIDE_PX / 2 - (xyz[:, 1] - centre_m[1]) / cell_m
         return np.stack([np.floor(u), np.floor(v)], 1).astype(np.int64)

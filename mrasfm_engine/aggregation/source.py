@@ -18,11 +18,8 @@ from numpy.typing import NDArray
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from schemas import DriveManifest
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 ARRAYS = (
     "unit_registered", "world_from_rig", "sigma_position_m", "image_registered", "unit_from_image",
@@ -49,11 +46,11 @@ class SourceScene:
     image_registered: Bools  # (i,)
     unit_from_image: Floats  # (i, 4, 4), or (0, 4, 4) where all images are at their unit's time
     points_m: Floats  # (p, 3)
-    point_colors: NDArray[np.uint8]  # (p, 3)
+    point_colors: Bytes  # (p, 3)
     point_errors_px: Floats  # (p,)
-    point_classes: NDArray[np.uint8]  # (p,)
+    point_classes: Bytes  # (p,)
     keypoint_first: Ints  # (i + 1,)
-    keypoint_xy_px: NDArray[np.float32]  # (n, 2)
+    keypoint_xy_px: Floats32  # (n, 2)
     keypoint_point: Ints  # (n,) -1 for none
     descriptors: NDArray[Any]  # (m, D) of the keypoints that observe a point, in their order
     footprints: dict[float, Floats] = field(default_factory=dict, repr=False, compare=False)  # by depth; see footprint

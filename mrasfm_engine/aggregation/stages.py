@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine import __version__
 from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
@@ -19,15 +18,13 @@ from mrasfm_engine.aggregation.load import BETWEEN_NAMES, read_scene
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.plugins import Plugins, load_plugins
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.io.export_map import SCENES_FOLDER, SEAMS_FOLDER
-from mrasfm_engine.io.findings import Finding, as_json, warning
+from mrasfm_engine.export.map import SCENES_FOLDER, SEAMS_FOLDER
+from mrasfm_engine.findings import Finding, as_json, warning
 from mrasfm_engine.io.read_map import MAP_FILE
 from mrasfm_engine.io.stage_store import StageStore, code_version, fingerprint
-
-Floats = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
+from mrasfm_engine.registry import Plugins, load_plugins
+from mrasfm_engine.types import CountProgress, StageProgress
 
 FAR_APART_M = 50_000.0
 MIN_SCENES = 2
@@ -40,7 +37,7 @@ class Run:
     config: EngineConfig
     store: StageStore  # finished stages of this folder
     into: Path | None  # the map that is extended
-    progress: Progress
+    progress: StageProgress
     cancel: Callable[[], bool]
     report: dict[str, Any] = field(
         default_factory=lambda: {"engine_version": __version__, "stages": [], "findings": [], "left_out": []}
@@ -51,9 +48,13 @@ class Run:
         """The matcher; its model is loaded when first asked for, once."""
         return load_plugins(self.config, None)
 
-    def step(self, stage: str) -> Callable[[int, int], None]:
+    def step(self, stage: str) -> CountProgress:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
+
+    def begin(self, stage: str) -> None:
+        """Tell that a stage begins, of which nothing is done yet."""
+        self.progress(stage, 0, 0)
 
     def ended(self, stage: str, started_s: float, **figures: Any) -> None:
         """Note a stage in the report."""
@@ -73,6 +74,7 @@ def scenes(
 ) -> list[SourceScene]:
     """All scenes of the map, those that it has already too; checked against one another."""
     started = time.perf_counter()
+    run.begin("scenes")
     kept = {} if run.into is None else _scenes_of_map(run.into)
     for number, name in enumerate(remove):
         if name not in kept or name in remove[:number]:
@@ -225,6 +227,7 @@ def _require_one(found: Sequence[SourceScene], name: str, code: str, what: str, 
 def association(run: Run, found: Sequence[SourceScene]) -> Association:
     """Where positions put the scenes, and which are to be compared."""
     started = time.perf_counter()
+    run.begin("association")
     result = associate(found, run.config.aggregation)
     middle = np.array([m[:3, 3] for m in result.map_from_scene])
     if np.abs(middle - middle[result.reference]).max() > FAR_APART_M:
@@ -254,6 +257,8 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
         if kept is None and older is not None:
             kept = older.load(name, key)
         if kept is None:
+            if reused == number:  # the first that is not there
+                run.begin("seams")
             seam = find_seam(
                 a,
                 b,
@@ -272,7 +277,8 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
             seam = Seam.unpack(a.name, b.name, *kept)
             reused += 1
         result.append(seam)
-        run.progress("seams", 100 * (number + 1), 100 * total)
+        if reused <= number:
+            run.progress("seams", 100 * (number + 1), 100 * total)
     run.ended("seams", started, pairs=total, pairs_reused=reused, accepted=sum(s.accepted for s in result))
     run.report["stages"][-1]["reused"] = reused == total
     return result

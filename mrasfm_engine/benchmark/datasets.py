@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.benchmark.side_by_side import TRUTH, Comparison, Settings, compare_mappers
 from mrasfm_engine.errors import InputError, ReconstructionError
 from mrasfm_engine.evaluation.trajectory import MIN_POSES
 from mrasfm_engine.geometry.alignment import align_rigid
-from mrasfm_engine.io.importers import nuscenes
-from mrasfm_engine.io.importers.layouts import import_recording
+from mrasfm_engine.importers import nuscenes
+from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.io.trajectory_file import read_tum
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 STEREO_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))  # of KITTI; the grey one is preferred
 

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine import stages
 from mrasfm_engine.ablation import warm_up
 from mrasfm_engine.benchmark import simulated_drive
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.prior_trajectory import PriorTrajectory
-from mrasfm_engine.evaluation.own_process import memory_bytes
-from mrasfm_engine.io.drive_bundle import read_drive, storage_error
-from mrasfm_engine.io.feature_database import write_matches
+from mrasfm_engine.errors import storage_error
+from mrasfm_engine.evaluation.subprocess_run import memory_bytes
+from mrasfm_engine.export.feature_database import write_matches
 from mrasfm_engine.io.stage_store import Arrays, StageStore, fingerprint
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-
-Floats = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]  # stage, done, total
+from mrasfm_engine.types import Floats, StageProgress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +68,7 @@ class Simulated:
     world_from_rig: Floats
 
 
-def prepare(progress: Progress, drive_folder: Path, config: EngineConfig, work: Path) -> Prepared:
+def prepare(progress: StageProgress, drive_folder: Path, config: EngineConfig, work: Path) -> Prepared:
     """Check a drive, extract and match; what is finished is kept in `work`."""
     run = _run(progress, drive_folder, config, StageStore(work))
     stages.load_models(run)
@@ -91,7 +87,7 @@ def prepare(progress: Progress, drive_folder: Path, config: EngineConfig, work: 
     )
 
 
-def map_drive(progress: Progress, drive_folder: Path, config: EngineConfig, work: Path) -> Mapped:
+def map_drive(progress: StageProgress, drive_folder: Path, config: EngineConfig, work: Path) -> Mapped:
     """Map from the features and matches that `prepare` left, and refine."""
     run = _run(progress, drive_folder, config, _MappedAnew(work))
     prior = stages.prior(run)
@@ -99,7 +95,7 @@ def map_drive(progress: Progress, drive_folder: Path, config: EngineConfig, work
     return _map(run, features, stages.matches(run, features, prior), prior)
 
 
-def map_simulated(progress: Progress, folder: Path, config: EngineConfig) -> Mapped:
+def map_simulated(progress: StageProgress, folder: Path, config: EngineConfig) -> Mapped:
     """Map from simulated features and matches, and refine."""
     simulated = simulated_drive.load(folder)
     key = fingerprint(simulated.drive.manifest.name)  # there are no files whose fingerprint it could be
@@ -107,7 +103,7 @@ def map_simulated(progress: Progress, folder: Path, config: EngineConfig) -> Map
     return _map(run, simulated.features, simulated.pairs, stages.prior(run))
 
 
-def write_database(progress: Progress, drive_folder: Path, config: EngineConfig, work: Path, path: Path) -> Path:
+def write_database(progress: StageProgress, drive_folder: Path, config: EngineConfig, work: Path, path: Path) -> Path:
     """Write the features and matches that `prepare` left for other mappers; the written file."""
     run = _run(progress, drive_folder, config, StageStore(work))
     prior = stages.prior(run)
@@ -115,13 +111,13 @@ def write_database(progress: Progress, drive_folder: Path, config: EngineConfig,
     return _write_database(run.drive, features, stages.matches(run, features, prior), path)
 
 
-def write_simulated_database(progress: Progress, folder: Path, path: Path) -> Path:
+def write_simulated_database(progress: StageProgress, folder: Path, path: Path) -> Path:
     """Write simulated features and matches for other mappers; the written file."""
     simulated = simulated_drive.load(folder)
     return _write_database(simulated.drive, simulated.features, simulated.pairs, path)
 
 
-def simulate(progress: Progress, rig: str, units: int, seed: int, config: EngineConfig, folder: Path) -> Simulated:
+def simulate(progress: StageProgress, rig: str, units: int, seed: int, config: EngineConfig, folder: Path) -> Simulated:
     """Simulate a drive into a folder."""
     simulated = simulated_drive.simulate_drive(rig, units, seed, config, folder, progress=progress)
     simulated_drive.save(simulated)
@@ -140,7 +136,7 @@ class _MappedAnew(StageStore):
         return None if name == "mapping" else super()._read(name, key, arrays=arrays)
 
 
-def _run(progress: Progress, drive_folder: Path, config: EngineConfig, store: StageStore) -> stages.Run:
+def _run(progress: StageProgress, drive_folder: Path, config: EngineConfig, store: StageStore) -> stages.Run:
     # Whoever wants it to end kills the process.
     return stages.Run(read_drive(drive_folder), config, store, progress, lambda: False)
 

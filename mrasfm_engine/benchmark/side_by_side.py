@@ -9,21 +9,20 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.benchmark import mapping
+from mrasfm_engine.benchmark.baselines import Mapper, run_peer
 from mrasfm_engine.benchmark.mapping import Mapped, Prepared
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError, ReconstructionError
-from mrasfm_engine.evaluation.own_process import Ran, run_apart
-from mrasfm_engine.evaluation.peers import Mapper, run_peer
 from mrasfm_engine.evaluation.pose_errors import TOLERANCE_US
+from mrasfm_engine.evaluation.subprocess_run import Ran, run_apart
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_known, match_timestamps
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.trajectory_file import Trajectory
+from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.types import Floats
 
-Floats = NDArray[np.float64]
 Progress = Callable[[str, str, int, int], None]  # row, stage, done, total
 Call = TypeVar("Call")
 

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.benchmark.simulated_matches import simulate_matches
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.io.drive_bundle import read_drive, storage_error, write_manifest
+from mrasfm_engine.errors import storage_error
+from mrasfm_engine.preflight.drive_reader import read_drive, write_manifest
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.stages import pack_pairs, unpack_pairs
 from mrasfm_engine.synthetic.long_route import LongRoute, simulate_long_route
+from mrasfm_engine.types import Floats, Floats32, StageProgress
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
-
-Floats = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]  # stage, done, total
 
 ARRAYS = "simulated.npz"
 FIRST_US, INTERVAL_US = 1_750_000_000_000_000, 100_000
@@ -37,7 +34,7 @@ class SimulatedDrive:
 
 
 def simulate_drive(
-    rig: str, units: int, seed: int, config: EngineConfig, folder: Path, *, progress: Progress
+    rig: str, units: int, seed: int, config: EngineConfig, folder: Path, *, progress: StageProgress
 ) -> SimulatedDrive:
     """Simulate a long route (see `simulate_long_route`) and its matches; the calibration is given exactly.
 
@@ -86,7 +83,7 @@ def _manifest(rig: str, route: LongRoute) -> DriveManifest:
     return DriveManifest(name=f"simulated-{rig}-{len(frames)}", rig=Rig(cameras=cameras), frames=frames)
 
 
-def _features(xy_px: NDArray[np.float32]) -> ImageFeatures:
+def _features(xy_px: Floats32) -> ImageFeatures:
     return ImageFeatures(
         xy_px=xy_px,
         descriptors=np.zeros((len(xy_px), 0), np.uint8),

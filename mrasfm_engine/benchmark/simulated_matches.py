@@ -13,25 +13,22 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.pairs import pairs_from_window
-from mrasfm_engine.correspondence.revisits import MIN_GAP_UNITS
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.pair_selection import pairs_from_window
+from mrasfm_engine.matching.retrieval import MIN_GAP_UNITS
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.synthetic.long_route import LongRoute
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import CountProgress, Floats, Ints
 
 WRONG = 0.1  # share of every pair's matches
 MAX_ANGLE_DEG = 35.0  # between the views of a point that still look alike
@@ -62,7 +59,7 @@ def simulate_matches(
     config: EngineConfig,
     rng: np.random.Generator,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: CountProgress | None = None,
 ) -> list[PairMatches]:
     """Verified matches of the route's image pairs; `drive` has one image for each of the route's."""
     views = list(_views(route))

@@ -17,9 +17,9 @@ from rich.table import Table
 from mrasfm_engine.commands.work_folder import work_folder, write_document
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.preflight.drive_reader import read_drive
 
 if TYPE_CHECKING:
     from mrasfm_engine.ablation import Row
@@ -31,7 +31,12 @@ TRUE_CALIBRATION = "truth_calibration.json"  # as `mrasfm synth` calls it
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("ablate", help="reconstruct a drive without each part of the method, and compare")
+    parser = subparsers.add_parser(
+        "ablate",
+        help="reconstruct a drive without each part of the method, and compare",
+        description="Reconstruct a drive with every part of the method and once more without each part, and compare "
+        "the results with the truth.",
+    )
     parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.json")
     parser.add_argument(
         "--truth", type=Path, required=True, metavar="FILE", help="true poses of the rig in TUM's format"
@@ -43,9 +48,15 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help=f"true poses of the cameras in the rig (default: {TRUE_CALIBRATION} beside the truth, else as given)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"keep stages and {RESULT} in this folder")
-    parser.add_argument("--only", action="append", default=[], metavar="SWITCH", help="this part only; may be repeated")
+    parser.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        metavar="SWITCH",
+        help="setting of one part, as in mapping.camera_set_registration; may be repeated (default: all parts)",
+    )
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.set_defaults(run=run)
 
@@ -56,11 +67,12 @@ def run(arguments: argparse.Namespace) -> int:
     truth = read_tum(arguments.truth)
     calibration, source = _true_calibration(arguments)
     from mrasfm_engine.ablation import ablate, switches_named
-    from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, progress_bars
+    from mrasfm_engine.commands.reconstruct import cancel_on_interrupt
+    from mrasfm_engine.commands.stage_progress import stage_progress
 
     switches, console = switches_named(arguments.only), Console(stderr=True)
     with work_folder(arguments.out, prefix="mrasfm-ablation-") as work:
-        with cancel_on_interrupt(console) as cancelled, progress_bars(console) as bars:
+        with cancel_on_interrupt(console) as cancelled, stage_progress(console) as bars:
             rows = ablate(
                 arguments.drive,
                 truth,

@@ -9,7 +9,8 @@ from typing import Any
 from rich.console import Console
 
 from mrasfm_engine.commands.named_path import split_name
-from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, progress_bars
+from mrasfm_engine.commands.reconstruct import cancel_on_interrupt
+from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
 
@@ -18,8 +19,8 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "aggregate",
-        help="put scenes together to a map",
-        description="Find how scenes of several drives lie to one another, and make one map of them.",
+        help="join scenes to a map",
+        description="Find the seams between scenes of several drives and join them to one map.",
     )
     parser.add_argument(
         "scenes", nargs="*", metavar="SCENE", help="folders that `mrasfm reconstruct` wrote, or NAME=FOLDER"
@@ -27,7 +28,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--out", type=Path, metavar="MAP", help="folder for the map; with --into by default that one")
     parser.add_argument("--into", type=Path, metavar="MAP", help="add the scenes to this map")
     parser.add_argument("--remove", action="append", default=[], metavar="NAME", help="take a scene out of the map")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
     parser.set_defaults(run=run)
 
 
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mrasfm_engine.aggregation.stages import map_document
 
     console = Console(stderr=True)
-    with cancel_on_interrupt(console) as cancelled, progress_bars(console) as progress:
+    with cancel_on_interrupt(console) as cancelled, stage_progress(console) as progress:
         report = aggregate(
             scenes, out, config, into=arguments.into, remove=arguments.remove, progress=progress, cancel=cancelled
         )

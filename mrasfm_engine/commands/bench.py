@@ -1,4 +1,4 @@
-"""`mrasfm bench`: time, memory and error beside other mappers, on simulated routes and on published data sets."""
+"""`mrasfm bench`: time, memory and error beside other mappers, on simulated paths and on published data sets."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "bench",
         help="measure time, memory and error, also beside COLMAP",
-        description="Measure on one of: a drive (DRIVE), simulated routes (--simulate), KITTI odometry (--kitti), "
-        "nuScenes (--nuscenes). Every mapper runs in a process of its own, on the same features and matches.",
+        description="Measure on one of: a drive (DRIVE), simulated paths (--simulate), KITTI odometry (--kitti), "
+        "nuScenes (--nuscenes). Every mapper runs in its own process, on the same features and matches.",
     )
     parser.add_argument("drive", nargs="?", type=Path, metavar="DRIVE", help="folder with drive.json")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="true poses (TUM's format); else DRIVE's truth.tum")
-    parser.add_argument("--simulate", metavar="RIG", help="long routes without images: stereo or surround")
-    parser.add_argument("--units", metavar="N[,N]", help=f"lengths of the routes, 1 m each (default: {DEFAULT_UNITS})")
-    parser.add_argument("--seed", type=int, help="everything random about the routes follows from it (default: 0)")
+    parser.add_argument("--simulate", metavar="RIG", help="long paths without images: stereo or surround")
+    parser.add_argument(
+        "--units", metavar="N[,N]", help=f"number of units of each path, one per metre (default: {DEFAULT_UNITS})"
+    )
+    parser.add_argument("--seed", type=int, help="everything random about the paths follows from it (default: 0)")
     parser.add_argument("--kitti", type=Path, metavar="FOLDER", help="KITTI odometry: sequences/ and poses/")
     parser.add_argument("--sequences", metavar="LIST", help="as 00-10 or 00,05 (default: all that have true poses)")
     parser.add_argument("--nuscenes", type=Path, metavar="FOLDER", help="nuScenes: v1.0-*/ and samples/")
@@ -43,15 +45,15 @@ def register(subparsers: Any) -> None:
         "--peers",
         default="",
         metavar="LIST",
-        help="other mappers, separated by commas: colmap-incremental, colmap-global, and both with -fixed, which are "
-        "told to hold the calibration",
+        help="baseline mappers, separated by commas: colmap-incremental, colmap-global, and both with -fixed, which "
+        "hold the calibration",
     )
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="mappings; the one of median time counts")
     parser.add_argument(
         "--timeout-s", type=float, default=float("inf"), metavar="S", help="for one mapping (default: none)"
     )
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"keep features, matches and {RESULT} in this folder")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     parser.set_defaults(run=run)
@@ -63,11 +65,12 @@ def run(arguments: argparse.Namespace) -> int:
     config = read_config(arguments.config, **({"use_gnss": False} if arguments.no_gnss else {}))
     from mrasfm_engine.benchmark.side_by_side import Settings, peers_named
     from mrasfm_engine.commands import bench_output
-    from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, progress_bars
+    from mrasfm_engine.commands.reconstruct import cancel_on_interrupt
+    from mrasfm_engine.commands.stage_progress import stage_progress
 
     console = Console(stderr=True)
     with work_folder(arguments.out, prefix="mrasfm-bench-") as work:
-        with cancel_on_interrupt(console) as cancelled, progress_bars(console) as bars:
+        with cancel_on_interrupt(console) as cancelled, stage_progress(console) as bars:
             settings = Settings(
                 config=config,
                 peers=peers_named(arguments.peers),
@@ -102,7 +105,7 @@ def _require_one_kind(arguments: argparse.Namespace) -> None:
 
 
 def _measure(arguments: argparse.Namespace, work: Path, settings: Any) -> Any:
-    from mrasfm_engine.benchmark import datasets, growth
+    from mrasfm_engine.benchmark import datasets, scaling
     from mrasfm_engine.benchmark.side_by_side import TRUTH, compare_mappers
     from mrasfm_engine.commands import bench_datasets_output, bench_output
     from mrasfm_engine.io.trajectory_file import read_tum
@@ -110,7 +113,7 @@ def _measure(arguments: argparse.Namespace, work: Path, settings: Any) -> Any:
     if arguments.simulate is not None:
         lengths = _lengths(arguments.units or DEFAULT_UNITS)
         return bench_output.GrowthOutput(
-            growth.measure_growth(arguments.simulate, lengths, arguments.seed or 0, work, settings)
+            scaling.measure_growth(arguments.simulate, lengths, arguments.seed or 0, work, settings)
         )
     if arguments.kitti is not None:
         sequences = datasets.kitti_sequences(arguments.kitti, arguments.sequences)

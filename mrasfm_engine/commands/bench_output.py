@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mrasfm_engine import __version__
-from mrasfm_engine.benchmark.growth import Growth, GrowthRow
+from mrasfm_engine.benchmark.scaling import Growth, GrowthRow
 from mrasfm_engine.benchmark.side_by_side import Comparison, Row
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.evaluation.trajectory import TrajectoryErrors

@@ -22,7 +22,12 @@ TOLERANCE_US = 1000
 
 def register(subparsers: Any) -> None:
     """Add the `evaluate` parser."""
-    parser = subparsers.add_parser("evaluate", help="compare a scene's or map's trajectory with the truth")
+    parser = subparsers.add_parser(
+        "evaluate",
+        help="compare a scene's or map's trajectory with the truth",
+        description="Compare the trajectory of a scene or a map with true poses: errors before and after "
+        "alignment, and the errors of a map's seams.",
+    )
     parser.add_argument(
         "scene", type=Path, metavar="OUT", help="the folder that `mrasfm reconstruct` or `mrasfm aggregate` wrote"
     )

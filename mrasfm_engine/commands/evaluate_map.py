@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -18,8 +17,7 @@ from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, com
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.read_map import MapPoses, MapSeam, read_map
 from mrasfm_engine.io.trajectory_file import Trajectory, read_tum
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 TOLERANCE_US = 1000
 

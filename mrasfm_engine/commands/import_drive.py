@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from mrasfm_engine.io.importers.layouts import import_recording
+from mrasfm_engine.importers.layouts import import_recording
 
 
 def register(subparsers: Any) -> None:
@@ -25,7 +25,7 @@ def register(subparsers: Any) -> None:
         help="slice of the frames, STOP not included; where START is negative, write --frames=-10:",
     )
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in FOLDER or the working directory")
-    parser.add_argument("--scene", metavar="NAME", help="which scene, if the recording holds several")
+    parser.add_argument("--scene", metavar="NAME", help="name of the scene, if the recording holds several")
     files = parser.add_mutually_exclusive_group()
     files.add_argument("--link", action="store_true", help="hard-link images where possible (the default)")
     files.add_argument("--copy", action="store_true", help="copy images")

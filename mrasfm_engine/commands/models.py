@@ -21,23 +21,28 @@ _USE = {True: "yes", False: "NO", None: "not known"}
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("models", help="trained models: list, pull, add")
+    parser = subparsers.add_parser(
+        "models", help="list, download and add trained models", description="List, download and add trained models."
+    )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    listing = actions.add_parser("list", help="which are known, their licences, which are there")
+    listing = actions.add_parser("list", help="list known models, their licences and the installed ones")
     listing.add_argument("--json", action="store_true", help="one JSON object, with signatures and sources")
     listing.set_defaults(run=run_list)
-    pulling = actions.add_parser("pull", help="download a published one")
-    pulling.add_argument("name", metavar="NAME", help="see list")
+    pulling = actions.add_parser("pull", help="download a published model")
+    pulling.add_argument("name", metavar="NAME", help="name of the model, as mrasfm models list prints it")
     pulling.set_defaults(run=run_pull)
-    adding = actions.add_parser("add", help="take in a file that you have")
+    adding = actions.add_parser("add", help="add a model file")
     adding.add_argument("file", type=Path, metavar="FILE", help="ONNX model, in one file")
     adding.add_argument(
-        "--name", metavar="NAME", help="what it is or shall be called (default: what it is found to be)"
+        "--name", metavar="NAME", help="name of the model (default: the name that its signature implies)"
     )
     adding.set_defaults(run=run_add)
     for action in (listing, pulling, adding):
         action.add_argument(
-            "--folder", type=Path, metavar="DIR", help="where models lie (default: MRASFM_MODELS or the user's data)"
+            "--folder",
+            type=Path,
+            metavar="DIR",
+            help="folder of the models (default: MRASFM_MODELS or the user's data folder)",
         )
 
 

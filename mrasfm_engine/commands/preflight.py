@@ -12,23 +12,25 @@ import sys
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.documents import read_document
-from mrasfm_engine.io.drive_bundle import MANIFEST_NAME, read_drive
-from mrasfm_engine.io.findings import Finding, as_json, error
-from mrasfm_engine.io.preflight import check_manifest, is_sound
+from mrasfm_engine.findings import Finding, as_json, error
+from mrasfm_engine.preflight.drive_check import check_manifest, is_sound
+from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, read_drive, read_manifest
 from schemas import DriveManifest
 
 EXIT_UNSOUND = 2
+_DESCRIPTION = "Check a drive without reconstructing it. The exit code is 2 where a finding is an error."
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    _add_arguments(subparsers.add_parser("preflight", help="check a drive without reconstructing it"))
+    _add_arguments(
+        subparsers.add_parser("preflight", help="check a drive without reconstructing it", description=_DESCRIPTION)
+    )
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command alone."""
-    parser = argparse.ArgumentParser(prog="mrasfm preflight", description="Check a drive without reconstructing it.")
+    parser = argparse.ArgumentParser(prog="mrasfm preflight", description=_DESCRIPTION)
     _add_arguments(parser)
     return run(parser.parse_args(argv))
 
@@ -36,9 +38,12 @@ def main(argv: list[str] | None = None) -> int:
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("drive", type=Path, metavar="DRIVE", help=f"folder with {MANIFEST_NAME}")
     parser.add_argument(
-        "--manifest-only", action="store_true", help=f"look at no image; DRIVE may be a {MANIFEST_NAME} itself"
+        "--manifest-only", action="store_true", help=f"open no image; DRIVE may be a {MANIFEST_NAME} itself"
     )
-    parser.add_argument("--no-gnss", action="store_true", help="as for a reconstruction that ignores GNSS")
+    parser.add_argument("--no-gnss", action="store_true", help="check for a reconstruction that ignores GNSS")
+    parser.add_argument(
+        "--accepted", action="store_true", help="leave out rules for new manifests: the service has accepted this one"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object: findings, sound")
     parser.add_argument(
         "--max-memory-mb", type=int, metavar="MB", help="refuse a manifest that needs more memory than this (Linux)"
@@ -50,7 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Print what is found; 0 for a drive that can be reconstructed, 2 for one that cannot."""
     if arguments.max_memory_mb is not None:
         _bound_memory(arguments.max_memory_mb)
-    findings = _check(arguments.drive, manifest_only=arguments.manifest_only, use_gnss=not arguments.no_gnss)
+    findings = _check(
+        arguments.drive,
+        manifest_only=arguments.manifest_only,
+        use_gnss=not arguments.no_gnss,
+        is_new=not arguments.accepted,
+    )
     sound = is_sound(findings)
     if arguments.json:
         print(json.dumps({"findings": [as_json(finding) for finding in findings], "sound": sound}, allow_nan=False))
@@ -61,15 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if sound else EXIT_UNSOUND
 
 
-def _check(path: Path, *, manifest_only: bool, use_gnss: bool) -> list[Finding]:
+def _check(path: Path, *, manifest_only: bool, use_gnss: bool, is_new: bool) -> list[Finding]:
     """The findings; a drive or manifest that cannot be read is one too."""
     try:
         if not manifest_only:
             # Loads the image libraries, which the check of a manifest does without.
-            from mrasfm_engine.io.preflight_content import inspect_drive
+            from mrasfm_engine.preflight.image_content import inspect_drive
 
-            return inspect_drive(read_drive(path), use_gnss=use_gnss)
-        return check_manifest(_read_manifest(path), use_gnss=use_gnss)
+            return inspect_drive(read_drive(path, is_new=is_new), use_gnss=use_gnss)
+        return check_manifest(_read_manifest(path, is_new=is_new), use_gnss=use_gnss)
     except InputError as problem:
         return [error(problem.code, _by_name(problem.what, path), problem.remedy)]
     except MemoryError:
@@ -88,10 +98,10 @@ def _bound_memory(megabytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _read_manifest(path: Path) -> DriveManifest:
+def _read_manifest(path: Path, *, is_new: bool) -> DriveManifest:
     if path.is_dir():
-        return read_drive(path).manifest
-    return read_document(path, DriveManifest, what="drive manifest", help_page="schemas/README.md")
+        return read_drive(path, is_new=is_new).manifest
+    return read_manifest(path, is_new=is_new)
 
 
 def _by_name(what: str, path: Path) -> str:

@@ -12,18 +12,22 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("reconstruct", help="turn a drive into a scene")
+    parser = subparsers.add_parser(
+        "reconstruct",
+        help="turn a drive into a scene",
+        description="Turn a drive into a scene. An interrupted reconstruction goes on from its last finished stage.",
+    )
     parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.json")
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the scene")
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
     parser.set_defaults(run=run)
 
 
@@ -38,9 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     with (
         cancel_on_interrupt(console) as cancelled,
         watched_compilation(lambda: console.print("compiling for this machine: about a minute, once")),
-        progress_bars(console) as progress,
+        stage_progress(console) as progress,
     ):
-        report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled)
+        report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled, is_new=True)
     _say(report, arguments.out)
     return 0
 
@@ -61,24 +65,6 @@ def cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
         yield asked.is_set
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar for every stage, moved by calling with stage, done and total."""
-    columns = (TextColumn("{task.description:<11}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=console) as bars:
-
-        def update(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            if total > 1 or bars.tasks[tasks[stage]].total == 1:
-                bars.update(tasks[stage], completed=done, total=total)
-            elif done == total:
-                bars.update(tasks[stage], completed=bars.tasks[tasks[stage]].total)
-
-        yield update
 
 
 def _say(report: dict[str, Any], out: Path) -> None:

@@ -33,16 +33,16 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         parser.add_argument(flag, choices=choices, default=value, help=f"{text} (default: {value})")
 
     add("--cameras", int, "cameras of the vehicle, 1 to 8")
-    add("--units", int, "instants at which all cameras take an image, 10 a second")
+    add("--units", int, "frames in which all cameras take an image, 10 per second")
     add("--drives", int, "drives of the same world, an hour apart")
     add("--seed", int, "everything random follows from it")
     choose("--world", [world.value for world in World], "kind of street")
     parser.add_argument("--straight", action="store_true", help="a street without curves")
-    add("--ramp", float, "slope of a hill on the way, percent", to="ramp_percent", metavar="PERCENT")
+    add("--ramp", float, "slope of a hill on the path, percent", to="ramp_percent", metavar="PERCENT")
     add("--parked-cars", int, "parked cars along each drive")
     add("--moving-cars", int, "other vehicles that drive")
-    add("--moving-shadows", int, "things out of view whose shadows move over the road, beside the vehicle's own")
-    add("--shadows", float, "how dark shadows are, 0 to 1", to="shadow_strength", metavar="STRENGTH")
+    add("--moving-shadows", int, "objects out of view whose shadows move over the road, besides the vehicle's own")
+    add("--shadows", float, "darkness of shadows, 0 to 1", to="shadow_strength", metavar="STRENGTH")
 
     add("--width", int, "of the images, pixels")
     add("--height", int, "of the images, pixels")
@@ -56,9 +56,9 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add("--texture-px", int, "side of the largest textures: 64, 128, 256, 512 or 1024")
 
     add("--spacing-m", float, "mean distance between units")
-    choose("--speed-profile", [profile.value for profile in SpeedProfile], "how the speed varies")
+    choose("--speed-profile", [profile.value for profile in SpeedProfile], "variation of the speed")
     add("--standing", int, "units in the middle during which the vehicle stands", to="standing_units", metavar="UNITS")
-    add("--time-skew-ms", float, "images of a unit are taken up to that long apart")
+    add("--time-skew-ms", float, "images of a unit are taken up to this far apart in time")
     add("--readout-ms", float, "rolling shutter: time from the first row to the last; slow to render")
     add("--drop-images", float, "fraction of images that are missing", metavar="FRACTION")
     parser.add_argument(
@@ -75,7 +75,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add("--gnss-drift-m", float, "slowly changing error, sigma of each horizontal axis")
     add("--gnss-bias-m", float, "constant error of each drive, sigma of each horizontal axis")
     parser.add_argument("--biased-drive", type=int, metavar="N", help="all positions of this drive are off")
-    add("--biased-by-m", float, "by how much, in one horizontal direction; its sigmas do not say so")
+    add("--biased-by-m", float, "by this distance, in one horizontal direction; its sigmas do not include it")
     add("--gnss-outliers", float, "fraction of samples that are 5 to 40 m off", metavar="FRACTION")
     add("--gnss-offset-s", float, "added to the GNSS timestamps")
     parser.add_argument("--rough-poses", action="store_true", help="the manifest has a rough trajectory")
@@ -84,10 +84,12 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
     add("--perturb-rotation-deg", float, "norm of the error of each given extrinsic rotation, in a random direction")
     add("--perturb-translation-m", float, "norm of the error of each given camera position, in a random direction")
-    parser.add_argument("--declare-sigmas", action="store_true", help="the manifest says how good the calibration is")
+    parser.add_argument(
+        "--declare-sigmas", action="store_true", help="the manifest declares the sigmas of the calibration"
+    )
     parser.add_argument("--tight", action="store_true", help="the manifest declares 0.01 degrees and 1 mm")
-    parser.add_argument("--wrong-camera", metavar="NAME", help="this camera's given rotation is wrong")
-    add("--wrong-by-deg", float, "by how much")
+    parser.add_argument("--wrong-camera", metavar="NAME", help="camera whose given rotation is wrong")
+    add("--wrong-by-deg", float, "error of that rotation, degrees")
     parser.set_defaults(run=run)
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mrasfm_engine.io.drive_bundle import storage_error
+from mrasfm_engine.errors import storage_error
 
 
 @contextmanager

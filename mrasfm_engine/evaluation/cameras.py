@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_rigid
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_trajectories, match_timestamps
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.scene.scene import Scene
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats, Ints
 
 TOLERANCE_US = 1000
 

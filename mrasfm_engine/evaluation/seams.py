@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 OVERLAP_M = 5.0  # units of two scenes nearer than that are in the overlap
 LEAST_UNITS = 3  # the nearest ones that are compared where none are

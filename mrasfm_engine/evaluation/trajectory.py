@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_rigid, align_similarity
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats, Ints
 
 MIN_POSES = 3
 FIRST_UNITS = 5  # on which a route is aligned to see the error of its end
@@ -30,9 +27,7 @@ class TrajectoryErrors:
     similarity_scale: float  # the factor that brings the estimate onto the truth
 
 
-def match_timestamps(
-    estimate_us: NDArray[np.int64], truth_us: NDArray[np.int64], *, tolerance_us: int
-) -> tuple[Ints, Ints]:
+def match_timestamps(estimate_us: Ints, truth_us: Ints, *, tolerance_us: int) -> tuple[Ints, Ints]:
     """Pairs of nearest timestamps no farther apart than the tolerance, each timestamp used at most once.
 
     Parameters

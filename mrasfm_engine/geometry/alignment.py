@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 # A set is collinear where its second eigenvalue is below this fraction of its first: 3 cm beside 30 m (both rms).
 COLLINEAR_RATIO = 1e-6

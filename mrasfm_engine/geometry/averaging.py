@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 
 def robust_mean_rotation(rotations: Floats, *, iterations: int = 20, epsilon_rad: float = 1e-4) -> Floats:

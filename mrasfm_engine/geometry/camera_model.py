@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mrasfm_engine.types import Floats, Ints
 from schemas import Camera
-
-Floats = NDArray[np.float64]
 
 PERSPECTIVE, RADIAL, FISHEYE = 0, 1, 2
 
@@ -62,7 +61,7 @@ def unpack_camera(model: str, packed: Floats) -> Floats:
     return np.array(packed, dtype=np.float64)
 
 
-def pack_cameras(cameras: list[Camera]) -> tuple[NDArray[np.int64], Floats]:
+def pack_cameras(cameras: list[Camera]) -> tuple[Ints, Floats]:
     """Kinds (c,) and parameters (c, 8) of the manifest's cameras."""
     packed = [pack_camera(camera.model, camera.params) for camera in cameras]
     return np.array([kind for kind, _ in packed], dtype=np.int64), np.stack([params for _, params in packed])
@@ -170,9 +169,7 @@ def project_points(kind: int, params: Floats, points_cam_m: ArrayLike) -> Floats
     return pixels
 
 
-def reprojection_errors_focal(
-    kind: NDArray[np.int64], params: Floats, camera: NDArray[np.int64], points_cam_m: Floats, pixels: Floats
-) -> Floats:
+def reprojection_errors_focal(kind: Ints, params: Floats, camera: Ints, points_cam_m: Floats, pixels: Floats) -> Floats:
     """Distances (n,) of pixels (n, 2) from where points (n, 3) are seen, in focal lengths; infinite behind the camera.
 
     Parameters

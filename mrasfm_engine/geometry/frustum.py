@@ -1,4 +1,4 @@
-"""How much of what one camera sees another one sees too."""
+"""Overlap of the fields of view of two cameras."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry.camera_model import project, unproject_pixels
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats, Ints
 
 GRID = (5, 3)  # rays sampled across and down an image
 DEPTH_FRACTIONS = (0.08, 0.2, 0.45, 1.0)  # of the maximal depth: what is near weighs more

@@ -10,14 +10,13 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pyproj import Transformer
 from pyproj.exceptions import ProjError
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 # Nothing that drives is farther from the earth's centre than this; the deepest mine is not nearer than half of it.
 MAX_RADIUS_M = 7.0e6

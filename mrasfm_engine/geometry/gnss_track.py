@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_BEYOND_S = 0.5  # before the first and after the last sample nothing is known
 NEIGHBOURS = 5  # samples on each side that a sample is compared with
@@ -51,7 +47,7 @@ class GnssTrack:
 
 
 def find_gross_errors(timestamps_us: Ints, position_m: Floats, sigma_m: Floats, *, outlier_sigmas: float) -> Bools:
-    """Which samples (n,) are far from the line through their neighbours in time.
+    """Mask (n,) of samples far from the line through their neighbours in time.
 
     The line is fitted with L1 weights, so that single neighbours that are wrong themselves do little.
     """

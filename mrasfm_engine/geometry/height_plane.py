@@ -8,11 +8,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools, Floats, Ints
 
 HYPOTHESES = 96  # planes through three points
 LEVEL_HYPOTHESES = 32  # planes through one point with the expected slope

@@ -1,17 +1,13 @@
-"""How a vehicle moves around each of its known poses, from the poses before and after."""
+"""Interpolation of the motion around each known pose from the poses before and after it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_GAP_S = 2.5  # a pose farther away in time says nothing of how the vehicle moves now
 MIN_GAP_S = 0.02  # poses closer in time than this would turn their noise into speed
@@ -40,7 +36,7 @@ class LocalMotion:
 
     @property
     def known(self) -> Bools:
-        """Whether any other pose says something (u,)."""
+        """Mask (u,) of poses that have another known pose near them."""
         result: Bools = self.support[:, 1] >= 0
         return result
 
@@ -50,7 +46,7 @@ class LocalMotion:
         return moved(t * (self.velocity[unit] + t * self.bend[unit]))
 
     def weights(self, unit: Ints, offset_s: Floats) -> Floats:
-        """How far the pose then follows small steps of the `support` units' poses (n, 3): Lagrange's polynomials."""
+        """Derivatives (n, 3) of interpolated poses by those of the `support` units: Lagrange's polynomials."""
         t, (a, b) = self._clipped(unit, offset_s), self.support_s[unit].T
         result = np.zeros((len(unit), 3))
         one, two = self.support[unit, 1] >= 0, self.support[unit, 2] >= 0

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats, Ints
 
 
 def nearest(places_m: Floats, xy_m: Floats, *, count: int = 1, within_m: float = np.inf) -> tuple[Floats, Ints]:

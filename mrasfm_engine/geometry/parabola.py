@@ -9,7 +9,7 @@ MIN_BEND = 1e-6  # of samples that bend less, rounding would tell the place
 
 
 def vertex(before: NDArray[np.floating], at: NDArray[np.floating], after: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Where parabolas through the samples (...) at -1, 0 and 1 are largest, within -0.5 and 0.5.
+    """Positions (...) of the maxima of parabolas through samples at -1, 0 and 1, within -0.5 and 0.5.
 
     It is 0 where they hardly bend, or bend upwards.
     """

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from mrasfm_engine.types import Floats
 from schemas import BodyAxes, DriveManifest, Pose
-
-Floats = NDArray[np.float64]
 
 _FLU_FROM_BODY = {
     BodyAxes.FLU: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),

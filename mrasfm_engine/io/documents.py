@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -59,9 +60,25 @@ def read_document(
     InputError
         That names the file, the fields at fault and what is wrong with them.
     """
+
+    def parse(raw: bytes) -> Model:
+        return parse_document(raw, model, strict=strict, max_bytes=max_bytes)
+
+    return read_parsed(path, parse, what=what, help_page=help_page, max_bytes=max_bytes)
+
+
+def read_parsed(
+    path: Path,
+    parse: Callable[[bytes], Model],
+    *,
+    what: str,
+    help_page: str = "",
+    max_bytes: int = MAX_MANIFEST_BYTES,
+) -> Model:
+    """As `read_document`, with what `parse` makes of the file's bytes; it raises DocumentError."""
     raw = read_bytes(path, what=what, max_bytes=max_bytes)
     try:
-        return parse_document(raw, model, strict=strict, max_bytes=max_bytes)
+        return parse(raw)
     except DocumentError as error:
         fields = ", ".join(p.path for p in error.problems[:3] if p.path) or "the file"
         described = f"; {help_page} describes the format" if help_page else ""

@@ -8,17 +8,15 @@ import numpy as np
 import pyproj
 import pyproj.datadir
 import pyproj.network
-from numpy.typing import NDArray
 from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.findings import listed
 from mrasfm_engine.geometry.geodesy import ellipsoidal_from_datum
-from mrasfm_engine.io.findings import listed
+from mrasfm_engine.types import Floats
 from schemas import Gnss
-
-Floats = NDArray[np.float64]
 
 
 def ellipsoidal_heights(gnss: Gnss) -> Floats:

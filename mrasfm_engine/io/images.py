@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.image_decoding import decode_jpeg, decode_png
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular
+from mrasfm_engine.types import Bytes
 from schemas import LabelMap
-from schemas.drive import MAX_IMAGE_SIDE_PX
-
-# OpenCV reads this when it is first imported; headers are checked before decoding in any case.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
-
-import cv2
-
-Bytes = NDArray[np.uint8]
 
 
 def read_image_gray(path: Path) -> Bytes:
@@ -28,13 +22,17 @@ def read_image_gray(path: Path) -> Bytes:
 
     Raises
     ------
+    IncompleteImageError
+        That names the file, if some of its pixels are missing or corrupt.
     InputError
         That names the file, if it is missing, truncated, damaged or no JPEG or PNG.
     """
     data, header = _load(path)
+    if header.format == "JPEG":
+        return decode_jpeg(data, "GRAY", header, path)
     if not _needs_conversion(header):
-        return _decode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, path, header)
-    image = _to_8_bits(_decode(data, cv2.IMREAD_UNCHANGED, path, header))
+        return _to_8_bits(decode_png(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, header, path))
+    image = _to_8_bits(decode_png(data, cv2.IMREAD_UNCHANGED, header, path))
     if image.ndim == 2:
         return image
     return np.asarray(cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY), dtype=np.uint8)
@@ -43,10 +41,12 @@ def read_image_gray(path: Path) -> Bytes:
 def read_image_rgb(path: Path) -> Bytes:
     """An image as (height, width, 3) uint8, red, green, blue; else as `read_image_gray`."""
     data, header = _load(path)
+    if header.format == "JPEG":
+        return decode_jpeg(data, "RGB", header, path)
     if not _needs_conversion(header):
-        image = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, path, header)
+        image = _to_8_bits(decode_png(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, header, path))
     else:
-        image = _to_8_bits(_decode(data, cv2.IMREAD_UNCHANGED, path, header))
+        image = _to_8_bits(decode_png(data, cv2.IMREAD_UNCHANGED, header, path))
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, axis=2)
     return np.ascontiguousarray(image[..., 2::-1])
@@ -68,7 +68,7 @@ def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:
     """
     data, header = _load(path)
     check_mask_header(header, path)
-    mask = _decode(data, cv2.IMREAD_UNCHANGED, path, header)
+    mask = _to_8_bits(decode_png(data, cv2.IMREAD_UNCHANGED, header, path))
     ids = (LabelMap.cityscapes() if label_map is None else label_map).ids
     unknown = [i for i in np.flatnonzero(np.bincount(mask.ravel(), minlength=256)) if int(i) not in ids]
     if unknown:
@@ -153,21 +153,7 @@ def _load(path: Path) -> tuple[Bytes, ImageHeader]:
     return np.frombuffer(data, dtype=np.uint8), header
 
 
-def _decode(data: Bytes, flags: int, path: Path, header: ImageHeader) -> Bytes:
-    try:
-        image = cv2.imdecode(data, flags)
-    except cv2.error:
-        image = None
-    if image is None or image.shape[:2] != (header.height, header.width):
-        raise InputError(
-            f"image {path} is damaged and cannot be decoded",
-            remedy="Copy it again from its source.",
-            code="damaged-image",
-        )
-    return image  # type: ignore[no-any-return]
-
-
-def _to_8_bits(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Bytes:
+def _to_8_bits(image: Bytes | NDArray[np.uint16]) -> Bytes:
     if image.dtype == np.uint16:
         return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     return image.astype(np.uint8, copy=False)

@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.read_scene import read_json
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.scene.drive import matrix_from_pose
+from mrasfm_engine.types import Floats
 from schemas import Pose
-
-Floats = NDArray[np.float64]
 
 MAP_FILE = "map.json"
 REMEDY = "Give the folder that `mrasfm aggregate --out` wrote."

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Bytes, Floats, Floats32, Ints
 
 POINT_HEAD = struct.Struct("<Q3d3BdQ")
 TRACK_ENTRY_BYTES = 8
@@ -22,7 +20,7 @@ class ModelImage:
     """One image of a model."""
 
     name: str
-    xy_px: NDArray[np.float32]  # (n, 2)
+    xy_px: Floats32  # (n, 2)
     point: Ints  # (n,) index into the points, -1 for none
 
 
@@ -31,7 +29,7 @@ class ModelPoints:
     """The points of a model; ids are index + 1."""
 
     xyz_m: Floats  # (p, 3)
-    color: NDArray[np.uint8]  # (p, 3)
+    color: Bytes  # (p, 3)
     error_px: Floats  # (p,)
 
 

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.trajectory_file import Trajectory, read_tum
 from mrasfm_engine.scene.drive import matrix_from_pose
+from mrasfm_engine.types import Floats
 from schemas import Pose
-
-Floats = NDArray[np.float64]
 
 REMEDY = "Give the folder that `mrasfm reconstruct --out` wrote."
 

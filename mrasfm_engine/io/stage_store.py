@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 import mrasfm_engine
 import schemas
-from mrasfm_engine.io.drive_bundle import storage_error
+from mrasfm_engine.errors import storage_error
 from mrasfm_engine.scene.drive import Drive
 
-NOT_IN_STAGES = ("ablation.py", "benchmark", "commands", "evaluation", "synthetic", "views")
+NOT_IN_STAGES = ("ablation.py", "benchmark", "commands", "evaluation", "synthetic", "visualization")
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -8,12 +8,10 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats, Ints
 
 REMEDY = (
     "Give one line 'timestamp tx ty tz qx qy qz qw' a pose: seconds, metres, unit quaternion; '#' starts a comment."
@@ -24,7 +22,7 @@ REMEDY = (
 class Trajectory:
     """Poses sorted by time."""
 
-    timestamps_us: NDArray[np.int64]  # (n,) strictly rising
+    timestamps_us: Ints  # (n,) strictly rising
     world_from_rig: Floats  # (n, 4, 4)
 
 

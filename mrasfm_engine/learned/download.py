@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,6 +12,7 @@ from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.learned.catalogue import KnownModel
 from mrasfm_engine.learned.model_folder import InstalledModel, ModelFolder, how_to_get
 from mrasfm_engine.learned.onnx_file import read_model, sha256_of
+from mrasfm_engine.types import CountProgress
 
 TIMEOUT_S = 30.0
 CHUNK_BYTES = 1 << 20
@@ -20,7 +20,7 @@ MAX_BYTES = 1 << 30  # no model of the catalogue comes near; a wrong answer shal
 
 
 def pull(
-    model: KnownModel, folder: ModelFolder, *, progress: Callable[[int, int], None] = lambda done, total: None
+    model: KnownModel, folder: ModelFolder, *, progress: CountProgress = lambda done, total: None
 ) -> InstalledModel:
     """Download a model into the folder; where it is there already nothing is asked of the network.
 
@@ -53,7 +53,7 @@ def pull(
         ) from error
 
 
-def _download(model: KnownModel, url: str, file: Path, progress: Callable[[int, int], None]) -> None:
+def _download(model: KnownModel, url: str, file: Path, progress: CountProgress) -> None:
     try:
         response = urllib.request.urlopen(url, timeout=TIMEOUT_S)
     except urllib.error.HTTPError as error:

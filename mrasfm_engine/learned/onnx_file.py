@@ -7,12 +7,16 @@ package that reads all of it is needed for nothing else here.
 from __future__ import annotations
 
 import hashlib
+import os
+import stat
 from collections.abc import Iterator
+from io import BytesIO, FileIO
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError
 
-MAX_BYTES = 2**31 - 1  # of a protobuf message
+MAX_BYTES = 2**31 - 1  # of a protobuf message: no ONNX model in one file is larger
+_PIECE_BYTES = 1 << 20
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MODEL_GRAPH, _MODEL_FUNCTIONS = 7, 25
 _GRAPH_NODE, _GRAPH_INITIALIZER, _GRAPH_SPARSE = 1, 5, 15
@@ -22,6 +26,17 @@ _ATTRIBUTE_SPARSE, _ATTRIBUTE_SPARSES = 22, 23
 _SPARSE_VALUES, _SPARSE_INDICES = 1, 2
 _TENSOR_NAME, _TENSOR_EXTERNAL, _TENSOR_LOCATION = 8, 13, 14
 MAX_DEPTH = 32
+
+# Opening a pipe would wait for somebody who writes into it.
+_READ_WITHOUT_WAITING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+# What a path may be besides a regular file, by the test of its mode.
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
 
 # Which fields of a message are messages that may hold tensors, and of which type these are.
 _CHILDREN: dict[str, dict[int, str]] = {
@@ -47,18 +62,29 @@ def read_model(path: Path) -> bytes:
     Raises
     ------
     InputError
-        Where the file cannot be read, is too large, is no ONNX model, or keeps weights in other files.
+        Where the file cannot be read, is no regular file, empty or too large, is no ONNX model, or keeps weights in
+        other files.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(
-                f"model {path} has more than {MAX_BYTES} bytes", remedy="Give a smaller model.", code="bad-model"
-            )
-        data = path.read_bytes()
+        descriptor = os.open(path, _READ_WITHOUT_WAITING)
+        try:
+            _require_regular(os.fstat(descriptor), path)
+            with open(descriptor, "rb", buffering=0, closefd=False) as file:
+                data = _read_in_pieces(file, path)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         raise InputError(
-            f"model {path} cannot be read: {error.strerror}", remedy="Give an existing file.", code="unreadable-file"
+            f"model {path} cannot be read: {error.strerror}",
+            remedy="Give an existing file that you may read.",
+            code="unreadable-file",
         ) from error
+    except MemoryError:
+        raise InputError(
+            f"model {path} needs more memory than there is",
+            remedy="Give a smaller model, or more memory.",
+            code="bad-model",
+        ) from None
     try:
         outside = list(external_tensors(memoryview(data)))
         fields = {number for number, _, _ in _fields(memoryview(data))}
@@ -73,6 +99,45 @@ def read_model(path: Path) -> bytes:
             code="bad-model",
         )
     return data
+
+
+def _require_regular(status: os.stat_result, path: Path) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((name for test, name in _KINDS if test(status.st_mode)), "no regular file")
+        raise InputError(f"model {path} is {kind}", remedy="Give the ONNX file itself.", code="not-a-file")
+    if status.st_size > MAX_BYTES:
+        raise _too_large(path)
+
+
+def _read_in_pieces(file: FileIO, path: Path) -> bytes:
+    """The content: no more of it than the bound if the file grows, and of what is no model only the beginning."""
+    content = BytesIO()
+    while piece := file.read(_PIECE_BYTES):
+        if content.tell() == 0 and not _begins_a_message(piece):
+            raise _no_model(path)
+        content.write(piece)
+        if content.tell() > MAX_BYTES:
+            raise _too_large(path)
+    if content.tell() == 0:
+        raise InputError(
+            f"{path} is no ONNX model: it is empty (0 bytes)",
+            remedy="Copy it again from its source.",
+            code="empty-file",
+        )
+    return content.getvalue()
+
+
+def _too_large(path: Path) -> InputError:
+    return InputError(
+        f"model {path} has more than {MAX_BYTES} bytes, the most that an ONNX model in one file can have",
+        remedy="Give a smaller model.",
+        code="bad-model",
+    )
+
+
+def _begins_a_message(piece: bytes) -> bool:
+    """Whether the first byte can be a field's key: a number over 0, of a type that ONNX has."""
+    return piece[0] >> 3 > 0 and piece[0] & 7 in (_VARINT, _FIXED64, _BYTES, _FIXED32)
 
 
 def sha256_of(data: bytes) -> str:

@@ -1,1 +1,1 @@
-"""What everything else speaks about: drives, scenes, and the state that is being estimated."""
+"""The data of all rooms: drives, scenes, and the estimated state."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.types import Floats, Ints
 from schemas import Camera, DriveManifest, Pose
-
-Floats = NDArray[np.float64]
 
 
 def matrix_from_pose(pose: Pose) -> Floats:
@@ -26,6 +25,13 @@ def pose_from_matrix(a_from_b: Floats) -> Pose:
         rotation_xyzw=[float(v) for v in se3.quaternion_from_rotation(a_from_b[:3, :3])],
         translation_m=[float(v) for v in a_from_b[:3, 3]],
     )
+
+
+class Incomplete(StrEnum):
+    """Why an image of which some pixels can be decoded is not used."""
+
+    TRUNCATED = "truncated"
+    CORRUPT = "corrupt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,11 +78,11 @@ class Drive:
 
     @cached_property
     def has_single_camera(self) -> bool:
-        """Whether all images are of one camera, however many the rig has: then it knows no scale."""
+        """True if all images are of one camera, however many the rig has; such a drive has no scale."""
         return len({image.camera for image in self.images}) == 1
 
     @cached_property
-    def timestamps_us(self) -> NDArray[np.int64]:
+    def timestamps_us(self) -> Ints:
         """The units' timestamps (units,)."""
         return np.array([frame.timestamp_us for frame in self.manifest.frames], dtype=np.int64)
 

@@ -6,20 +6,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry.neighbours import nearest
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools, Floats, Ints
 
 SAME_LEVEL_M = 1.0  # patches farther apart in height are of different roads, above one another
 NEIGHBOURS = 12  # patches that are asked for at one place
 
 
 class RoadSource(StrEnum):
-    """How points of the road were told from others."""
+    """Source of the decision that a point is on the road."""
 
     MASKS = "masks"
     GEOMETRY = "geometry"  # below the vehicle's way, where no mask says what is road: less sure
@@ -76,7 +72,7 @@ class RoadSurface:
 
 
 def patch_weight(reach_m: Floats, radius_m: float) -> Floats:
-    """How much a patch counts at a horizontal distance from its centre: 1 there, 0 from its radius on."""
+    """Weight of a patch at a horizontal distance from its centre: 1 there, 0 from its radius on."""
     scaled = np.minimum(np.where(np.isfinite(reach_m), reach_m, radius_m) / radius_m, 1.0)
     result: Floats = np.maximum((1.0 - scaled**2) ** 2, 1e-9) * (scaled < 1.0)
     return result
@@ -84,14 +80,14 @@ def patch_weight(reach_m: Floats, radius_m: float) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Thickness:
-    """How thick a layer points make about the surface, from their signed distances; nothing is left out."""
+    """Thickness of the layer of points about the surface, from the signed distances of all points."""
 
     range90_m: float  # between the 5th and the 95th percentile
     spread_m: float  # 1.4826 times the median absolute deviation: the standard deviation, were they normal
 
     @staticmethod
     def of(distance_m: Floats) -> Thickness:
-        """Of signed distances (n,), those that are NaN aside; NaN for none."""
+        """Compute from signed distances (n,) without the NaN ones; NaN for none."""
         known = distance_m[np.isfinite(distance_m)]
         if not len(known):
             return Thickness(range90_m=float("nan"), spread_m=float("nan"))
@@ -120,10 +116,10 @@ class Road:
 
     @property
     def thickness_before(self) -> Thickness:
-        """Of all points that were taken for the road's."""
+        """Thickness of all points taken for the road."""
         return Thickness.of(self.before.distance_m)
 
     @property
     def thickness_after(self) -> Thickness:
-        """Of those that were kept."""
+        """Thickness of the inliers."""
         return Thickness.of(self.before.distance_m[self.before.kept])

@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.road import Road
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,15 +19,17 @@ class ImageFeatures:
     xy_px has COLMAP's convention: the centre of the top left pixel is at (0.5, 0.5).
     """
 
-    xy_px: NDArray[np.float32]  # (n, 2)
+    xy_px: Floats32  # (n, 2)
     # uint8 (n, 128): RootSIFT scaled by 512 and clipped to 255, as COLMAP stores it; float32 (n, D): of a network
-    descriptors: NDArray[np.uint8] | NDArray[np.float32]
-    colors: NDArray[np.uint8]  # (n, 3) red, green, blue at the keypoint
-    scores: NDArray[np.float32] | None = None  # (n,) a trained network's confidence
+    descriptors: Bytes | Floats32
+    colors: Bytes  # (n, 3) red, green, blue at the keypoint
+    scores: Floats32 | None = None  # (n,) a trained network's confidence
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
-    classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where it was not asked
-    made_mask: NDArray[np.uint8] | None = None
+    made_mask: Bytes | None = None
+    # of an image without keypoints that takes no part, as its pixels are not all there
+    left_out: Incomplete | None = None
 
     def __post_init__(self) -> None:
         if not len(self.classes):
@@ -43,12 +43,12 @@ class PairMatches:
     image_a: int
     image_b: int
     matches: NDArray[np.int32]  # (m, 2) keypoint indices, before verification
-    inliers: NDArray[np.bool_]  # (m,) which of them passed geometric verification
+    inliers: Bools  # (m,) which of them passed geometric verification
 
 
 @dataclass(frozen=True, kw_only=True)
 class Georeference:
-    """Where the scene's local frame lies on the earth.
+    """Position of the scene's local frame on the earth.
 
     The local frame is an east-north-up frame (x east, y north, z up) in metres at `origin_*`.
     """
@@ -71,13 +71,13 @@ class CameraCalibration:
     sigma_focal_px: float
     # which of the six directions (rotation x y z, translation x y z) of this camera among the others the drive
     # observed, the rest is only the prior
-    observed: NDArray[np.bool_]  # (6,)
+    observed: Bools  # (6,)
     is_wrong: bool = False  # whether what was given is far from what the drive shows
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationVerdict:
-    """What the drive could say of the cameras together."""
+    """Observability of the relative poses of all cameras in the drive."""
 
     adjusted: bool  # whether `rig_from_cam` varied at all
     reason: str
@@ -94,14 +94,14 @@ class Scene:
     """
 
     drive: Drive
-    unit_registered: NDArray[np.bool_]  # (units,)
-    image_registered: NDArray[np.bool_]  # (images,)
+    unit_registered: Bools  # (units,)
+    image_registered: Bools  # (images,)
     world_from_rig: Floats  # (units, 4, 4); rows of units that are not registered are NaN
     sigma_position_m: Floats  # (units, 3), NaN where not known
     calibration: list[CameraCalibration]  # by camera
     calibration_verdict: CalibrationVerdict | None = None
     points_m: Floats  # (p, 3)
-    point_colors: NDArray[np.uint8]  # (p, 3)
+    point_colors: Bytes  # (p, 3)
     point_error_px: Floats  # (p,) mean reprojection error
     # one row an observation, sorted by point
     observation_point: Ints
@@ -116,7 +116,7 @@ class Scene:
     # where the rig was at every image's own timestamp, relative to its unit's pose (images, 4, 4); None: at its unit's
     unit_from_image: Floats | None = None
     # (p,) classes as `semantics.CLASS_CODES` numbers them, and patches of the road; unknown and -1 where not given
-    point_classes: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    point_classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     point_patches: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     road: Road | None = None
     # (cameras,) of a map: which vehicle each camera is on; empty where all are on one

@@ -1,4 +1,4 @@
-"""What the ids of a semantic mask mean, and the classes of keypoints and points as small integers."""
+"""Meaning of the ids of a semantic mask, and classes of keypoints and points as small integers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.types import Bools, Bytes, Ints
 from schemas import LabelMap, SemanticClass
-
-Bytes = NDArray[np.uint8]
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 # Keypoints on these show something that moves, is infinitely far away, or comes along with the camera.
 WITHOUT_KEYPOINTS = (SemanticClass.DYNAMIC, SemanticClass.SKY, SemanticClass.OWN_CAR)
@@ -40,7 +37,7 @@ def class_codes(mask: Bytes, label_map: LabelMap) -> Bytes:
 
 
 def usable_pixels(codes: Bytes) -> Bools:
-    """Where keypoints may be taken in an image with these classes (h, w)."""
+    """Mask (h, w) of pixels with classes on which keypoints are detected."""
     table = np.ones(256, dtype=np.bool_)
     table[[CLASS_CODES[meaning] for meaning in WITHOUT_KEYPOINTS]] = False
     result: Bools = table[codes]
@@ -68,18 +65,18 @@ def classes_at(codes: Bytes, xy_px: NDArray[np.floating]) -> Bytes:
 
 
 def may_match(a: Bytes, b: Bytes) -> Bools:
-    """Which pairs (n,) of keypoints can show one thing by their classes; what is unknown can be anything."""
+    """Mask (n,) of keypoint pairs whose classes are compatible; an unknown class is compatible with all."""
     result: Bools = (a == b) | (a == UNKNOWN) | (b == UNKNOWN)
     return result
 
 
 def count_classes(classes: Sequence[Bytes]) -> dict[str, int]:
-    """How many of all keypoints have each class, by its name; classes that none has are left out."""
+    """Number of keypoints of each class by name; classes without keypoints are left out."""
     counts = np.bincount(np.concatenate([np.zeros(0, np.uint8), *classes]), minlength=len(CLASS_NAMES))
     return {CLASS_NAMES[code]: int(n) for code, n in enumerate(counts) if n}
 
 
-def majority_class(classes: Bytes, owner: NDArray[np.int64], count: int) -> Bytes:
+def majority_class(classes: Bytes, owner: Ints, count: int) -> Bytes:
     """The class (count,) of most observations of every owner; unknown ones have no vote, ties go to the smaller code.
 
     Parameters

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +32,7 @@ class State:
         """The units' poses (u, 4, 4)."""
         return se3.transform(self.unit_rotation, self.unit_position_m)
 
-    def world_from_rig_of(self, units: NDArray[np.int64]) -> Floats:
+    def world_from_rig_of(self, units: Ints) -> Floats:
         """The poses (n, 4, 4) of some units, without those of all others."""
         return se3.transform(self.unit_rotation[units], self.unit_position_m[units])
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from mrasfm_engine.types import Bytes, Ints
 
 MAX_LEVELS = 12
 
@@ -21,7 +21,7 @@ class Atlas:
     """
 
     texels: NDArray[np.uint32]  # (texels,): red in the lowest byte, then green, blue and alpha
-    offset: NDArray[np.int64]  # (textures, MAX_LEVELS)
+    offset: Ints  # (textures, MAX_LEVELS)
     log2_width: NDArray[np.int32]  # (textures,)
     log2_height: NDArray[np.int32]  # (textures,)
     levels: NDArray[np.int32]  # (textures,)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.synthetic.rigs import TrueCamera
+from mrasfm_engine.types import Floats
 from schemas import Camera
-
-Floats = NDArray[np.float64]
 
 _TIGHT_DEG, _TIGHT_M = 0.01, 0.001
 

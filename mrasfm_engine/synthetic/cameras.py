@@ -6,11 +6,10 @@ Ideal coordinates are (x / z, y / z) in the camera. The centre of the top left p
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mrasfm_engine.errors import InputError
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 
 def _distort_opencv(xy: Floats, k: Floats) -> Floats:

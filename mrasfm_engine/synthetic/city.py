@@ -13,12 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.types import Floats
 
-Floats = NDArray[np.float64]
 Junction = tuple[int, int]
 
 _BLOCK_X_M, _BLOCK_Y_M = 120.0, 100.0
@@ -167,7 +167,7 @@ def _points_of_street(start_m: Floats, axis: int, rng: np.random.Generator) -> F
 
 @njit(cache=True, nogil=True)
 def in_sight(from_x_m: float, from_y_m: float, x_m: float, y_m: float) -> bool:
-    """Whether a place is seen from another one without a house in between."""
+    """True if no house blocks the line of sight between two places."""
     for k in range(_SIGHT_SAMPLES):
         share = (k + 0.5) / _SIGHT_SAMPLES
         x = (from_x_m + share * (x_m - from_x_m)) % _BLOCK_X_M

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.geometry import se3
@@ -31,10 +30,8 @@ from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
 from mrasfm_engine.synthetic.scene_in_time import SceneInTime, build_scene
 from mrasfm_engine.synthetic.streets import GROUND_GRID_M, Ground
 from mrasfm_engine.synthetic.world import StaticWorld, build_world
+from mrasfm_engine.types import Bytes, CountProgress, Floats, Ints
 from schemas import DriveManifest, Frame, FrameImage, LabelMap, Rig, RoughPose, RoughTrajectory
-
-Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 FIRST_EPOCH_US = 1_750_000_000_000_000
 _BETWEEN_DRIVES_US = 3_600_000_000
@@ -55,7 +52,7 @@ class Shot:
 
 
 def render_drives(
-    options: SynthOptions, out: Path, *, force: bool = False, progress: Progress | None = None
+    options: SynthOptions, out: Path, *, force: bool = False, progress: CountProgress | None = None
 ) -> list[Path]:
     """Render one world's drives.
 
@@ -112,7 +109,7 @@ def _replace(partial: Path, out: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _render_into(folders: list[Path], options: SynthOptions, progress: Progress | None) -> None:
+def _render_into(folders: list[Path], options: SynthOptions, progress: CountProgress | None) -> None:
     # Each topic has its own stream of random numbers, so that an option changes nothing but its own topic.
     world = build_world(options, np.random.default_rng([options.seed, 0]))
     rig = true_cameras(
@@ -207,11 +204,11 @@ def _plan(
     options: SynthOptions,
     motion: Motion,
     rig: list[TrueCamera],
-    unit_us: NDArray[np.int64],
+    unit_us: Ints,
     start_us: int,
     rng: np.random.Generator,
 ) -> list[Shot]:
-    """When and where every image is taken; the images that are dropped are left out."""
+    """Times and poses of all images; dropped images are left out."""
     spread = np.linspace(-0.5, 0.5, len(rig)) if len(rig) > 1 else np.zeros(1)
     skew_us = np.round(rng.permutation(spread) * options.time_skew_ms * 1000).astype(np.int64)
     dropped = rng.random((len(unit_us), len(rig))) < options.drop_images
@@ -235,7 +232,7 @@ def _plan(
     return shots
 
 
-def _frames(options: SynthOptions, shots: list[Shot], rig: list[TrueCamera], unit_us: NDArray[np.int64]) -> list[Frame]:
+def _frames(options: SynthOptions, shots: list[Shot], rig: list[TrueCamera], unit_us: Ints) -> list[Frame]:
     images: list[dict[str, FrameImage]] = [{} for _ in unit_us]
     for shot in shots:
         images[shot.unit][rig[shot.camera].name] = FrameImage(
@@ -244,9 +241,7 @@ def _frames(options: SynthOptions, shots: list[Shot], rig: list[TrueCamera], uni
     return [Frame(timestamp_us=int(t), source_frame=unit, images=images[unit]) for unit, t in enumerate(unit_us)]
 
 
-def _rough(
-    options: SynthOptions, world_from_rig: Floats, unit_us: NDArray[np.int64], rng: np.random.Generator
-) -> RoughTrajectory:
+def _rough(options: SynthOptions, world_from_rig: Floats, unit_us: Ints, rng: np.random.Generator) -> RoughTrajectory:
     n = len(world_from_rig)
     rough = world_from_rig.copy()
     rough[:, :3, 3] += options.rough_noise_m * rng.normal(size=(n, 3))
@@ -267,7 +262,7 @@ def _write_truth(
     rig: list[TrueCamera],
     shots: list[Shot],
     world_from_rig: Floats,
-    unit_us: NDArray[np.int64],
+    unit_us: Ints,
     ground: Ground,
 ) -> None:
     """Write what the engine never reads."""
@@ -317,7 +312,7 @@ def _view(options: SynthOptions, scene: SceneInTime, lens: Lens, time_s: float, 
 
 
 def _rolling(options: SynthOptions, scene: SceneInTime, lens: Lens, middle_s: float, motion: Motion) -> View:
-    """What a sensor sees whose rows are read one after the other, in bands that are each one instant."""
+    """Image of a rolling-shutter sensor, rendered in row bands of one instant each."""
     height = lens.camera.height
     count = min(height, math.ceil(options.readout_ms / _BAND_MS))
     bounds = np.linspace(0, height, count + 1).round().astype(int)
@@ -359,6 +354,6 @@ def _take(
         _write(folder / shot.mask, view.labels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
 
 
-def _write(path: Path, image: NDArray[np.uint8], parameters: list[int]) -> None:
+def _write(path: Path, image: Bytes, parameters: list[int]) -> None:
     if not cv2.imwrite(str(path), image, parameters):
         raise OSError(f"{path} could not be encoded or written")

@@ -1,18 +1,16 @@
-"""What a satellite receiver on a synthetic vehicle says, and which place on Earth a world has."""
+"""Measurements of a simulated GNSS receiver, and the place of a world on Earth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.types import Floats, Ints
 from schemas import Gnss, GnssSample
-
-Floats = NDArray[np.float64]
 
 ANTENNA_IN_RIG_M = (0.55, 0.12, 1.62)
 VERTICAL_FACTOR = 1.5  # satellites are above only, so heights are worse
@@ -21,7 +19,7 @@ _DRIFT_TIME_S = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Where the world's ENU frame touches the Earth; height above the WGS84 ellipsoid."""
+    """Geodetic origin of the world's ENU frame; height above the WGS84 ellipsoid."""
 
     latitude_deg: float = 48.137
     longitude_deg: float = 11.575
@@ -48,7 +46,7 @@ def antenna_positions(world_from_rig: Floats) -> Floats:
 def receive(
     options: SynthOptions,
     world_from_rig: Floats,
-    timestamps_us: NDArray[np.int64],
+    timestamps_us: Ints,
     rng: np.random.Generator,
     *,
     off_m: tuple[float, float] = (0.0, 0.0),

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.synthetic.atlas import Atlas
 from mrasfm_engine.synthetic.mesh import Mesh
 from mrasfm_engine.synthetic.rasteriser import rasterise_linear
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats, Floats32
 
 _CELL_M = 0.07
 _MAX_CELLS = 5000  # a side
@@ -52,7 +50,7 @@ class ShadowMap:
 
     sun_from_world: Floats  # (3, 4): x and y across, z towards the sun
     frame: Floats  # (3,): x and y of the corner, cell size
-    depth: NDArray[np.float32]  # (rows, columns)
+    depth: Floats32  # (rows, columns)
 
 
 def daylight(rng: np.random.Generator) -> Light:

@@ -1,4 +1,4 @@
-"""What the cameras of a vehicle observe on a long way through a city, without images: for measuring how work grows.
+"""Observations of a vehicle's cameras on a long path through a city, without images, to measure scaling.
 
 A point is found where it is neither too near nor too far for its size, and where nothing hides it; of those an image
 has the most distinct ones, less some that are missed. So neighbouring images share most keypoints, and a street that is
@@ -8,20 +8,16 @@ driven again shows the same points.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.synthetic.city import city_route, in_sight, points_beside
 from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import CountProgress, Floats, Floats32, Ints
 
 SPACING_M = 1.0
 KEYPOINTS = 400  # of an image
@@ -43,7 +39,7 @@ class LongRoute:
     cameras: list[TrueCamera]
     world_from_rig: Floats  # (units, 4, 4)
     points_m: Floats  # (points, 3) in the world
-    xy_px: list[NDArray[np.float32]]  # by image (n, 2); the centre of the top left pixel is at (0.5, 0.5)
+    xy_px: list[Floats32]  # by image (n, 2); the centre of the top left pixel is at (0.5, 0.5)
     point: list[Ints]  # by image (n,): index into points_m of every keypoint
 
     @property
@@ -66,7 +62,7 @@ def require_rig(rig: str) -> None:
 
 
 class _Cells:
-    """Where the points of each square cell of the ground plane lie, in an order in which they lie together."""
+    """An index of points by square cells of the ground plane."""
 
     def __init__(self, xy_m: Floats) -> None:
         self._low = np.floor(xy_m.min(0) / CELL_M).astype(np.int64)
@@ -84,9 +80,7 @@ class _Cells:
         return np.stack([self._first[rows + low[1]], self._first[rows + high[1] + 1]], axis=-1)
 
 
-def simulate_long_route(
-    rig: str, units: int, *, seed: int = 0, progress: Callable[[int, int], None] | None = None
-) -> LongRoute:
+def simulate_long_route(rig: str, units: int, *, seed: int = 0, progress: CountProgress | None = None) -> LongRoute:
     """Drive `units` metres through a city and see about `KEYPOINTS` points in every image.
 
     Parameters
@@ -121,7 +115,7 @@ def observe_route(
     world_from_rig: Floats,
     *,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: CountProgress | None = None,
 ) -> LongRoute:
     """See about `KEYPOINTS` points of the city in every image that pinhole cameras take from poses (units, 4, 4)."""
     rng = np.random.default_rng([seed, len(cameras)])
@@ -130,7 +124,7 @@ def observe_route(
     points = points[cells.order]
     nearest_m = np.exp(rng.uniform(np.log(NEAREST_M), np.log(LARGEST_NEAREST_M), len(points)))
     distinct = rng.random(len(points))
-    xy_px: list[NDArray[np.float32]] = []
+    xy_px: list[Floats32] = []
     point: list[Ints] = []
     for unit, pose in enumerate(world_from_rig):
         near = cells.around(pose[:2, 3], MAX_DISTANCE_M)
@@ -147,8 +141,8 @@ def observe_route(
 def _observe(
     camera: TrueCamera, world_from_rig: Floats, spans: Ints, points_m: Floats, nearest_m: Floats, distinct: Floats,
     rng: np.random.Generator,
-) -> tuple[Ints, NDArray[np.float32]]:  # fmt: skip
-    """Which points an image finds (n,), in no order, and where (n, 2)."""
+) -> tuple[Ints, Floats32]:  # fmt: skip
+    """Points (n,) that an image observes, in no order, and their positions (n, 2) in pixels."""
     size_px = np.array([camera.width, camera.height], dtype=np.float64)
     seen, exact = _in_view(
         spans, points_m, nearest_m, world_from_rig @ camera.rig_from_cam, np.array(camera.params[:4]), size_px

@@ -9,7 +9,7 @@ import numpy as np
 
 from mrasfm_engine.synthetic import paint_facades, paint_surfaces
 from mrasfm_engine.synthetic.atlas import Atlas, AtlasBuilder
-from mrasfm_engine.synthetic.paint_noise import Bytes
+from mrasfm_engine.types import Bytes
 
 _WORKERS = 2
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mrasfm_engine.geometry import se3
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Bools, Bytes, Floats, Floats32
 
 
 class Label(IntEnum):
@@ -36,17 +35,17 @@ class Mesh:
     origin: Floats  # (n, 3)
     u: Floats  # (n, 3)
     v: Floats  # (n, 3)
-    is_triangle: NDArray[np.bool_]  # (n,)
+    is_triangle: Bools  # (n,)
     texture: NDArray[np.int32]  # (n,) index into the atlas
-    texture_uv: NDArray[np.float32]  # (n, 6): u, v at the origin, their change along a, their change along b
+    texture_uv: Floats32  # (n, 6): u, v at the origin, their change along a, their change along b
     detail: NDArray[np.int32]  # (n,) a second texture that multiplies the first, 128 being 1, or -1
-    detail_uv: NDArray[np.float32]  # (n, 6)
-    tint: NDArray[np.float32]  # (n, 3) multiplies the texture
-    normal: NDArray[np.float32]  # (n, 3) for shading; zero: lit alike from everywhere
-    label: NDArray[np.uint8]  # (n,)
-    has_alpha: NDArray[np.bool_]  # (n,) texels with alpha below one half are holes
-    casts_shadow: NDArray[np.bool_]  # (n,)
-    is_moving: NDArray[np.bool_]  # (n,)
+    detail_uv: Floats32  # (n, 6)
+    tint: Floats32  # (n, 3) multiplies the texture
+    normal: Floats32  # (n, 3) for shading; zero: lit alike from everywhere
+    label: Bytes  # (n,)
+    has_alpha: Bools  # (n,) texels with alpha below one half are holes
+    casts_shadow: Bools  # (n,)
+    is_moving: Bools  # (n,)
 
     def __len__(self) -> int:
         return len(self.origin)
@@ -70,7 +69,7 @@ def concatenate(meshes: list[Mesh]) -> Mesh:
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """How primitives look."""
+    """Appearance of primitives."""
 
     texture: int
     label: Label
@@ -176,14 +175,14 @@ class MeshBuilder:
         return concatenate(self._parts)
 
 
-def _texture_uv(surface: Surface, o: Floats, eu: Floats, ev: Floats) -> NDArray[np.float32]:
+def _texture_uv(surface: Surface, o: Floats, eu: Floats, ev: Floats) -> Floats32:
     if surface.tile_m is not None:
         return _repeating_uv(surface, surface.tile_m, o, eu, ev)
     u0, v0, width, height = surface.uv
     return np.tile(np.array([u0, v0 + height, width, 0.0, 0.0, -height], np.float32), (len(o), 1))
 
 
-def _repeating_uv(surface: Surface, tile_m: float, o: Floats, eu: Floats, ev: Floats) -> NDArray[np.float32]:
+def _repeating_uv(surface: Surface, tile_m: float, o: Floats, eu: Floats, ev: Floats) -> Floats32:
     if surface.planar:
         uv = np.concatenate([o[:, :2], eu[:, :2], ev[:, :2]], 1) / tile_m
         # Whole periods make no difference, but they would cost float32 its digits far from the world's origin.

@@ -1,17 +1,16 @@
-"""How vehicles move: pose of the rig at any instant of a drive."""
+"""Motion of vehicles: the pose of the rig at any instant of a drive."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.options import RATE_HZ, SpeedProfile, SynthOptions
 from mrasfm_engine.synthetic.streets import Ground, Layout, Route, Street
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6

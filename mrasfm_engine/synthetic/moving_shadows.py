@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.synthetic import objects
 from mrasfm_engine.synthetic.motion import Motion
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
 from mrasfm_engine.synthetic.streets import Layout, Route
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 OWN_CENTRE_M = 1.3  # of the body ahead of the rear axle
 REACH_M = (-10.0, 14.0)  # where along the way a companion meets the vehicle, from behind to ahead

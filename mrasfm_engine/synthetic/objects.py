@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.materials import Materials
 from mrasfm_engine.synthetic.mesh import Label, Mesh, MeshBuilder, Surface
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 CAR_SIZE_M = (4.4, 1.78, 1.5)  # length, width, height
 TRUCK_SIZE_M = (8.5, 2.4, 3.9)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.cameras import unproject
 from mrasfm_engine.synthetic.objects import TRUCK_SIZE_M
 from mrasfm_engine.synthetic.rigs import TrueCamera
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 _COVERAGE = 0.9
 _CLEARANCE_M = 0.45  # between the lorry and any camera

@@ -1,4 +1,4 @@
-"""What can be asked of the renderer, and what makes no sense to ask."""
+"""Options of the renderer, and checks of their combinations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class World(StrEnum):
 
 
 class SpeedProfile(StrEnum):
-    """How the vehicle's speed varies about its mean."""
+    """Variation of the vehicle's speed about its mean."""
 
     CONSTANT = "constant"
     GENTLE = "gentle"  # by 8 %
@@ -158,7 +158,7 @@ class SynthOptions:
 
     @property
     def drive_length_m(self) -> float:
-        """How far each drive goes, without the units in which it stands still."""
+        """Length of each drive, without the units in which it stands still."""
         return (self.units - 1 - self.standing_units) * self.spacing_m
 
     @property

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.synthetic.paint_noise import Bytes, Floats32, cracks, fractal, spots, to_bytes
+from mrasfm_engine.synthetic.paint_noise import cracks, fractal, spots, to_bytes
 from mrasfm_engine.synthetic.paint_surfaces import write_text
+from mrasfm_engine.types import Bytes, Floats32
 
 Colour = tuple[float, float, float]
 

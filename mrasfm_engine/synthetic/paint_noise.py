@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats32 = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
+from mrasfm_engine.types import Bools, Bytes, Floats32
 
 
 def fractal(size: int, rng: np.random.Generator, *, coarsest: int = 4, persistence: float = 0.6) -> Floats32:
@@ -72,7 +71,7 @@ def to_bytes(image: Floats32) -> Bytes:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def with_alpha(image: Bytes, alpha: NDArray[np.bool_] | Bytes) -> Bytes:
+def with_alpha(image: Bytes, alpha: Bools | Bytes) -> Bytes:
     """The image (h, w, 3) with a fourth channel: opaque where `alpha` is."""
     mask = np.asarray(alpha).astype(bool).astype(np.uint8) * 255
     return np.concatenate([image, mask[..., None]], 2)

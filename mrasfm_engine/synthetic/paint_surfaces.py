@@ -6,9 +6,9 @@ import string
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from mrasfm_engine.synthetic.paint_noise import Bytes, Floats32, colourise, cracks, fractal, spots, to_bytes, with_alpha
+from mrasfm_engine.synthetic.paint_noise import colourise, cracks, fractal, spots, to_bytes, with_alpha
+from mrasfm_engine.types import Bytes, Floats32
 
 LETTERS = np.array(list(string.ascii_uppercase + string.digits))
 
@@ -201,7 +201,7 @@ def truck_side(rng: np.random.Generator) -> Bytes:
         cv2.rectangle(image, (int(x), int(y)), (int(x + w), int(y + h)), tuple(rng.uniform(20, 240, 3).tolist()), -1)
     for row in range(3):
         write_text(image, rng, box=(20, 30 + 160 * row, 980, 140), letters=int(rng.integers(6, 11)))
-    noise: NDArray[np.float32] = fractal(1024, rng, coarsest=8, persistence=0.85)[:512]
+    noise: Floats32 = fractal(1024, rng, coarsest=8, persistence=0.85)[:512]
     image *= (
         1 + 0.1 * noise[..., None] + spots(1024, rng, count=900, radius_px=(2.0, 14.0), strength=0.18)[:512, :, None]
     )

@@ -17,8 +17,7 @@ from mrasfm_engine.synthetic.rasteriser import prepare_perspective, rasterise_li
 from mrasfm_engine.synthetic.rigs import TrueCamera
 from mrasfm_engine.synthetic.sensor import expose
 from mrasfm_engine.synthetic.shading import shade
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Bytes, Floats, Floats32
 
 _SAMPLES = 2  # a side of each pixel's sample grid
 
@@ -27,9 +26,9 @@ _SAMPLES = 2  # a side of each pixel's sample grid
 class View:
     """A rendered image; `intensity` is in square-root intensities before exposure."""
 
-    intensity: NDArray[np.float32]  # (h, w, 3) red, green, blue; 1 is white
-    labels: NDArray[np.uint8]  # (h, w) Cityscapes train ids
-    depth_m: NDArray[np.float32]  # (h, w) along the camera's z axis at pixel centres, inf for sky
+    intensity: Floats32  # (h, w, 3) red, green, blue; 1 is white
+    labels: Bytes  # (h, w) Cityscapes train ids
+    depth_m: Floats32  # (h, w) along the camera's z axis at pixel centres, inf for sky
 
 
 class Lens:
@@ -197,9 +196,7 @@ def _alpha_levels(mesh: Mesh, atlas: Atlas, lens: Lens, nearest: Floats) -> NDAr
     return result
 
 
-def develop(
-    view: View, lens: Lens, *, gain: float, noise: float, blur_px: float, rng: np.random.Generator
-) -> NDArray[np.uint8]:
+def develop(view: View, lens: Lens, *, gain: float, noise: float, blur_px: float, rng: np.random.Generator) -> Bytes:
     """The 8 bit image (h, w, 3), red first, that a sensor makes of a view.
 
     Parameters

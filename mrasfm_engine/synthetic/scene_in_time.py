@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic import objects
@@ -20,8 +19,7 @@ from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
 from mrasfm_engine.synthetic.rigs import TrueCamera
 from mrasfm_engine.synthetic.streets import ROAD_HALF_M, Layout
 from mrasfm_engine.synthetic.world import StaticWorld
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 _UNDERGROUND_M = -500.0  # where things wait that are not there
 _COLLISION_STEP_S = 0.05
@@ -49,7 +47,7 @@ class Mover:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneInTime:
-    """Everything that a drive's cameras can see."""
+    """All that a drive's cameras can see."""
 
     materials: Materials
     light: Light
@@ -109,7 +107,7 @@ def parked_cars(
 
 
 def _drives_through(lorry: Mover, pose_of_car: Callable[[float], Floats | None]) -> bool:
-    """Whether a lorry is in one place with a car, whose pose at any time is given, while it is there."""
+    """True if a lorry overlaps a car at some time; the car's pose is given as a function of time."""
     reach = (np.array(lorry.size_m[:2]) + np.array(objects.CAR_SIZE_M[:2])) / 2
     for time_s in np.arange(lorry.begin_s, lorry.end_s, _COLLISION_STEP_S).tolist():
         world_from_lorry, world_from_car = lorry.pose(time_s), pose_of_car(time_s)

@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.rigs import true_cameras
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from mrasfm_engine.types import Bools, Floats, Ints, Ints32
 
 RATE_HZ = 10.0
 _ROW_ROUNDS = 5
@@ -31,14 +29,14 @@ class SimulatedObservations:
     rig_from_cam: Floats  # (cameras, 4, 4)
     camera_params: Floats  # (cameras, 4): PINHOLE's fx fy cx cy, px
     image_size_px: tuple[int, int]  # width, height
-    timestamps_us: NDArray[np.int64]  # (units,), at RATE_HZ
+    timestamps_us: Ints  # (units,), at RATE_HZ
     points_m: Floats  # (points, 3), world frame
-    unit: Ints  # (observations,) index into world_from_rig
-    camera: Ints  # (observations,) index into rig_from_cam
-    point: Ints  # (observations,) index into points_m
+    unit: Ints32  # (observations,) index into world_from_rig
+    camera: Ints32  # (observations,) index into rig_from_cam
+    point: Ints32  # (observations,) index into points_m
     xy_px: Floats  # (observations, 2), the centre of the top left pixel is at (0.5, 0.5)
     exact_xy_px: Floats  # (observations, 2), without noise and outliers
-    is_outlier: NDArray[np.bool_]  # (observations,), where xy_px is anywhere in the image
+    is_outlier: Bools  # (observations,), where xy_px is anywhere in the image
 
 
 def simulate_trajectory(units: int, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:

@@ -1,4 +1,4 @@
-"""Where streets are, how high the ground is, and which way each drive takes."""
+"""Layout of the streets, height of the ground, and the path of each drive."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mrasfm_engine.synthetic.options import LOOP_OVERLAP_M, SynthOptions, World
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Floats
 
 ROAD_HALF_M = 5.4  # two lanes and a parking lane on each side
 KERB_M = 0.12

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic import objects
@@ -13,8 +12,7 @@ from mrasfm_engine.synthetic.materials import Materials, paint_materials
 from mrasfm_engine.synthetic.mesh import Label, Mesh, MeshBuilder, Surface
 from mrasfm_engine.synthetic.options import SynthOptions, World
 from mrasfm_engine.synthetic.streets import KERB_M, ROAD_HALF_M, SIDEWALK_M, Layout, Street, lay_out
-
-Floats = NDArray[np.float64]
+from mrasfm_engine.types import Bools, Floats
 
 _FRONT_M = ROAD_HALF_M + SIDEWALK_M  # where buildings begin
 _YARD_M = 7.0  # paved or green strip behind the sidewalk, on which buildings stand
@@ -25,7 +23,7 @@ _DECAL_M = 0.012  # above the road: thicker than rounding, thinner than anything
 
 @dataclass(frozen=True, kw_only=True)
 class StaticWorld:
-    """What does not move and is the same for all drives."""
+    """The static part of a world, the same for all drives."""
 
     layout: Layout
     materials: Materials
@@ -77,7 +75,7 @@ class _Site:
         return objects.pose_on_ground(self.layout.ground.lift(xy, above_m), float(heading) + turn)
 
     def clear_of_streets(self, xy: Floats, distance_m: float) -> bool:
-        """Whether points (n, 2) keep their distance from all other streets, and from far parts of this one."""
+        """True if points (n, 2) keep their distance from all other streets, and from far parts of this one."""
         own = bool((self.street.distance(xy) > min(distance_m, _FRONT_M - 0.4)).all())
         return own and all((other.distance(xy) > distance_m).all() for other in self.others)
 
@@ -176,7 +174,7 @@ def _add_sidewalk(site: _Site, side: int) -> None:
         site.builder.add(kerb, a[:-1], a[1:] - a[:-1], b[:-1] - a[:-1])
 
 
-def _runs(free: NDArray[np.bool_]) -> list[slice]:
+def _runs(free: Bools) -> list[slice]:
     """Slices of at least two consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], free.astype(int), [0]])))
     return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]

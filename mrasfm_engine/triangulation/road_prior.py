@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.triangulation.road_surface import MIN_POINTS, horizontal_axes, most_frequent
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools, Floats
 
 CORRIDOR_M = 3.0  # to both sides of the way: a lane
 DRIVEN_M = 0.8  # to both sides of the way: where the vehicle itself was

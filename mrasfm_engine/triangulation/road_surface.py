@@ -11,15 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry.height_plane import GATE_SIGMAS, HeightPlane, fit_height_plane
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.scene.road import RoadSurface, patch_weight
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats
 
 SPACING = 0.75  # of patches' centres, in radii: neighbours overlap
 MIN_POINTS = 8  # of a patch, that agree with its plane

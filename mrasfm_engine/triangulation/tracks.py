@@ -8,17 +8,13 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.row_bands import Shots
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import majority_class
-from mrasfm_engine.scene.shots import Shots
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
+from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,13 +93,13 @@ class Tracks:
         return len(self.first) - 1
 
 
-def kept_members(tracks: Tracks, which: Ints, kept: NDArray[np.bool_]) -> Ints:
+def kept_members(tracks: Tracks, which: Ints, kept: Bools) -> Ints:
     """Keypoints (m,) of some tracks that are kept (keypoints,), track by track."""
     result: Ints = _kept_members(tracks.first, tracks.keypoints, which, kept)
     return result
 
 
-def count_members(tracks: Tracks, which: Ints, more: NDArray[np.bool_], unit: Ints, counts: Ints) -> None:
+def count_members(tracks: Tracks, which: Ints, more: Bools, unit: Ints, counts: Ints) -> None:
     """Count the keypoints of some tracks by their unit (keypoints,): in where `more` (tracks,), out where not."""
     _count_members(tracks.first, tracks.keypoints, which, more, unit, counts)
 

@@ -12,16 +12,12 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_HYPOTHESES = 24  # pairs of rays tried a track
 MAX_OBSERVATIONS = 256  # of a track that are looked at

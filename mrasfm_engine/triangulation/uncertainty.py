@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mrasfm_engine.types import Floats, Ints
 
 SMALLEST_INFORMATION = 1e-12  # of a point that nothing observes
 REGULAR = 1e-9  # of the largest information: keeps points with parallel rays invertible

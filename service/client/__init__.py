@@ -1,10 +1,10 @@
 """The service as a Python library: what `mrasfm upload` is made of.
 
 >>> from pathlib import Path
->>> from service.client import Client, DriveFolder, download_scene, follow, start_reconstruction, upload_drive
+>>> from service.client import Client, DriveFolder, download_scene, watch_job, start_reconstruction, upload_drive
 >>> with Client("https://maps.example.org", key) as client:  # doctest: +SKIP
 ...     sent = upload_drive(client, DriveFolder.read(Path("my-drive")))
-...     job = follow(client, start_reconstruction(client, sent.drive_id).id)
+...     job = watch_job(client, start_reconstruction(client, sent.drive_id).id)
 ...     download_scene(client, job.scene_id, Path("my-scene"))
 
 What can go wrong is a `ClientError`: an `ApiError` carries the problem that the service answered with.
@@ -14,7 +14,8 @@ from service.client.api import Client, JobEvent
 from service.client.download import Downloaded, download_map, download_scene
 from service.client.drive_folder import DriveFolder, LocalFile
 from service.client.errors import ApiError, ClientError, DriveFolderError, SceneFolderError, UnreachableError
-from service.client.follow import ENDED, JobNews, follow
+from service.client.job_watcher import ENDED, JobNews, watch_job
+from service.client.report import scene_findings
 from service.client.upload import Sent, start_aggregation, start_reconstruction, upload_drive
 from service.client.upload_state import UploadState
 
@@ -35,8 +36,9 @@ __all__ = [
     "UploadState",
     "download_map",
     "download_scene",
-    "follow",
+    "scene_findings",
     "start_aggregation",
     "start_reconstruction",
     "upload_drive",
+    "watch_job",
 ]

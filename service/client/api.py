@@ -24,7 +24,7 @@ from schemas.api.status import ServiceStatus
 from schemas.api.uploads import UploadResource
 from service.client.drive_folder import LocalFile
 from service.client.transport import CHECK_TIMEOUT_S, IO_TIMEOUT_S, Body, Patience, Transport, TroubleError, unexpected
-from service.uploads.digests import format_digest
+from service.digests import format_digest
 
 Model = TypeVar("Model", bound=BaseModel)
 PATIENCE_S = 300.0  # a service that is being restarted, or moved

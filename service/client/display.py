@@ -20,7 +20,7 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from service.client.follow import ENDED, JobNews
+from service.client.job_watcher import ENDED, JobNews
 
 _LINE_EVERY_S = 10.0
 _NAME = "{task.description:<9}"

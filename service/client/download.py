@@ -20,7 +20,7 @@ from service.client.api import Client
 from service.client.errors import ClientError, SceneFolderError
 from service.client.parallel import Meter, Report, in_parallel, no_report
 from service.client.transport import TroubleError
-from service.data_folder import write_private_file
+from service.storage.data_folder import write_private_file
 
 OWN_PREFIX = ".mrasfm-"
 MARKER_NAME = f"{OWN_PREFIX}scene.json"  # says which scene the folder is of

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.drive import DriveManifest
-from schemas.parsing import DocumentError, parse_manifest
+from schemas.file_names import MANIFEST_NAME
+from schemas.parsing import DocumentError, parse_new_manifest
 from service.client.errors import DriveFolderError
 
-MANIFEST_NAME = "drive.json"
 PIECE_BYTES = 1 << 20
 _SHOWN = 10
 
@@ -71,10 +71,10 @@ class DriveFolder:
         """
         raw = _read_manifest(root)
         try:
-            manifest = parse_manifest(raw)
+            manifest = parse_new_manifest(raw)
         except DocumentError as error:
             raise DriveFolderError(
-                f"{root / MANIFEST_NAME}: {error}. Correct it; schemas/README.md describes every field."
+                f"{root / MANIFEST_NAME}: {error}. Correct it; `mrasfm describe manifest` describes every field."
             ) from None
         images = [image for frame in manifest.frames for image in frame.images.values()]
         paths = tuple(sorted({name for image in images for name in (image.file, image.mask) if name is not None}))

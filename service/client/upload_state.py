@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from service.client.drive_folder import DriveFolder
-from service.data_folder import write_private_file
+from service.storage.data_folder import write_private_file
 
 STATE_NAME = ".mrasfm-upload.json"
 _RequestName = Annotated[str, StringConstraints(pattern=r"^[0-9a-f-]{36}$")]

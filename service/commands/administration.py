@@ -25,7 +25,7 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 def administer(action: Action, arguments: argparse.Namespace) -> int:
     """Run an action in one transaction on the service's records; its exit code."""
-    from service.unusable_database import UnusableDatabaseError, unusable_is_told
+    from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
 
     settings = Settings() if arguments.data is None else Settings(data_dir=arguments.data)
     try:
@@ -37,7 +37,7 @@ def administer(action: Action, arguments: argparse.Namespace) -> int:
 
 
 def _in_transaction(action: Action, settings: Settings, arguments: argparse.Namespace) -> int:
-    from service.persistence.database import Database, migrate
+    from service.database.connections import Database, migrate
 
     migrate(settings)
     database = Database.of(settings)

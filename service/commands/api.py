@@ -15,17 +15,23 @@ if TYPE_CHECKING:
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("api", help="run the HTTP API", description="Settings: environment MRASFM_*.")
+    parser = subparsers.add_parser(
+        "api",
+        help="run the HTTP API",
+        description="Run the HTTP API. Settings are environment variables, see mrasfm describe service.",
+    )
     parser.add_argument("--host", help="address to listen on (MRASFM_HOST)")
     parser.add_argument("--port", type=int, help="port to listen on (MRASFM_PORT)")
-    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+    parser.add_argument(
+        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="least severe messages"
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
+    from service.api.server import serve
     from service.logs import configure
-    from service.server import serve
 
     settings = Settings()
     configure(arguments.log_level)
@@ -34,12 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
         host=arguments.host or settings.host,
         port=settings.port if arguments.port is None else arguments.port,
         processes=settings.api_processes or min(2, os.cpu_count() or 1),
+        metrics_dir=settings.metrics_dir,
     )
 
 
 def make_app(settings: Settings, log_level: str) -> FastAPI:
     """The application, in the process that serves it."""
-    from service.app import create_app
+    from service.api.app import create_app
     from service.logs import configure
 
     configure(log_level)

@@ -39,14 +39,16 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "demo",
-        help="show the whole service at work",
+        help="demonstrate the whole service on rendered drives",
         description="Render two drives of one street, send them to a service of their own, get scenes and a map, "
         "compare with the truth.",
         epilog=f"exit codes: 0 done; 1 a part failed, or an error is over {MAX_RMSE_M} m, at the seam {MAX_SEAM_M} m; "
         "2 OUT is not empty",
     )
-    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="OUT", help="folder for all of it: demo")
-    parser.add_argument("--units", type=int, default=20, help="instants of each drive (default: 20)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="OUT", help="folder for all output (default: demo)"
+    )
+    parser.add_argument("--units", type=int, default=20, help="frames of each drive (default: 20)")
     parser.set_defaults(run=run)
 
 
@@ -136,7 +138,7 @@ class _Demo:
         _output_of([*_MRASFM, "synth", *options, "--out", str(out)])
 
     def _make_key(self) -> str:
-        from service.data_folder import write_private_file
+        from service.storage.data_folder import write_private_file
 
         data = str(self._out / "service")
         key = _output_of([*_PYTHON, "-m", "service", "keys", "--data", data, "create", "--name", "demo"]).strip()
@@ -180,7 +182,7 @@ class _Demo:
 
     def _use(self, client: Client) -> None:
         from schemas.api.aggregations import AggregationRequest
-        from service.client import DriveFolder, download_map, follow, start_aggregation, upload_drive
+        from service.client import DriveFolder, download_map, start_aggregation, upload_drive, watch_job
 
         with self._timed("upload"):
             drive_ids = []
@@ -192,7 +194,7 @@ class _Demo:
             asked = AggregationRequest(drives=drive_ids, name="demo", require_all=True)
             job = start_aggregation(client, asked)
             self._display.say(f"making a map of them: {client.url}/v1/jobs/{job.id}")
-            job = follow(client, job.id, tell=self._display.tell)
+            job = watch_job(client, job.id, tell=self._display.tell)
         if job.map_id is None or job.map_version is None:
             why = "" if job.problem is None else f": {job.problem.detail}\n{job.problem.log_tail or ''}"
             raise DemoError(f"job {job.id} {job.state}{why}. {self._log()}")

@@ -16,15 +16,21 @@ if TYPE_CHECKING:
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("keys", help="make, list and revoke API keys")
+    parser = subparsers.add_parser(
+        "keys", help="create, list and revoke API keys", description="Create, list and revoke API keys."
+    )
     add_data(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    create = actions.add_parser("create", help="make a key and print it")
-    create.add_argument("--project", default="default", help="made where there is none of this name")
-    create.add_argument("--name", default="unnamed", help="to recognise the key by")
+    create = actions.add_parser("create", help="create a key and print it")
+    create.add_argument(
+        "--project",
+        default="default",
+        help="project that the key opens; created if it does not exist (default: default)",
+    )
+    create.add_argument("--name", default="unnamed", help="label of the key in lists (default: unnamed)")
     actions.add_parser("list", help="list keys, without their secrets")
-    revoke = actions.add_parser("revoke", help="end a key")
-    revoke.add_argument("key_id", metavar="ID")
+    revoke = actions.add_parser("revoke", help="revoke a key")
+    revoke.add_argument("key_id", metavar="ID", help="id of the key, as mrasfm keys list prints it")
     parser.set_defaults(run=run)
 
 
@@ -34,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _create(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
-    from service.persistence.keys import create_key, create_project, find_project
+    from service.domain.keys import create_key, create_project, find_project
 
     for given in (arguments.project, arguments.name):
         if not 0 < len(given) <= 200 or not given.isprintable():
@@ -48,7 +54,7 @@ def _create(session: Session, settings: Settings, arguments: argparse.Namespace)
 def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
     from sqlalchemy import select
 
-    from service.persistence.tables import ApiKey, Project
+    from service.database.tables import ApiKey, Project
 
     rows = session.execute(select(ApiKey, Project.name).join(Project, ApiKey.project_id == Project.id))
     for key, project in rows:
@@ -57,7 +63,7 @@ def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -
 
 
 def _revoke(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
-    from service.persistence.keys import revoke_key
+    from service.domain.keys import revoke_key
 
     if revoke_key(session, arguments.key_id):
         return 0

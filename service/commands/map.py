@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.commands.conversation import EPILOG, add_connection, connect, job_failed, talk
+from service.commands.client_common import EPILOG, add_connection, connect, job_failed, talk
 
 if TYPE_CHECKING:
     from schemas.api.aggregations import AggregationRequest
@@ -41,7 +41,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "map",
         help="send drives to a service and get one map of them",
-        description="Send drives to a service, have what is not reconstructed yet reconstructed, and get one map.",
+        description="Send drives to a service, reconstruct those without a scene there, and download one map of all.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,  # --key SECRET must not pass for --key-file
@@ -51,9 +51,9 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--out", type=Path, metavar="OUT", help="folder for the map")
     parser.add_argument("--into", metavar="MAP_ID", help="make a new version of this map instead of a new map")
     parser.add_argument(
-        "--remove", action="append", default=[], metavar="ID", help="drive or scene that the new version shall not have"
+        "--remove", action="append", default=[], metavar="ID", help="drive or scene that the new version leaves out"
     )
-    parser.add_argument("--name", help="of a new map")
+    parser.add_argument("--name", help="name of a new map")
     parser.add_argument("--require-all", action="store_true", help="fail where a drive cannot be reconstructed")
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS in the reconstructions")
     parser.set_defaults(run=run)
@@ -125,10 +125,10 @@ def _asked(arguments: argparse.Namespace, drive_ids: list[str]) -> AggregationRe
 def _receive(
     client: Client, job: JobResource, arguments: argparse.Namespace, summary: Summary, display: Display
 ) -> int:
-    from service.client import download_map, follow
+    from service.client import download_map, watch_job
 
     began_s = time.monotonic()
-    job = follow(client, job.id, tell=display.tell)
+    job = watch_job(client, job.id, tell=display.tell)
     summary.job_state, summary.version = job.state, job.map_version
     summary.seconds["wait"] = round(time.monotonic() - began_s, 3)
     if job.map_id is None or job.map_version is None:

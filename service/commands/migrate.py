@@ -11,14 +11,19 @@ from service.settings import Settings
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("migrate", help="bring the service's database to this version")
+    parser = subparsers.add_parser(
+        "migrate",
+        help="migrate the service's database to this version",
+        description="Migrate the service's database to this version. Settings are environment variables, see "
+        "mrasfm describe service.",
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Migrate; safe to repeat."""
-    from service.persistence.database import migrate
-    from service.unusable_database import UnusableDatabaseError, unusable_is_told
+    from service.database.connections import migrate
+    from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
 
     settings = Settings()
     try:

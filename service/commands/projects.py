@@ -16,20 +16,22 @@ if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
 _QUOTAS = {
-    "max_bytes": (Bytes, "of all that it stores"),
-    "max_active_jobs": (Count, "queued or running at one time"),
-    "max_drives": (Count, "at one time"),
+    "max_bytes": (Bytes, "bytes that the project stores"),
+    "max_active_jobs": (Count, "jobs that are queued or running at one time"),
+    "max_drives": (Count, "drives at one time"),
 }
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("projects", help="list projects, and change their quotas")
+    parser = subparsers.add_parser(
+        "projects", help="list projects and change their quotas", description="List projects and change their quotas."
+    )
     add_data(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     actions.add_parser("list", help="list projects with what they use of their quotas")
     change = actions.add_parser("set", help="change quotas of a project; what it has already stays")
-    change.add_argument("name", metavar="NAME")
+    change.add_argument("name", metavar="NAME", help="name of the project")
     for quota, (kind, what) in _QUOTAS.items():
         change.add_argument(_option(quota), type=_number(kind), metavar="N", help=what)
     parser.set_defaults(run=run)
@@ -43,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
     from sqlalchemy import select
 
-    from service.persistence.tables import Project
+    from service.database.tables import Project
 
     for project in session.scalars(select(Project).order_by(Project.name)):
         print(
@@ -54,7 +56,7 @@ def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -
 
 
 def _set(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:
-    from service.persistence.keys import find_project
+    from service.domain.keys import find_project
 
     quotas = {quota: value for quota in _QUOTAS if (value := getattr(arguments, quota)) is not None}
     if not quotas:

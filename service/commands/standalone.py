@@ -10,14 +10,18 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from service.commands.administration import EXIT_CANNOT_RUN
 from service.settings import Settings
-
-EXIT_CANNOT_RUN = 2
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser("standalone", help="run the whole service on this machine")
+    parser = subparsers.add_parser(
+        "standalone",
+        help="run the whole service on this machine",
+        description="Run API, broker, workers and reconciler on this machine, with all state in one folder. "
+        "Settings are environment variables, see mrasfm describe service.",
+    )
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of all state (default: mrasfm-data)")
     parser.add_argument("--host", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, help="port to listen on (default: 8000; 0 takes a free one)")
@@ -30,10 +34,10 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(arguments: argparse.Namespace) -> int:
     """Run until a signal says stop."""
-    from service.broker import BrokerServerError
-    from service.data_folder import DataFolderError
-    from service.standalone import StandaloneError, run_standalone
-    from service.supervisor import SupervisorError
+    from service.standalone.broker import BrokerServerError
+    from service.standalone.program import StandaloneError, run_standalone
+    from service.standalone.supervisor import SupervisorError
+    from service.storage.data_folder import DataFolderError
 
     try:
         run_standalone(_settings(arguments), workers=arguments.workers, log_level=arguments.log_level, say=_say)

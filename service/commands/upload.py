@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.commands.conversation import EPILOG, add_connection, connect, job_failed, talk
+from service.commands.client_common import EPILOG, add_connection, connect, job_failed, lines_of, talk
 
 if TYPE_CHECKING:
     from schemas.api.jobs import JobResource
@@ -32,6 +32,7 @@ class Summary:
     seconds: dict[str, float] = field(default_factory=dict)
     error: str | None = None
     problem: dict[str, Any] | None = None
+    findings: list[dict[str, Any]] = field(default_factory=list)  # of the scene's report
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,7 +40,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "upload",
         help="send a drive to a service and get its scene",
-        description="Send a drive to a service, ask for its scene, and with --wait or --out get it.",
+        description="Send a drive to a service and reconstruct it; --wait waits for the scene, --out downloads it.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,  # --key SECRET must not pass for --key-file
@@ -104,15 +105,19 @@ def _receive(
     client: Client, job: JobResource, arguments: argparse.Namespace, summary: Summary, display: Display
 ) -> int:
     from schemas.api.jobs import JobState
-    from service.client import download_scene, follow
+    from service.client import download_scene, scene_findings, watch_job
 
     began_s = time.monotonic()
-    job = follow(client, job.id, tell=display.tell)
+    job = watch_job(client, job.id, tell=display.tell)
     summary.job_state, summary.scene_id = job.state, job.scene_id
     summary.seconds["wait"] = round(time.monotonic() - began_s, 3)
     if job.state != JobState.SUCCEEDED or job.scene_id is None:
         return job_failed(job, summary, display)
     display.say(f"scene {job.scene_id}: {client.url}/v1/scenes/{job.scene_id}")
+    findings = scene_findings(client, job.scene_id)
+    summary.findings = [finding.model_dump(mode="json") for finding in findings]
+    for line in lines_of(findings):
+        display.say(line)
     if arguments.out is not None:
         began_s = time.monotonic()
         done = download_scene(client, job.scene_id, arguments.out, parallel=arguments.parallel, report=display.report)

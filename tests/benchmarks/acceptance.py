@@ -1,4 +1,4 @@
-"""Every figure that the README claims: `python -m tests.benchmarks.acceptance`.
+"""Every figure of README.md and docs/: `python -m tests.benchmarks.acceptance`.
 
 | line | what |
 |---|---|
@@ -18,6 +18,7 @@
 | 14 | time of mapping a rendered drive of six cameras beside COLMAP's mappers on the same matches |
 | 15 | how time, memory and error grow with the length of simulated routes |
 | 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
+| 17 | the service while its processes are killed: nothing lost, twice, stuck, wrong or left |
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
@@ -56,7 +57,7 @@ from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.semantics import real_road, shadowed_road
-from tests.benchmarks.service import maps_over_http, service
+from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.table import Figure, failed, save, show
 
@@ -91,6 +92,7 @@ LINES = {
     "14": Line(repeated=(surround_speed,)),
     "15": Line(timed=(long_routes,)),
     "16": Line(repeated=(correspondence,)),
+    "17": Line(timed=(kills,)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
 }
 
@@ -174,7 +176,7 @@ def main() -> int:
     parser.add_argument("--seeds", default="1", help="of rendered drives (default: %(default)s)")
     parser.add_argument("--repeat", type=int, default=1, help="times that count by their median (default: %(default)s)")
     parser.add_argument(
-        "--thorough", action="store_true", help=f"as the README: seeds {','.join(map(str, SEEDS))}, medians of three"
+        "--thorough", action="store_true", help=f"as published: seeds {','.join(map(str, SEEDS))}, medians of three"
     )
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")

@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.adjustment.ceres_reference import CeresProblem
-from mrasfm_engine.adjustment.problem import Layout, Observations
-from mrasfm_engine.adjustment.solver import Problem, SolverOptions, solve
+from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
+from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.synthetic.simulate import SimulatedObservations, simulate_observations
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.table import Figure
+from tests.helpers.ceres_reference import CeresProblem
 
 UNITS, CAMERAS, POINTS = 60, 6, 130_000
 TRACK_UNITS, SEEN = 6, 0.8

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.preflight.drive_reader import read_drive
 from tests.benchmarks.commands import mrasfm, read_report
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure

@@ -14,7 +14,7 @@ TEST_LIMIT_S = 600.0
 
 
 def fresh_clone(data: Path, work: Path) -> Iterator[Figure]:
-    """Line 4: clone what is committed, run the tests and the README's first command."""
+    """Line 4: clone what is committed, run the tests and the demo."""
     clone = work / "clone"
     subprocess.run(["git", "clone", "--quiet", REPOSITORY, clone], check=True)
     environment = {"MRASFM_TEST_DATA": str(data.parent.resolve())}

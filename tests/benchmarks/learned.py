@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.features import extract_features
-from mrasfm_engine.correspondence.pairs import pairs_from_window
-from mrasfm_engine.correspondence.plugins import load_plugins
-from mrasfm_engine.correspondence.search import match_pairs
-from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.learned.model_folder import ModelFolder
+from mrasfm_engine.matching.pair_matching import match_pairs
+from mrasfm_engine.matching.pair_selection import pairs_from_window
+from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.registry import load_plugins
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import THREADS, imported, reconstructed
 from tests.benchmarks.table import Figure, exactly

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mrasfm_engine.benchmark.baselines import Mapper, run_peer
 from mrasfm_engine.evaluation.cameras import compare_camera_poses
-from mrasfm_engine.evaluation.peers import Mapper, run_peer
 from mrasfm_engine.io.read_scene import read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
 from tests.benchmarks.commands import evaluate, mrasfm

@@ -32,11 +32,11 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_rigid
 from mrasfm_engine.geometry.camera_model import pack_cameras, project_points, unproject_pixels
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
-from mrasfm_engine.registration.model import Model
-from mrasfm_engine.registration.road import RoadJudgement, judge_road
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.road import RoadJudgement, judge_road
+from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.road import Thickness
 from mrasfm_engine.scene.semantics import ROAD
 from tests.benchmarks.commands import evaluate, mrasfm, read_report

@@ -1,26 +1,25 @@
-"""Line 5: the service gives what the command gives, bears load, and answers what it says."""
+"""Lines 5 and 17: the service gives what the command gives, bears load and kills, and answers what it says."""
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 
 from mrasfm_engine.io.trajectory_file import read_tum
-from service.data_folder import write_private_file
+from tests.benchmarks.chaos.report import MOST_HELD_S
 from tests.benchmarks.commands import CommandFailed, mrasfm, read_report
 from tests.benchmarks.real_drives import imported, reconstructed
 from tests.benchmarks.service_load import FUZZED_REQUESTS, MAX_RSS_BYTES, MIN_RATE_RATIO
+from tests.benchmarks.service_under_load import MAX_POLL_P99_S, MAX_SLOWDOWN
+from tests.benchmarks.standalone import standalone
 from tests.benchmarks.table import Figure, exactly
-from tests.service.live_api import free_port, wait_until
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DRIVE = "kitti06"
@@ -29,6 +28,20 @@ OF_MAPS = (
     ("tests/worker/test_map_over_http.py", "seven drives over HTTP, one broken, a worker killed: one map of six"),
     ("tests/service/test_upload_kills.py", "an upload whose API is killed at 50 random bytes has the right digest"),
 )
+
+KILLS = 10
+OF_KILLS = {
+    "lost": "after them, lost: drives, files, jobs, scenes, maps",
+    "twice": "there twice",
+    "stuck": "stuck ten minutes after the last kill",
+    "wrong_bytes": "files with wrong bytes",
+    "failed": "jobs failed for kills alone",
+    "damaged": "defects of the database",
+    "left": "processes and files left",
+    "broken_promises": "answers that must not be",
+    "ended_by_itself": "ends of the service by itself",
+    "kills_missing": "kinds of kills of which there were too few",
+}
 
 
 def service(data: Path, work: Path) -> Iterator[Figure]:
@@ -52,6 +65,7 @@ def service(data: Path, work: Path) -> Iterator[Figure]:
         most=MAX_RSS_BYTES / 1e6,
     )
     yield exactly("5", "50 clients at once: failures + 1", len(load["clients_failures"]) + 1, 1)
+    yield from _under_load()
     fuzzed = _figures_of("tests.benchmarks.service_load", "--fuzz")
     yield Figure(
         line="5",
@@ -63,10 +77,58 @@ def service(data: Path, work: Path) -> Iterator[Figure]:
     yield _passed("5", "long tests, of crashes and leases among them", "tests", *(f"--ignore={t}" for t, _ in OF_MAPS))
 
 
+def _under_load() -> Iterator[Figure]:
+    load = _figures_of("tests.benchmarks.service_under_load")
+    kinds = ", ".join(f"{count} {kind}" for kind, count in load["clients"].items())
+    yield Figure(
+        line="5",
+        what=f"a reconstruction and 100 clients ({kinds}): 99 % of polls are answered within",
+        value=load["polling"]["p99_s"],
+        unit="s",
+        most=MAX_POLL_P99_S,
+        remark=f"median {load['polling']['p50_s']} s of {load['polling']['requests']}",
+    )
+    yield Figure(
+        line="5",
+        what="the same: the reconstruction's time, as a multiple of that without clients",
+        value=load["slowdown"],
+        most=MAX_SLOWDOWN,
+        remark=f"{load['reconstruction_under_load_s']} s against {load['reconstruction_alone_s']} s",
+    )
+    failures = sum(len(load[kind]["failures"]) for kind in load["clients"])
+    yield exactly("5", "the same: requests without an answer + 1", failures + 1, 1)
+
+
 def maps_over_http(data: Path, work: Path) -> Iterator[Figure]:
     """Line 20f: the service's part of aggregation."""
     for test, what in OF_MAPS:
         yield _passed("20f", what, test)
+
+
+def kills(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 17: the whole service while its processes are killed."""
+    figures = _figures_of("tests.benchmarks.chaos", "--kills", str(KILLS))
+    yield Figure(
+        line="17",
+        what="kills of processes of the service while clients use it",
+        value=figures["kills"],
+        above=KILLS - 1,
+        most=2 * KILLS,
+        remark=f"seed {figures['seed']}; " + ", ".join(f"{n} {what}" for what, n in figures["kills_in_fact"].items()),
+    )
+    for name, what in OF_KILLS.items():
+        found = figures[name] if isinstance(figures[name], int) else len(figures[name])
+        said = figures["findings"].get(name, figures[name])
+        remark = "; ".join(said[:3]) if found and isinstance(said, list) else ""
+        yield replace(exactly("17", f"{what} + 1", found + 1, 1), remark=remark)
+    yield Figure(
+        line="17",
+        what="longest time for which a client is told that its request is in flight, which a kill has ended",
+        value=figures["longest_held_s"],
+        unit="s",
+        above=-1.0,
+        most=MOST_HELD_S,
+    )
 
 
 def _passed(line: str, what: str, *arguments: str) -> Figure:
@@ -78,7 +140,7 @@ def _same_scene(data: Path, work: Path) -> Iterator[Figure]:
     drive = imported(data, DRIVE, work)
     by_command = reconstructed(drive, work / f"{DRIVE}-no-gnss", "--no-gnss")
     by_service = work / f"{DRIVE}-service"
-    with _standalone(work / "service") as (url, key_file):
+    with standalone(work / "service") as (url, key_file):
         mrasfm("upload", drive, "--url", url, "--key-file", key_file, "--out", by_service, "--no-gnss")
     images = [read_report(scene)["summary"]["registered_images"] for scene in (by_command, by_service)]
     yield exactly("5", f"{DRIVE} over HTTP: images registered, as by the command", images[1], images[0])
@@ -92,33 +154,6 @@ def _same_scene(data: Path, work: Path) -> Iterator[Figure]:
         above=-1.0,  # exactly the same poses are what to hope for
         most=DIFFERENCE_M,
     )
-
-
-@contextmanager
-def _standalone(folder: Path) -> Iterator[tuple[str, Path]]:
-    """A whole service, and the file with a key for it."""
-    folder.mkdir()
-    key_file = folder / "key"
-    write_private_file(key_file, mrasfm("keys", "--data", folder / "data", "create"))
-    port = free_port()
-    url = f"http://127.0.0.1:{port}"
-    argv = [sys.executable, "-m", "service", "standalone", "--data", str(folder / "data"), "--port", str(port)]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("MRASFM_")}
-    with (folder / "log").open("wb") as log:
-        process = subprocess.Popen(argv, cwd=REPOSITORY, env=environment, stdout=log, stderr=log)
-    try:
-        wait_until(lambda: _is_ready(url), "the service's start")
-        yield url, key_file
-    finally:
-        process.terminate()
-        process.wait(timeout=120)
-
-
-def _is_ready(url: str) -> bool:
-    try:
-        return httpx.get(f"{url}/readyz").is_success
-    except httpx.TransportError:
-        return False  # nobody listens yet
 
 
 def _figures_of(module: str, *arguments: str) -> dict[str, Any]:

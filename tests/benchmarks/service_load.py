@@ -24,9 +24,9 @@ from typing import Any
 import httpx
 import psutil
 
-from tests.service.fuzzing import fuzz
-from tests.service.live_api import ApiProcess, Client, api_process, settings_of
-from tests.service.tiny_drive import CAMERAS, HEIGHT, WIDTH, manifest, png_of, tiny_drive
+from tests.helpers.fuzzing import fuzz
+from tests.helpers.live_api import ApiProcess, Client, api_process, settings_of
+from tests.helpers.tiny_drive import CAMERAS, HEIGHT, WIDTH, manifest, png_of, tiny_drive
 
 FILES = 500
 FILE_BYTES = 2_000_000

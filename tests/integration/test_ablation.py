@@ -12,7 +12,7 @@ import pytest
 from mrasfm_engine import ablation
 from mrasfm_engine.ablation import FULL, SWITCHES, Row, _remark, switches_named
 from mrasfm_engine.config import EngineConfig, SemanticsConfig
-from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.preflight.drive_reader import read_drive
 from tests.integration.conftest import Ran, Variant
 
 Run = Callable[..., Ran]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
 from tests.integration.conftest import Ran, Variant, synth
 

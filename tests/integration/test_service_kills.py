@@ -20,8 +20,8 @@ import pytest
 
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
-from service.broker import JOURNAL, JOURNAL_SET_ASIDE
 from service.settings import Settings
+from service.standalone.broker import JOURNAL, JOURNAL_SET_ASIDE
 
 DEADLINE_S = 120.0
 WORKER_STARTS_WITHIN_S = 90.0
@@ -169,7 +169,7 @@ def test_kills(service: Standalone, drive: Path) -> None:
     victims: list[tuple[Callable[[], psutil.Process], int]] = [
         (lambda: service.process_of("worker", "reconstructions"), 2),
         (lambda: service.process_of("service", "api"), 1),
-        (lambda: service.broker(), 1),
+        (lambda: service.standalone.broker(), 1),
     ]
     job_ids = []
     for victim, attempts in victims:

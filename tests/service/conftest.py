@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 from sqlalchemy import create_engine, make_url, text
 
-from service.persistence.database import Database, migrate
-from service.persistence.tables import new_id
+from service.database.connections import Database, migrate
+from service.database.tables import new_id
+from service.domain.keys import create_project
 from service.settings import Settings
-from tests.service.live_api import Api, Client, api_in_thread, settings_of
+from tests.helpers.live_api import Api, Client, api_in_thread, settings_of
 
 StartApi = Callable[..., Api]
 
@@ -111,6 +112,13 @@ def database_settings(request: pytest.FixtureRequest, tmp_path: Path) -> Iterato
         yield settings_of(tmp_path, database_url=url)
 
 
+@pytest.fixture
+def postgres_database(postgres_url: str) -> Iterator[str]:
+    """URL of an empty PostgreSQL database."""
+    with _postgres_database(postgres_url) as url:
+        yield url
+
+
 @contextmanager
 def _postgres_database(server: str) -> Iterator[str]:
     """URL of an empty database."""
@@ -134,3 +142,10 @@ def database(database_settings: Settings) -> Iterator[Database]:
     opened = Database.of(database_settings)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def project_id(database: Database, database_settings: Settings) -> str:
+    """A project of that database."""
+    with database.write() as session:
+        return create_project(session, "test", database_settings).id

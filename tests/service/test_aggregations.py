@@ -10,10 +10,10 @@ from sqlalchemy import delete, update
 
 from mrasfm_engine.aggregation.load import name_scenes
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from service.persistence import jobs, trees
-from service.persistence.tables import Drive, Job, JobMember, Scene
-from tests.service.live_api import Api, Client, problem_of, wait_until
-from tests.service.tiny_drive import tiny_drive
+from service.database.tables import Drive, Job, JobMember, Scene
+from service.domain import job_trees, jobs
+from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, problem_of, wait_until
+from tests.helpers.tiny_drive import tiny_drive
 
 FILES = {"points.ply": b"ply", "map.json": b"{}", "report.json": b"{}"}
 LEASE_US = 60_000_000
@@ -41,7 +41,7 @@ def finish(client: Client, job_id: str) -> str:
 def fail(client: Client, job_id: str, problem: Problem = BROKEN) -> None:
     held = client.claim(job_id)
     with client.api.database.write() as session:
-        jobs.fail(session, held, problem, max_attempts=1, retry_delay_us=0)
+        jobs.fail(session, held, problem, limits=ONE_ATTEMPT, retry_delay_us=0)
 
 
 def beat(client: Client, held: jobs.Claim, percent: float) -> None:
@@ -58,7 +58,7 @@ def due(client: Client) -> set[str]:
 
 
 def tend(client: Client) -> None:
-    trees.tend(client.api.database)
+    job_trees.tend(client.api.database)
 
 
 def test_a_tree_of_jobs(client: Client, drives: list[str]) -> None:

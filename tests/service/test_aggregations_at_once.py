@@ -14,22 +14,16 @@ from sqlalchemy.orm import Session
 from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DriveState
 from schemas.api.jobs import JobKind
-from service.persistence import aggregations, blobs, jobs, maps, scenes
-from service.persistence.checkpoints import settings_sha256
-from service.persistence.database import Database
-from service.persistence.keys import create_project
-from service.persistence.tables import Blob, Drive, Job, JobMember, JobState, Map, Scene, new_id, now_us
+from service.database.connections import Database
+from service.database.tables import Blob, Drive, Job, JobMember, JobState, Map, Scene, new_id, now_us
+from service.domain import aggregations, jobs, maps, scenes
+from service.domain.checkpoints import settings_sha256
 from service.settings import Settings
-from tests.service.live_api import SUMMARY, wait_until
+from service.storage import blobs
+from tests.helpers.live_api import SUMMARY, wait_until
 from worker.reconciler import Reconciler
 
 LEASE_US = 60_000_000
-
-
-@pytest.fixture
-def project_id(database: Database, database_settings: Settings) -> str:
-    with database.write() as session:
-        return create_project(session, "test", database_settings).id
 
 
 @pytest.fixture

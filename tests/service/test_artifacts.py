@@ -17,10 +17,10 @@ import boto3
 import pytest
 from obstore.exceptions import BaseError
 
-from service.persistence import artifacts
-from service.persistence.artifacts import ArtifactStore, content_mtime_ns
 from service.settings import Settings
-from tests.service.live_api import HOST, free_port, settings_of, wait_until
+from service.storage import artifacts
+from service.storage.artifacts import ArtifactStore, content_mtime_ns
+from tests.helpers.live_api import HOST, free_port, settings_of, wait_until
 
 CONTENT = os.urandom(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

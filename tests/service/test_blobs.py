@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
+from service.database.connections import Database
+from service.database.tables import Blob, Checkpoint, Drive, DriveFile, Job, Project, Scene, SceneFile, now_us
+from service.domain.keys import create_project
 from service.errors import ServiceError
-from service.persistence import blobs
-from service.persistence.database import Database
-from service.persistence.keys import create_project
-from service.persistence.tables import Blob, Checkpoint, Drive, DriveFile, Job, Project, Scene, SceneFile, now_us
 from service.settings import Settings
+from service.storage import blobs
 
 EVER_US = 2**62
 

@@ -18,9 +18,9 @@ import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from service import broker
-from service.child_log import TAIL_LINES
-from service.data_folder import DataFolderError
+from service.standalone import broker
+from service.standalone.child_log import TAIL_LINES
+from service.storage.data_folder import DataFolderError
 
 Start = Callable[[broker.EmbeddedBroker], subprocess.Popen[bytes]]
 

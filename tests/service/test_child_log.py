@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.child_log import KEPT, TAIL_LINES, ChildLog
+from service.standalone.child_log import KEPT, TAIL_LINES, ChildLog
 
 
 def write(descriptor: int, *lines: str) -> None:
@@ -85,7 +85,7 @@ def test_on_a_full_disk_a_large_log_goes(tmp_path: Path, monkeypatch: pytest.Mon
     log = ChildLog(tmp_path / "api.log", max_bytes=100)
     descriptor = log.open_for_child()
     write(descriptor, "x" * 150)
-    monkeypatch.setattr("service.child_log.shutil.copy", no_room)
+    monkeypatch.setattr("service.standalone.child_log.shutil.copy", no_room)
     log.rotate_if_large()
     write(descriptor, "the newest")
     os.close(descriptor)

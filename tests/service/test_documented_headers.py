@@ -9,9 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.service.live_api import Api, Client
-from tests.service.tiny_drive import tiny_drive
-from tests.service.tus_client import VERSION, create, head, metadata, patch
+from tests.helpers.live_api import Api, Client
+from tests.helpers.tiny_drive import tiny_drive
+from tests.helpers.tus_client import VERSION, create, head, metadata, patch
 
 # Of the connection and of the body's form: every HTTP server sends them.
 FRAMING = {"connection", "content-length", "content-type", "date", "server", "transfer-encoding"}
@@ -138,6 +138,7 @@ def _download(said: Conversation, of: str, url: str) -> None:
     for name, method in ((f"download_{of}_file", "GET"), (f"head_{of}_file", "HEAD")):
         etag = said.ask(name, method, url, 200).headers["etag"]
         said.ask(name, method, url, 304, headers={"If-None-Match": etag})
+        said.ask(name, method, url, 412, headers={"If-Match": '"another"'})
         said.ask(name, method, f"{url}x", 404)
     said.ask(f"download_{of}_file", "GET", url, 206, headers={"Range": "bytes=0-1", "If-Range": etag})
     said.ask(f"download_{of}_file", "GET", url, 416, headers={"Range": "bytes=99-"})

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from schemas.api.resource import Finding
-from service import manifest_check
-from service.persistence import jobs
-from service.persistence.tables import Blob, Drive
+from service.api.manifests import manifest_check
+from service.database.tables import Blob, Drive
+from service.domain import jobs
+from tests.helpers.live_api import Api, Client, problem_of, wait_until
+from tests.helpers.tiny_drive import manifest, tiny_drive
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, problem_of, wait_until
-from tests.service.tiny_drive import manifest, tiny_drive
 
 MISSING_ID = "drv_" + "0" * 30
 
@@ -313,12 +313,12 @@ def test_a_commit_is_replayed_after_the_drive_is_gone(client: Client) -> None:
 
 
 def test_a_large_manifest_keeps_its_turn_until_it_is_recorded(client: Client) -> None:
-    limiter = client.api.context.large_documents
+    places = client.api.context.large_documents
     raw = tiny_drive().raw + b" " * 2_000_000
     with ThreadPoolExecutor(1) as pool:
         with client.api.database.write():  # the writers' lock: it is parsed and stored, and waits to be recorded
             answer = pool.submit(client.post, "/v1/drives", content=raw)
             wait_until(lambda: len(client.api.objects(client.project_id)) == 1, "the manifest")
-            assert limiter.borrowed_tokens == 1
+            assert places.held == 1
         assert answer.result().status_code == 201
-    wait_until(lambda: limiter.borrowed_tokens == 0, "the turn's end")
+    wait_until(lambda: places.held == 0, "the turn's end")

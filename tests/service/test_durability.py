@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from sqlalchemy import make_url, select, text, update
 
+from service.database.connections import Database
+from service.database.tables import Blob, DriveFile
+from service.domain import drives
 from service.errors import ServiceError
-from service.persistence import drives
-from service.persistence.database import Database
-from service.persistence.durability import boot_id
-from service.persistence.tables import Blob, DriveFile
-from tests.service.live_api import Api, Client, problem_of
-from tests.service.tiny_drive import tiny_drive
+from service.storage.durability import boot_id
+from tests.helpers.live_api import Api, Client, problem_of
+from tests.helpers.tiny_drive import tiny_drive
 
 pytestmark = pytest.mark.skipif(boot_id() is None, reason="this system does not name its starts")
 

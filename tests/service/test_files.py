@@ -14,10 +14,10 @@ import httpx
 import pytest
 from sqlalchemy import event
 
-from service.persistence.blobs import Recorded
-from service.persistence.storing import StoredFile, Storing
-from tests.service.live_api import Api, Client, forget_all, problem_of
-from tests.service.tiny_drive import TinyDrive, png, png_of, tiny_drive, zip_of
+from service.storage.blob_writer import StoredFile, Storing
+from service.storage.blobs import Recorded
+from tests.helpers.live_api import Api, Client, forget_all, problem_of
+from tests.helpers.tiny_drive import TinyDrive, png, png_of, tiny_drive, zip_of
 
 
 def digest(data: bytes) -> str:
@@ -318,7 +318,7 @@ def test_the_manifest_in_an_archive_may_be_written_in_another_way(client: Client
     for written in (indented, indented + b" " * 3_000_000):
         drive_id = client.create(drive)
         assert client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped(**{"drive.json": written})).is_success
-    assert client.api.context.large_documents.borrowed_tokens == 0
+    assert client.api.context.large_documents.held == 0
 
 
 @pytest.mark.parametrize("what", ["key twice", "many keys", "deep", "too large"])

@@ -14,18 +14,19 @@ from sqlalchemy import text, update
 from sqlalchemy.exc import DBAPIError
 
 from schemas.drive import DriveManifest
+from service.database.connections import Database
+from service.database.tables import Project
+from service.domain import drive_files, drives
+from service.domain.keys import create_project
+from service.domain.manifest_facts import facts_of
 from service.errors import ServiceError
-from service.manifest_facts import facts_of
-from service.persistence import blobs, drives, slots
-from service.persistence.database import Database
-from service.persistence.keys import create_project
-from service.persistence.storing import StoredFile
-from service.persistence.tables import Project
 from service.settings import Settings
-from tests.service.live_api import Api, Client
+from service.storage import blobs
+from service.storage.blob_writer import StoredFile
+from tests.helpers.live_api import Api, Client
+from tests.helpers.tiny_drive import manifest, tiny_drive, zip_of
+from tests.helpers.tus_client import begin, patch
 from tests.service.test_blobs import in_threads, meet
-from tests.service.tiny_drive import manifest, tiny_drive, zip_of
-from tests.service.tus_client import begin, patch
 
 PATH = "front/000000.png"
 
@@ -95,12 +96,6 @@ def test_a_declaration_while_an_archive_comes(client: Client) -> None:
 
 
 @pytest.fixture
-def project_id(database: Database, database_settings: Settings) -> str:
-    with database.write() as session:
-        return create_project(session, "test", database_settings).id
-
-
-@pytest.fixture
 def drive_id(database: Database, project_id: str) -> str:
     facts = facts_of(DriveManifest.model_validate(manifest()))
     with database.write() as session:
@@ -128,18 +123,18 @@ def overtaken(database: Database, project_id: str, drive_id: str) -> Callable[[s
 
     def fill(first: str, second: str, replace: bool) -> bool:
         with database.write() as session:
-            slot = slots.find(session, project_id, drive_id, PATH, lock=True)
+            slot = drive_files.find(session, project_id, drive_id, PATH, lock=True)
             with database.write() as other:
-                found = slots.find(other, project_id, drive_id, PATH, lock=True)
-                slots.fill(other, found, stored(first, project_id), replace=False)
-            return slots.fill(session, slot, stored(second, project_id), replace=replace) is not None
+                found = drive_files.find(other, project_id, drive_id, PATH, lock=True)
+                drive_files.fill(other, found, stored(first, project_id), replace=False)
+            return drive_files.fill(session, slot, stored(second, project_id), replace=replace) is not None
 
     return fill
 
 
 def content(database: Database, project_id: str, drive_id: str) -> str | None:
     with database.read() as session:
-        sha256 = slots.find(session, project_id, drive_id, PATH).sha256
+        sha256 = drive_files.find(session, project_id, drive_id, PATH).sha256
     return None if sha256 is None else sha256[0]
 
 
@@ -174,7 +169,7 @@ def test_known_files_are_looked_for_while_others_are_recorded(
         recorded = [blobs.record(session, project_id=project_id, **stored(name, project_id).identity) for name in names]
         paths = (PATH, "rear/000000.png")
         ids = {path: blob.id for path, blob in zip(paths, recorded, strict=True)}
-        slots.fill_all(session, drive, ids, replace=False)
+        drive_files.fill_all(session, drive, ids, replace=False)
     both = threading.Barrier(2)
 
     def record() -> None:

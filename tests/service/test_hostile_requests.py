@@ -23,10 +23,9 @@ import httpx
 import psutil
 import pytest
 
-from service.routes import bodies
+from tests.helpers.live_api import Api, Client, api_in_thread, api_process, problem_of, settings_of, wait_until
+from tests.helpers.tiny_drive import TinyDrive, manifest, png, png_of, tiny_drive, zip_of
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, api_in_thread, api_process, problem_of, settings_of, wait_until
-from tests.service.tiny_drive import TinyDrive, manifest, png, png_of, tiny_drive, zip_of
 
 NAME = "front/000000.png"
 
@@ -166,6 +165,13 @@ MANIFESTS: dict[str, tuple[bytes, str]] = {
     "absolute": (with_manifest(set_in("frames", 0, "images", "front", "file", "/x.png")), "relative path"),
     "foreign camera": (with_manifest(set_in("frames", 0, "images", "left", {"file": "x.png"})), "left"),
     "version": (with_manifest(set_in("version", 2)), "version"),
+    "version true": (with_manifest(set_in("version", True)), "version: must be the integer 1, is true"),
+    "version 1.0": (with_manifest(set_in("version", 1.0)), "version: must be the integer 1, is 1.0"),
+    "names differ in case": (
+        with_manifest(set_in("frames", 0, "images", "rear", "file", NAME.upper())),
+        "one file with",
+    ),
+    "own name": (with_manifest(set_in("frames", 0, "images", "rear", "file", "Drive.json")), "manifest's own name"),
     "number as text": (with_manifest(set_in("frames", 0, "timestamp_us", "5")), "timestamp_us"),
     "a list": (b"[]", "object"),
 }
@@ -345,15 +351,3 @@ def test_a_kill_in_the_middle_of_an_upload(tmp_path: Path) -> None:
         for path, data in drive.files.items():
             assert client.put(f"/v1/drives/{drive_id}/files/{path}", content=data).status_code in (200, 201)
         assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
-
-
-def test_a_large_body_that_comes_too_slowly(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bodies, "_LARGE_WITHIN_S", 0.3)
-    host, port = client.base_url.host, client.base_url.port
-    head = (
-        f"POST /v1/drives HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {client.key}\r\nContent-Length: 9000000\r\n\r\n"
-    )
-    with socket.create_connection((host, port), timeout=30) as connection:
-        connection.sendall(head.encode() + b" " * (bodies.LARGE_BYTES + 1000))
-        assert connection.recv(100).startswith(b"HTTP/1.1 408 ")
-    wait_until(lambda: client.api.context.large_bodies.borrowed_tokens == 0, "the turn's end")

@@ -12,12 +12,13 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
-from service import http_protocol
-from service.http_protocol import MAX_HEAD_BYTES
-from service.routes.bodies import LARGE_BYTES
+from service.api.http import protocol
+from service.api.http.protocol import MAX_HEAD_BYTES
+from service.api.manifests.bounded_process import LARGE_BYTES
+from service.domain import drives
+from tests.helpers.live_api import Api, Client, problem_of, wait_until
+from tests.helpers.tiny_drive import png, tiny_drive
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, problem_of
-from tests.service.tiny_drive import png, tiny_drive
 
 NAME = "front/000000.png"
 
@@ -38,7 +39,11 @@ def everything_from(connection: socket.socket) -> bytes:
 
 def answer_of(connection: socket.socket) -> httpx.Response:
     """The answer, after which the service hangs up."""
-    head, _, body = everything_from(connection).partition(b"\r\n\r\n")
+    return parsed(everything_from(connection))
+
+
+def parsed(received: bytes) -> httpx.Response:
+    head, _, body = received.partition(b"\r\n\r\n")
     status, *lines = head.decode().split("\r\n")
     headers = [(name, value) for name, _, value in (line.partition(": ") for line in lines)]
     return httpx.Response(int(status.split()[1]), headers=headers, content=body)
@@ -95,8 +100,103 @@ def test_what_is_not_http(api: Api) -> None:
         problem_of(answer_of(connection), 400, "malformed-request")
 
 
+def post_in_chunks(client: Client, chunk: bytes) -> bytes:
+    head = (
+        f"POST /v1/drives HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {client.key}\r\nTransfer-Encoding: chunked\r\n"
+    )
+    return head.encode() + b"\r\n" + chunk
+
+
+def logged(caplog: pytest.LogCaptureFixture, path: str) -> list[int]:
+    """Statuses of the requests for a path, as the request log has them."""
+    fields = [getattr(record, "fields", {}) for record in caplog.records if record.message == "request"]
+    return [of["status"] for of in fields if of["path"] == path]
+
+
+@pytest.mark.parametrize("first", [b"", b"5\r\nhello\r\n"], ids=["first chunk", "second chunk"])
+def test_a_malformed_chunk_is_answered(client: Client, caplog: pytest.LogCaptureFixture, first: bytes) -> None:
+    with caplog.at_level("INFO", "mrasfm.api"), connected(client.api) as connection:
+        connection.sendall(post_in_chunks(client, first))
+        time.sleep(0.1)  # the application waits for the body
+        connection.sendall(b"this is no length\r\n")
+        received = everything_from(connection)
+        wait_until(lambda: logged(caplog, "/v1/drives"), "the application's end")
+    assert received.count(b"HTTP/1.1 ") == 1, "nothing is written behind the answer"
+    problem_of(parsed(received), 400, "malformed-request")
+    assert logged(caplog, "/v1/drives") == [400], "the application learns that nothing more comes"
+    assert client.get("/v1/drives").json()["items"] == []
+
+
+def test_a_complete_request_is_answered_before_a_malformed_one(client: Client) -> None:
+    with connected(client.api) as connection:
+        raw = tiny_drive().raw
+        connection.sendall(post_in_chunks(client, b"%x\r\n%b\r\n0\r\n\r\n" % (len(raw), raw)) + b"\0 no request\r\n")
+        received = everything_from(connection)
+    assert received.startswith(b"HTTP/1.1 201 ")
+    assert received.count(b"HTTP/1.1 ") == 1
+
+
+def test_answers_stay_in_the_order_of_their_requests(client: Client) -> None:
+    with connected(client.api) as connection:
+        raw = tiny_drive().raw
+        first = post_in_chunks(client, b"%x\r\n%b\r\n0\r\n\r\n" % (len(raw), raw))
+        connection.sendall(first + post_in_chunks(client, b"this is no length\r\n"))
+        received = everything_from(connection)
+    assert [part[:3] for part in received.split(b"HTTP/1.1 ")[1:]] == [b"201", b"400"]
+
+
+def test_an_answer_that_has_begun_gets_no_other_behind_it(client: Client) -> None:
+    """Without a key the answer comes before the body."""
+    with connected(client.api) as connection:
+        connection.sendall(b"POST /v1/drives HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n1\r\nx\r\n")
+        assert connection.recv(100).startswith(b"HTTP/1.1 401 ")
+        connection.sendall(b"this is no length\r\n")
+        assert b"HTTP/1.1 " not in everything_from(connection)
+
+
+def test_every_answer_has_the_headers_that_browsers_go_by(api: Api, client: Client) -> None:
+    scene_id = client.scene({"points.ply": b"ply"})
+    scene = client.get(f"/v1/scenes/{scene_id}").json()
+    (url,) = (file["url"] for file in scene["files"])
+    etag = client.get(url).headers["etag"]
+    answers = [
+        client.get("/v1/drives"),
+        client.get(url),
+        client.get(url, headers={"If-None-Match": etag}),
+        client.get(url, headers={"Range": "bytes=9-"}),
+        client.get("/v1/nothing"),
+        client.patch("/v1/drives"),
+        client.post("/v1/drives", content=b"{"),
+        client.post("/v1/drives", headers={"Content-Encoding": "gzip"}, content=b"x"),
+        client.get(f"/v1/jobs/{scene['job_id']}/events"),
+        *(
+            api.anonymous().get(path)
+            for path in ("/v1/drives", "/openapi.json", "/docs/files/swagger-ui.css", "/livez")
+        ),
+    ]
+    for malformed in (b"no http\r\n\r\n", b"GET /livez HTTP/1.1\r\nX: " + b"x" * MAX_HEAD_BYTES):
+        with connected(api) as connection:
+            connection.sendall(malformed)
+            answers.append(answer_of(connection))
+    assert {answer.status_code for answer in answers} == {200, 304, 400, 401, 404, 405, 415, 416, 422, 431}
+    for answer in answers:
+        assert answer.headers.get_list("content-security-policy") == ["default-src 'none'; frame-ancestors 'none'"]
+        assert answer.headers.get_list("x-content-type-options") == ["nosniff"]
+
+
+def test_a_failure_of_the_service_has_them_too(start_api: StartApi, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*given: object, **more: object) -> None:
+        raise RuntimeError
+
+    monkeypatch.setattr(drives, "page", fails)
+    answer = start_api().client().get("/v1/drives")
+    problem_of(answer, 500, "internal-error")
+    assert answer.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
 def test_connections_that_ask_nothing_end(start_api: StartApi, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_protocol, "HEAD_WITHIN_S", 0.3)
+    monkeypatch.setattr(protocol, "HEAD_WITHIN_S", 0.3)
     api = start_api()
     with connected(api) as silent, connected(api) as unfinished, connected(api) as second:
         unfinished.sendall(b"GET /livez HTTP/1.1\r\nHost: x\r\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -16,30 +17,23 @@ from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from service.database.connections import Database, migrate
+from service.database.tables import TERMINAL, Job, JobAttempt, JobEvent, JobState, Scene, now_us
+from service.domain import jobs, scenes
+from service.domain.keys import create_project
 from service.errors import ServiceError
-from service.persistence import jobs, scenes
-from service.persistence.database import Database, migrate
-from service.persistence.keys import create_project
-from service.persistence.tables import TERMINAL, Job, JobAttempt, JobEvent, JobState, Scene, now_us
-from service.settings import Settings
-from tests.service.live_api import SUMMARY, settings_of
+from tests.helpers.live_api import LIMITS, SUMMARY, settings_of
 
 LEASE_US = 60_000_000
 EXPIRED_US = -1_000_000  # a lease that ends before it begins
-MAX_ATTEMPTS = 3
-_WITH_CLOCKS = ("_ending", "_queue", "_rows")  # of their own, besides the database's
+MAX_ATTEMPTS = LIMITS.max_attempts
+_WITH_CLOCKS = ("_completion", "_queue", "_queries")  # of their own, besides the database's
 
 
 def problem(*, retryable: bool) -> Problem:
     return Problem(
         type=PROBLEM_TYPE + "out-of-memory", title="Memory", detail="no memory", remedy="More.", retryable=retryable
     )
-
-
-@pytest.fixture
-def project_id(database: Database, database_settings: Settings) -> str:
-    with database.write() as session:
-        return create_project(session, "test", database_settings).id
 
 
 @pytest.fixture
@@ -71,12 +65,18 @@ def job_of(database: Database, job_id: str) -> Job:
 
 def expire(database: Database) -> list[str]:
     with database.write() as session:
-        return jobs.expire_leases(session, max_attempts=MAX_ATTEMPTS)
+        return jobs.expire_leases(session, limits=LIMITS)
 
 
 def fail(database: Database, held: jobs.Claim, *, retryable: bool) -> JobState:
     with database.write() as session:
-        return jobs.fail(session, held, problem(retryable=retryable), max_attempts=MAX_ATTEMPTS, retry_delay_us=0)
+        return jobs.fail(
+            session,
+            held,
+            problem(retryable=retryable),
+            limits=LIMITS,
+            retry_delay_us=0,
+        )
 
 
 def note_of(percent: float) -> jobs.ProgressNote:
@@ -140,7 +140,7 @@ def test_an_old_holder_writes_nothing(database: Database, job_id: str) -> None:
     actions: list[Callable[[Session], object]] = [
         lambda session: jobs.heartbeat(session, old, lease_us=LEASE_US),
         lambda session: jobs.succeed(session, old),
-        lambda session: jobs.fail(session, old, problem(retryable=True), max_attempts=3, retry_delay_us=0),
+        lambda session: jobs.fail(session, old, problem(retryable=True), limits=LIMITS, retry_delay_us=0),
         lambda session: jobs.cancelled(session, old),
         lambda session: jobs.release(session, old),
         lambda session: scenes.publish(session, old, files={}, summary=SUMMARY, expires_us=None),
@@ -181,19 +181,81 @@ def test_the_end_is_published_or_cancelled_and_not_both(database: Database, proj
         assert count == (1 if job.state == JobState.SUCCEEDED else 0), job.state
 
 
-def test_a_lost_worker_is_replaced_until_no_attempt_is_left(database: Database, job_id: str) -> None:
-    for attempt in range(1, MAX_ATTEMPTS + 1):
-        assert claimed(database, job_id, lease_us=EXPIRED_US).attempt == attempt
-        assert expire(database) == [job_id]
-        assert expire(database) == []
+def lose(database: Database, job_id: str, *, engine_ran: bool, memory_kills: int | None = None) -> JobState:
+    """An attempt whose worker is lost; what of it is known as by `blame_of_loss`."""
+    held = claimed(database, job_id)
+    with database.write() as session:
+        note = dataclasses.replace(note_of(1.0), engine_ran=engine_ran)
+        jobs.heartbeat(session, held, lease_us=LEASE_US, note=note)
+        assert jobs.end_lease(session, job_id, held.fence, memory_kills=memory_kills)
+    assert expire(database) == [job_id]
+    assert expire(database) == []
+    return JobState(job_of(database, job_id).state)
+
+
+def tries(database: Database, job_id: str, **known: Any) -> int:
+    """How many workers a job outlasts."""
+    number = 1
+    while lose(database, job_id, **known) == JobState.QUEUED:
+        number += 1
+    return number
+
+
+def test_lost_workers_are_no_fault_of_their_job(database: Database, job_id: str) -> None:
+    assert tries(database, job_id, engine_ran=True, memory_kills=0) == LIMITS.max_losses
     job = job_of(database, job_id)
-    assert job.state == JobState.FAILED
+    assert (job.state, job.blame, job.attempt) == (JobState.FAILED, 0.0, LIMITS.max_losses)
     assert job.problem is not None
     assert job.problem["type"].endswith("worker-lost")
     assert claim(database, job_id) is None
     with database.read() as session:
         outcomes = session.scalars(select(JobAttempt.outcome).order_by(JobAttempt.fence)).all()
-    assert outcomes == ["worker-lost"] * MAX_ATTEMPTS
+    assert outcomes == ["worker-lost"] * LIMITS.max_losses
+
+
+@pytest.mark.parametrize(
+    ("known", "expected", "problem_type"),
+    [
+        ({"engine_ran": True, "memory_kills": 2}, LIMITS.max_attempts, "out-of-memory"),
+        ({"engine_ran": False, "memory_kills": 1}, LIMITS.max_attempts, "out-of-memory"),
+        ({"engine_ran": True}, 2 * LIMITS.max_attempts, "worker-lost"),
+        ({"engine_ran": False}, LIMITS.max_losses, "worker-lost"),
+    ],
+)
+def test_what_is_known_of_a_loss_decides(
+    database: Database, job_id: str, known: dict[str, Any], expected: int, problem_type: str
+) -> None:
+    assert tries(database, job_id, **known) == expected
+    problem = job_of(database, job_id).problem
+    assert problem is not None
+    assert problem["type"].endswith(problem_type)
+
+
+def test_losses_and_failures_are_counted_apart(database: Database, job_id: str) -> None:
+    for _ in range(LIMITS.max_losses - 1):
+        assert lose(database, job_id, engine_ran=True, memory_kills=0) == JobState.QUEUED
+    for _ in range(LIMITS.max_attempts - 1):
+        assert fail(database, claimed(database, job_id), retryable=True) == JobState.QUEUED
+    job = job_of(database, job_id)
+    assert (job.losses, job.blame) == (LIMITS.max_losses - 1, LIMITS.max_attempts - 1)
+    assert fail(database, claimed(database, job_id), retryable=True) == JobState.FAILED
+
+
+def test_losses_are_counted_since_the_last_finished_stage(database: Database, job_id: str) -> None:
+    for _ in range(3):
+        for _ in range(LIMITS.max_losses - 1):
+            assert lose(database, job_id, engine_ran=True, memory_kills=0) == JobState.QUEUED
+        held = claimed(database, job_id)
+        with database.write() as session:
+            jobs.note_finished_stage(session, held)
+            jobs.release(session, held)
+        with database.write() as session:  # an attempt that is not the job's any more changes nothing
+            jobs.note_finished_stage(session, held)
+    assert job_of(database, job_id).losses == 0
+    assert lose(database, job_id, engine_ran=True, memory_kills=0) == JobState.QUEUED
+    with database.write() as session:
+        jobs.note_finished_stage(session, held)
+    assert job_of(database, job_id).losses == 1
 
 
 def test_several_reconcilers_take_a_lost_job_once(database: Database, project_id: str) -> None:
@@ -258,7 +320,13 @@ def test_progress_is_not_taken_back_when_a_worker_stops(database: Database, job_
 def test_a_retry_waits_its_time(database: Database, job_id: str) -> None:
     held = claimed(database, job_id)
     with database.write() as session:
-        jobs.fail(session, held, problem(retryable=True), max_attempts=3, retry_delay_us=3_600_000_000)
+        jobs.fail(
+            session,
+            held,
+            problem(retryable=True),
+            limits=LIMITS,
+            retry_delay_us=3_600_000_000,
+        )
     assert claim(database, job_id) is None
     with database.write() as session:
         assert jobs.due(session) == []
@@ -327,8 +395,8 @@ def test_machines_whose_clocks_differ(database: Database, job_id: str, monkeypat
     held = claimed(database, job_id)
     for off_us in (3_600_000_000, -3_600_000_000):
         for module in _WITH_CLOCKS:
-            monkeypatch.setattr(f"service.persistence.jobs.{module}.now_us", lambda off_us=off_us: now_us() + off_us)
-        monkeypatch.setattr("service.persistence.database.now_us", lambda off_us=off_us: now_us() + off_us)
+            monkeypatch.setattr(f"service.domain.jobs.{module}.now_us", lambda off_us=off_us: now_us() + off_us)
+        monkeypatch.setattr("service.database.connections.now_us", lambda off_us=off_us: now_us() + off_us)
         assert expire(database) == []
         with database.write() as session:
             jobs.heartbeat(session, held, lease_us=LEASE_US)
@@ -344,7 +412,7 @@ def test_a_retry_is_due_by_the_database_s_clock(
         pytest.skip("its users share a machine")
     held = claimed(database, job_id)
     for module in _WITH_CLOCKS:
-        monkeypatch.setattr(f"service.persistence.jobs.{module}.now_us", lambda: now_us() + 3_600_000_000)
+        monkeypatch.setattr(f"service.domain.jobs.{module}.now_us", lambda: now_us() + 3_600_000_000)
     fail(database, held, retryable=True)
     monkeypatch.undo()
     assert claim(database, job_id) is not None
@@ -454,7 +522,7 @@ class Transitions(RuleBasedStateMachine):
         if held is not None:
             assert self.ended is None
             assert all(held.fence > old.fence for old in self.held)
-            assert held.failures < MAX_ATTEMPTS
+            assert held.blame < LIMITS.max_attempts
             self.held.append(held)
 
     @rule(pick=st.integers(0, 5), what=st.sampled_from(["beat", "succeed", "cancelled", "release", "publish"]))
@@ -481,7 +549,7 @@ class Transitions(RuleBasedStateMachine):
         held = self._holder(pick)
         if held is not None:
             given = problem(retryable=retryable)
-            self._try(lambda s: jobs.fail(s, held, given, max_attempts=MAX_ATTEMPTS, retry_delay_us=0))
+            self._try(lambda s: jobs.fail(s, held, given, limits=LIMITS, retry_delay_us=0))
 
     @rule()
     def cancel(self) -> None:
@@ -490,6 +558,18 @@ class Transitions(RuleBasedStateMachine):
     @rule()
     def expire(self) -> None:
         expire(self.database)
+
+    @rule(pick=st.integers(0, 5), memory_kills=st.sampled_from([None, 0, 1]))
+    def found_dead(self, pick: int, memory_kills: int | None) -> None:
+        held = self._holder(pick)
+        if held is not None:
+            self._try(lambda s: jobs.end_lease(s, held.job_id, held.fence, memory_kills=memory_kills))
+
+    @rule(pick=st.integers(0, 5))
+    def finished_stage(self, pick: int) -> None:
+        held = self._holder(pick)
+        if held is not None:
+            self._try(lambda s: jobs.note_finished_stage(s, held))
 
     @invariant()
     def what_has_ended_never_changes(self) -> None:
@@ -502,7 +582,7 @@ class Transitions(RuleBasedStateMachine):
             published = session.scalars(select(Scene.id).where(Scene.job_id == job.id)).all()
         assert self.ended is None or seen == self.ended
         assert job.revision >= self.revision
-        assert 0 <= job.failures < MAX_ATTEMPTS
+        assert LIMITS.allow(blame=job.blame, losses=job.losses) or job.state == JobState.FAILED
         assert (job.attempt, job.percent) >= self.shown, "neither falls, the percent within an attempt"
         assert open_attempts == ([job.fence] if job.state == JobState.RUNNING else [])
         assert published == ([] if job.scene_id is None else [job.scene_id])

@@ -12,11 +12,11 @@ import httpx
 import pytest
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from service.persistence import jobs
-from service.persistence.keys import revoke_key
-from service.persistence.tables import ApiKey, Job, Project, now_us
+from service.database.tables import ApiKey, Job, Project, now_us
+from service.domain import jobs
+from service.domain.keys import revoke_key
+from tests.helpers.live_api import LIMITS, Api, Client, problem_of, wait_until
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, problem_of, wait_until
 
 LEASE_US = 60_000_000
 BROKEN = Problem(type=PROBLEM_TYPE + "engine-abort", title="Aborted", detail="it", remedy="Look.", retryable=False)
@@ -50,7 +50,7 @@ def beat(client: Client, held: jobs.Claim, percent: float) -> bool:
 
 def fail(client: Client, held: jobs.Claim) -> None:
     with client.api.database.write() as session:
-        jobs.fail(session, held, BROKEN, max_attempts=3, retry_delay_us=0)
+        jobs.fail(session, held, BROKEN, limits=LIMITS, retry_delay_us=0)
 
 
 def test_a_new_job_waits_and_says_where_to_look(owner: Client, drive_id: str) -> None:

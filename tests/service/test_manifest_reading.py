@@ -12,14 +12,17 @@ import psutil
 import pytest
 
 from schemas.api.drives import FileRole
-from service import manifest_reading
-from service.bounded_process import LARGE_BYTES
-from service.context import Context
+from schemas.parsing import parse_manifest
+from service.api.context import Context
+from service.api.manifests import reading
+from service.api.manifests.bounded_process import LARGE_BYTES
+from service.api.manifests.reading import read_manifest
+from service.domain import drives
+from service.domain.manifest_facts import ManifestFacts, facts_of
 from service.errors import ServiceError
-from service.manifest_facts import ManifestFacts
-from service.manifest_reading import read_manifest
-from tests.service.live_api import Client, api_process, problem_of, settings_of
-from tests.service.tiny_drive import manifest, tiny_drive
+from service.storage.blob_writer import store_file
+from tests.helpers.live_api import Client, api_process, problem_of, settings_of, sha256_of
+from tests.helpers.tiny_drive import manifest, png, tiny_drive
 
 Read = Callable[[bytes], ManifestFacts]
 
@@ -74,6 +77,51 @@ def test_names_that_no_folder_can_hold(read: Read) -> None:
     assert [item.field for item in refused.value.problem.errors] == ["rear/000000.png/x.png"]
 
 
+def test_a_drive_that_was_accepted_before_stricter_rules(client: Client) -> None:
+    """It is shown, filled, committed and reconstructed; a new one like it is refused."""
+    document = manifest("old")
+    document["version"] = True
+    images = document["frames"][0]["images"]
+    images["front"]["file"], images["rear"]["file"] = "front/A.png", "front/a.png"
+    raw = json.dumps(document).encode()
+    problem = problem_of(client.post("/v1/drives", content=raw), 422, "invalid-document")
+    assert "version" in {item["field"] for item in problem["errors"]}
+    drive_id = stored_before(client, raw)
+    assert client.get(f"/v1/drives/{drive_id}").json()["files_expected"] == 6
+    assert client.get(f"/v1/drives/{drive_id}/manifest").content == raw
+    files = [image["file"] for frame in document["frames"] for image in frame["images"].values()]
+    for path in files:
+        assert client.put(f"/v1/drives/{drive_id}/files/{path}", content=png(seed=path)).status_code == 201
+    assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+    assert client.reconstruct(drive_id)["state"] == "QUEUED"
+
+
+def stored_before(client: Client, raw: bytes) -> str:
+    """A drive as an earlier version made it; its id."""
+    api, facts = client.api, facts_of(parse_manifest(raw))
+    path = api.settings.spool_dir / "manifest"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(raw)
+    stored = store_file(
+        api.database,
+        api.context.artifacts,
+        project_id=client.project_id,
+        path=path,
+        sha256=sha256_of(raw),
+        size_bytes=len(raw),
+    )
+    with api.database.write() as session:
+        drive = drives.create(
+            session,
+            project_id=client.project_id,
+            manifest=facts,
+            rows=drives.rows_of(facts),
+            stored=stored,
+            expires_us=None,
+        )
+        return drive.id
+
+
 LARGE = tiny_drive().raw + b" " * LARGE_BYTES
 
 
@@ -81,7 +129,7 @@ LARGE = tiny_drive().raw + b" " * LARGE_BYTES
 def test_a_manifest_that_costs_too_much_has_to_be_split(
     client: Client, monkeypatch: pytest.MonkeyPatch, bound: str, value: float
 ) -> None:
-    monkeypatch.setattr(manifest_reading, bound, value)
+    monkeypatch.setattr(reading, bound, value)
     problem = problem_of(client.post("/v1/drives", content=LARGE), 422, "manifest-too-large")
     assert "Split the drive" in problem["remedy"]
     assert client.api.objects(client.project_id) == []
@@ -91,7 +139,7 @@ def test_a_manifest_that_costs_too_much_has_to_be_split(
 def test_a_reader_that_cannot_run_is_the_services_fault(
     client: Client, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr(manifest_reading, "_COMMAND", command)
+    monkeypatch.setattr(reading, "_COMMAND", command)
     problem_of(client.post("/v1/drives", content=LARGE), 503, "check-failed")
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
-from service.persistence import jobs, maps
-from service.persistence.tables import Blob, Map, MapFile, Scene, now_us
+from service.database.tables import Blob, Map, MapFile, Scene, now_us
+from service.domain import jobs, maps
+from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, forget_all, problem_of
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, forget_all, problem_of
 from tests.service.test_aggregations import BROKEN, FILES, fail, finish, job_of, members
-from tests.service.tiny_drive import tiny_drive
 
 CONTENT = bytes(range(256)) * 40
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -173,7 +173,7 @@ def test_a_map_that_nothing_came_of_goes_with_its_job(start_api: StartApi, end: 
         assert (expires()[1], expire()) == (None, 200), "it is kept as maps are"
         return
     with client.api.database.write() as session:
-        jobs.fail(session, held, BROKEN, max_attempts=1, retry_delay_us=0)
+        jobs.fail(session, held, BROKEN, limits=ONE_ATTEMPT, retry_delay_us=0)
     assert expire() == 404
 
 

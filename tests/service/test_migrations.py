@@ -14,10 +14,10 @@ from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import inspect, text
 
-from service.persistence.database import MIGRATIONS, Database, is_current, migrate
-from service.persistence.tables import Base, Job, JobAttempt, JobEvent, Scene
+from service.database.connections import MIGRATIONS, Database, is_current, migrate
+from service.database.tables import Base, Job, JobAttempt, JobEvent, Scene
 from service.settings import Settings
-from tests.service.live_api import REPOSITORY, free_port
+from tests.helpers.live_api import REPOSITORY, free_port
 
 
 def differences(database: Database) -> list[object]:
@@ -66,8 +66,8 @@ def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
         assert (job.drive_id, job.map_id, job.is_child, job.waiting_for, job.children_percent) == (
             "drv_1", None, False, 0, 0.0,
         )  # fmt: skip
-        assert (job.attempt, job.failures) == (1, 0)
-        assert session.get_one(Job, "job_2").failures == 2, "attempts that failed before it was queued again"
+        assert (job.attempt, job.blame, job.losses, job.engine_ran) == (1, 0.0, 0, False)
+        assert session.get_one(Job, "job_2").blame == 2, "attempts that failed before it was queued again"
         assert session.query(JobAttempt).count() == 1
         assert session.query(JobEvent).count() == 1
         assert session.query(Scene).count() == 0

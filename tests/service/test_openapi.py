@@ -16,8 +16,8 @@ from schemas.api.drives import DriveResource
 from schemas.api.jobs import JobResource
 from schemas.api.resource import Resource, example_of
 from schemas.api.uploads import UploadResource
-from tests.service.fuzzing import fuzz
-from tests.service.live_api import Api, Client, problem_of
+from tests.helpers.fuzzing import fuzz
+from tests.helpers.live_api import Api, Client, problem_of
 
 
 def operations(page: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -10,19 +10,20 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import event, text
 
+from service.api.routes import drives as drive_routes
+from service.domain import workers
 from service.logs import JsonFormatter, log_fields
-from service.persistence import workers
-from service.routes import drives as drive_routes
 from service.settings import Settings
+from tests.helpers.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
-from tests.service.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of
-from tests.service.tiny_drive import tiny_drive
 
 QUICK_S = 10.0  # generous: a broker that hangs would cost much more
 
@@ -33,6 +34,34 @@ def metrics_of(api: Api) -> dict[str, float]:
     assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
     samples = (sample for family in text_string_to_metric_families(answer.text) for sample in family.samples)
     return {f"{sample.name}{json.dumps(sample.labels, sort_keys=True)}": sample.value for sample in samples}
+
+
+def test_metrics_behind_a_token(start_api: StartApi) -> None:
+    token = "a-token-of-the-operator/1+2="
+    api = start_api(metrics_token=token)
+    own_key = api.client().key
+    for given in (None, "", "Bearer", f"Bearer {token}x", f"Basic {token}", token, f"Bearer {own_key}", "Bearer \xff"):
+        headers = {} if given is None else {"Authorization": given.encode("latin-1")}
+        answer = httpx.get(f"{api.url}/metrics", headers=headers)
+        problem = problem_of(answer, 401, "unauthorized")
+        assert "MRASFM_METRICS_TOKEN" in problem["remedy"]
+        assert answer.headers["www-authenticate"].startswith("Bearer ")
+        assert "mrasfm_" not in answer.text
+    for method in ("GET", "HEAD"):
+        answer = httpx.request(method, f"{api.url}/metrics", headers={"Authorization": f"Bearer {token}"})
+        assert answer.status_code == 200
+        assert httpx.request(method, f"{api.url}/metrics").status_code == 401
+    page = httpx.get(f"{api.url}/openapi.json").json()
+    shown = page["paths"]["/metrics"]["get"]
+    (scheme,) = (name for each in shown["security"] for name in each)
+    assert page["components"]["securitySchemes"][scheme]["scheme"] == "bearer"
+    assert "401" in shown["responses"]
+    assert token not in json.dumps(page)
+
+
+def test_metrics_without_a_token_are_open(api: Api, page: dict[str, Any]) -> None:
+    assert httpx.get(f"{api.url}/metrics").status_code == 200
+    assert "security" not in page["paths"]["/metrics"]["get"]
 
 
 def test_alive_and_ready(api: Api) -> None:

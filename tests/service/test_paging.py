@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from schemas.drive import MAX_PATH_CHARACTERS, RelativePath
-from service.routes.paging import MAX_CURSOR_CHARACTERS, cursor_of, position_of
-from tests.service.live_api import Client
-from tests.service.tiny_drive import manifest
+from service.api.http.paging import MAX_CURSOR_CHARACTERS, cursor_of, position_of
+from tests.helpers.live_api import Client
+from tests.helpers.tiny_drive import manifest
 
 _path = TypeAdapter(RelativePath)
 

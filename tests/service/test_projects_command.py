@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from service.commands import projects
-from tests.service.live_api import Api, problem_of
-from tests.service.tiny_drive import tiny_drive
+from tests.helpers.live_api import Api, problem_of
+from tests.helpers.tiny_drive import tiny_drive
 
 
 def run(api: Api, *arguments: str) -> int:

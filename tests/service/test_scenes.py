@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import hashlib
 
+import httpx
 import pytest
 
-from service.persistence import jobs
-from tests.service.live_api import Api, Client, problem_of
-from tests.service.tiny_drive import tiny_drive
+from service.domain import jobs
+from tests.helpers.live_api import Api, Client, problem_of
+from tests.helpers.tiny_drive import tiny_drive
 
 CONTENT = bytes(range(256)) * 40
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -97,6 +98,41 @@ def test_a_range_outside_the_file(owner: Client, url: str, asked: str) -> None:
     answer = owner.get(url, headers={"Range": asked})
     problem_of(answer, 416, "range-outside")
     assert answer.headers["content-range"] == f"bytes */{len(CONTENT)}"
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        [f'"{SHA256}"'],
+        ["*"],
+        [f'"other", "{SHA256}"'],
+        ['"other", W/"x"', f'"{SHA256}"'],
+        [f'"with, comma","{SHA256}"'],
+    ],
+)
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_if_match_of_the_version_there_is(owner: Client, url: str, method: str, given: list[str]) -> None:
+    headers = httpx.Headers([*(("If-Match", line) for line in given), ("Range", "bytes=0-9")])
+    assert owner.request(method, url, headers=headers).status_code == (206 if method == "GET" else 200)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [['"other"'], [f'W/"{SHA256}"'], [SHA256], [""], ['"other"', 'W/"x", "y"'], [f'"{SHA256}x"'], [f'"a {SHA256}"']],
+)
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_if_match_of_another_version(owner: Client, url: str, method: str, given: list[str]) -> None:
+    """It comes before If-None-Match and Range, which would answer 304 and 416."""
+    rest = [("If-None-Match", f'"{SHA256}"'), ("Range", "bytes=99999-")]
+    answer = owner.request(method, url, headers=httpx.Headers([*(("If-Match", line) for line in given), *rest]))
+    assert (answer.status_code, answer.headers["etag"]) == (412, f'"{SHA256}"')
+    if method == "GET":
+        problem_of(answer, 412, "precondition-failed")
+
+
+def test_if_none_match_comes_after_if_match_and_before_the_range(owner: Client, url: str) -> None:
+    headers = {"If-Match": f'"{SHA256}"', "If-None-Match": f'"{SHA256}"', "Range": "bytes=99999-"}
+    assert owner.get(url, headers=headers).status_code == 304
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ from typing import Any
 import httpx
 import pytest
 
-from service.persistence.database import migrate
-from service.persistence.keys import ensure_first_key, revoke_key
-from service.persistence.tables import ApiKey
-from tests.service.live_api import Api, Client, api_process, problem_of, settings_of, wait_until
+from service.database.connections import migrate
+from service.database.tables import ApiKey
+from service.domain.keys import ensure_first_key, revoke_key
+from tests.helpers.live_api import Api, Client, api_process, problem_of, settings_of, wait_until
+from tests.helpers.tiny_drive import tiny_drive
+from tests.helpers.tus_client import OFFSET_TYPE, VERSION, begin, metadata
 from tests.service.test_maps import new_version
-from tests.service.tiny_drive import tiny_drive
-from tests.service.tus_client import OFFSET_TYPE, VERSION, begin, metadata
 
 OPEN = {"/livez", "/readyz", "/metrics"}
 BODIES: dict[str, Any] = {

@@ -10,7 +10,8 @@ import httpx
 import psutil
 import pytest
 
-from tests.service.live_api import DEADLINE_S, ApiProcess, api_process, settings_of, wait_until
+from tests.helpers.live_api import DEADLINE_S, ApiProcess, api_process, settings_of, wait_until
+from tests.helpers.process_tree import children_of
 
 POLLS = 20
 
@@ -23,8 +24,7 @@ def api(tmp_path: Path) -> Iterator[ApiProcess]:
 
 def serving(api: ApiProcess) -> list[psutil.Process]:
     assert api.process is not None
-    children = psutil.Process(api.process.pid).children()
-    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+    return children_of(api.process.pid, "spawn_main")
 
 
 def test_processes_serve_count_and_end_together(api: ApiProcess) -> None:
@@ -59,3 +59,22 @@ def test_a_parent_that_is_killed_leaves_nobody(api: ApiProcess) -> None:
     assert alive == []
     with pytest.raises(httpx.TransportError):
         httpx.get(f"{api.url}/livez", timeout=5)
+    (of_killed,) = api.settings.metrics_dir.iterdir()
+    api.start()
+    (of_next,) = api.settings.metrics_dir.iterdir()
+    assert of_next != of_killed, "what a killed parent left is removed at the next start"
+    assert api.process is not None
+    api.process.terminate()
+    assert api.process.wait(DEADLINE_S) == 0
+    assert list(api.settings.metrics_dir.iterdir()) == []
+
+
+def test_a_parent_that_lives_keeps_its_counts(api: ApiProcess, tmp_path: Path) -> None:
+    """Another API on the same data folder removes nothing of it."""
+    (own,) = api.settings.metrics_dir.iterdir()
+    (tmp_path / "other").mkdir()
+    with api_process(api.settings, tmp_path / "other", MRASFM_API_PROCESSES="2"):
+        assert own in set(api.settings.metrics_dir.iterdir())
+        assert len(list(api.settings.metrics_dir.iterdir())) == 2
+    assert list(api.settings.metrics_dir.iterdir()) == [own]
+    assert "mrasfm_http_requests_total" in httpx.get(f"{api.url}/metrics", timeout=DEADLINE_S).text

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.persistence.database import migrate
+from service.database.connections import migrate
 from service.settings import Settings
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
-from tests.service.tiny_drive import tiny_drive
 
 FIELDS = Settings.model_json_schema()["properties"]
 NUMBERS = {
@@ -41,6 +41,19 @@ def test_the_largest_numbers_can_be_worked_with(start_api: StartApi) -> None:
     assert created.json()["expires_at"] > "2100"
     job = client.reconstruct(client.committed(tiny_drive("b")), **{"Idempotency-Key": "job"})
     assert client.publish(client.claim(job["id"]), {"report.json": b"{}"})
+
+
+@pytest.mark.parametrize("token", ["short", "sixteen letters and spaces", "quoted'quoted'quoted'", "ü" * 20])
+def test_a_token_that_cannot_be_sent_or_can_be_guessed(monkeypatch: pytest.MonkeyPatch, token: str) -> None:
+    monkeypatch.setenv("MRASFM_METRICS_TOKEN", token)
+    with pytest.raises(ValidationError, match="openssl rand") as caught:
+        Settings()
+    assert token not in str(caught.value), "errors end in logs"
+
+
+def test_no_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MRASFM_METRICS_TOKEN", "")
+    assert Settings().metrics_token is None
 
 
 def test_the_defaults_fit_together() -> None:

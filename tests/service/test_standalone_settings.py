@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from service import broker
 from service.commands import standalone as command
-from service.persistence.database import migrate
+from service.database.connections import migrate
 from service.settings import Settings
-from service.standalone import child_specs
+from service.standalone import broker
+from service.standalone.program import child_specs
 
 
 def run(*arguments: str) -> int:
@@ -101,7 +101,7 @@ def test_a_full_disk_is_named(
     def no_room(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(f"service.data_folder.os.{function}", no_room)
+    monkeypatch.setattr(f"service.storage.data_folder.os.{function}", no_room)
     assert run("--data", str(tmp_path), "--port", "0") == 2
     said = capsys.readouterr().err
     assert "cannot be used: No space left on device. Make room on its disk" in said

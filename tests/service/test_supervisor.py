@@ -21,17 +21,18 @@ from typing import Any
 import psutil
 import pytest
 
-from service.data_folder import DataFolderError, exclusive_use
-from service.supervisor import ChildSpec, Supervisor
+from service.standalone.supervisor import ChildSpec, Supervisor
+from service.storage.data_folder import DataFolderError, exclusive_use
+from tests.helpers.process_tree import children_of
 
 PATIENCE_S = 60.0
 
 SUPERVISOR = """
 import json, sys
 from pathlib import Path
-from service.data_folder import DataFolderError, exclusive_use
-from service.pulse import Pulse
-from service.supervisor import ChildSpec, Supervisor, SupervisorError
+from service.storage.data_folder import DataFolderError, exclusive_use
+from service.standalone.liveness_probe import Pulse
+from service.standalone.supervisor import ChildSpec, Supervisor, SupervisorError
 
 def say(line):
     print(line, flush=True)
@@ -100,7 +101,7 @@ def is_gone(pid: int) -> bool:
 
 
 def guards_of(pid: int) -> list[psutil.Process]:
-    return [child for child in psutil.Process(pid).children() if "process_guard" in " ".join(child.cmdline())]
+    return children_of(pid, "process_guard")
 
 
 @dataclass
@@ -367,7 +368,7 @@ def test_a_passing_lack_of_processes_ends_nothing(tmp_path: Path, monkeypatch: p
             raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         return real(argv, **options)
 
-    monkeypatch.setattr("service.supervisor.subprocess.Popen", scarce)
+    monkeypatch.setattr("service.standalone.supervisor.subprocess.Popen", scarce)
     spec = ChildSpec(name="worker", argv=[sys.executable, "-I", "-S", "-c", "import time; time.sleep(600)"])
 
     def end() -> None:

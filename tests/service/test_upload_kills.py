@@ -11,9 +11,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.service.live_api import ApiProcess, api_process, settings_of
+from tests.helpers.live_api import ApiProcess, api_process, settings_of
+from tests.helpers.tus_client import begin, checksum, head, offset_of, patch
 from tests.service.test_uploads import PATH, image, stored
-from tests.service.tus_client import begin, checksum, head, offset_of, patch
 
 SIZE_BYTES = 24_000_000
 PIECE_BYTES = 16_384

@@ -17,16 +17,16 @@ import httpx
 import pytest
 from sqlalchemy import update
 
-from service.app import sweep_uploads
-from service.persistence import durability
-from service.persistence import uploads as upload_records
-from service.persistence.tables import Drive, Upload, now_us
-from service.routes import upload_writing
-from service.uploads.resumable import PartialFile, sweep
+from service.api.app import sweep_uploads
+from service.api.routes import upload_writing
+from service.database.tables import Drive, Upload, now_us
+from service.domain import uploads as upload_records
+from service.storage import durability
+from service.storage.uploads.resumable import PartialFile, sweep
+from tests.helpers.live_api import Api, Client, problem_of, wait_until
+from tests.helpers.tiny_drive import TinyDrive, png_of, tiny_drive
+from tests.helpers.tus_client import OFFSET_TYPE, VERSION, begin, checksum, create, head, offset_of, patch
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, problem_of, wait_until
-from tests.service.tiny_drive import TinyDrive, png_of, tiny_drive
-from tests.service.tus_client import OFFSET_TYPE, VERSION, begin, checksum, create, head, offset_of, patch
 
 PATH = "front/000000.png"
 
@@ -150,7 +150,7 @@ def test_after_another_start_of_the_machine_only_what_was_synced_counts(
     file.append_at(400, data[400:700], min_free_bytes=0)  # as a process that was killed leaves it
     file.close()
     with monkeypatch.context() as patched:
-        patched.setattr("service.routes.upload_writing.boot_id", lambda: "another start")
+        patched.setattr("service.api.routes.upload_writing.boot_id", lambda: "another start")
         assert offset_of(client, url) == 400
     assert offset_of(client, url) == 700
     with api.database.read() as session:
@@ -497,7 +497,7 @@ def test_the_disk_fills_up(client: Client, api: Api, monkeypatch: pytest.MonkeyP
             if len(asked) > 2:
                 raise OSError(28, "No space left on device")
 
-        full.setattr("service.uploads.resumable.require_space", require_space)
+        full.setattr("service.storage.uploads.resumable.require_space", require_space)
         problem_of(patch(client, url, 0, data), 507, "disk-full")
     kept = offset_of(client, url)
     assert 0 < kept < len(data)
@@ -509,7 +509,7 @@ def test_killed_between_the_last_byte_and_the_end(client: Client, api: Api, monk
     data, drive_id = image(1000), client.create()
     url = begin(client, drive_id, PATH, data, sha256=sha256_of(data))
     with monkeypatch.context() as killed:
-        killed.setattr("service.routes.upload_writing._Held._hand_over", _die)
+        killed.setattr("service.api.routes.upload_writing._Held._hand_over", _die)
         assert patch(client, url, 0, data).status_code == 500
     assert stored(client, drive_id) is None
     assert offset_of(client, url) == len(data)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.live_api import Client
+from tests.helpers.live_api import Client
+from tests.helpers.tus_client import offset_of
 from tests.service.test_uploads import PATH, image, stored
-from tests.service.tus_client import offset_of
 
 tusclient = pytest.importorskip("tusclient.client")
 exceptions = pytest.importorskip("tusclient.exceptions")

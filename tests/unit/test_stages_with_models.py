@@ -8,20 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import learned_graphs
 import numpy as np
 import pytest
-from export_example import make_scene
 
 from mrasfm_engine import stages
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.images import mask_of_png
 from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.learned.onnx_file import sha256_of
 from mrasfm_engine.pipeline import reconstruct
-from mrasfm_engine.views.birds_eye import read_view
+from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.visualization.birds_eye import read_view
+from tests.helpers import learned_graphs
+from tests.helpers.export_example import make_scene
 
 CAR, BUILDING = 13, 2  # Cityscapes
 WriteDrive = Callable[[dict[str, Any]], Path]

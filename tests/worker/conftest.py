@@ -13,10 +13,10 @@ import pytest
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from service.settings import Settings
-from tests.worker.service_world import World
-from worker.messages import Work
+from tests.helpers.service_world import World
+from worker.attempt import Verdict
+from worker.child_protocol import Work
 from worker.progress import Progress, ProgressMeter
-from worker.stages import Verdict
 
 DEADLINE_S = 60.0
 

@@ -13,11 +13,11 @@ from sqlalchemy import select
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.api.aggregations import AggregationRequest
-from service.persistence import aggregations, jobs
-from service.persistence.tables import Blob, Job, MapFile, MapScene, MapVersion
-from service.persistence.wakeups import Wakeups
-from tests.worker.service_world import TERMINAL, World, is_gone, kill, wait_until
-from worker.execution import Runner
+from service.database.tables import Blob, Job, MapFile, MapScene, MapVersion
+from service.domain import aggregations, jobs
+from service.job_queue import Wakeups
+from tests.helpers.service_world import TERMINAL, World, is_gone, kill, wait_until
+from worker.job_execution import Runner
 
 
 @pytest.fixture(scope="session")

@@ -14,12 +14,12 @@ import httpx
 import pytest
 from pydantic import SecretStr
 
-from service.persistence.keys import create_key
-from service.persistence.tables import Project
-from service.persistence.wakeups import Wakeups, task_id
+from service.database.tables import Project
+from service.domain.keys import create_key
+from service.job_queue import Wakeups, task_id
 from service.settings import Settings
-from tests.service.live_api import api_process
-from tests.worker.service_world import FAST, TERMINAL, World, environment_of, wait_until
+from tests.helpers.live_api import api_process
+from tests.helpers.service_world import FAST, TERMINAL, World, environment_of, wait_until
 
 
 class Proxy:

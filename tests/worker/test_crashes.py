@@ -14,10 +14,10 @@ import pytest
 from pydantic import SecretStr
 
 from schemas.api.problems import PROBLEM_TYPE
-from service.persistence.tables import Blob, Checkpoint, SceneFile
-from service.persistence.wakeups import Wakeups
+from service.database.tables import Blob, Checkpoint, SceneFile
+from service.job_queue import Wakeups
 from service.settings import Settings
-from tests.worker.service_world import SHORT_TIMES, World, environment_of, is_gone, kill, wait_until
+from tests.helpers.service_world import SHORT_TIMES, World, environment_of, is_gone, kill, wait_until
 
 
 def assert_one_scene(world: World, job_id: str, outcomes: list[str]) -> None:
@@ -47,7 +47,7 @@ def test_stage_is_killed(world: World, brief_drive: Path) -> None:
     world.start_reconciler()
     job_id = world.ask(world.add_drive(brief_drive))
     world.hold(job_id).kill()
-    assert_one_scene(world, job_id, ["out-of-memory", "succeeded"])
+    assert_one_scene(world, job_id, ["engine-killed", "succeeded"])
 
 
 @pytest.mark.slow
@@ -171,25 +171,73 @@ def test_everything_is_killed(world: World, brief_drive: Path) -> None:
     assert_one_scene(world, job_id, ["worker-lost", "succeeded"])
 
 
+def test_killed_worker_leaves_no_temporary_files(
+    world: World, brief_drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Celery's pool makes some; they lie in the data folder, and the next worker removes those of dead ones."""
+    of_machine, of_workers = tmp_path / "temporary", world.settings.temporary_dir
+    of_machine.mkdir()
+    monkeypatch.setenv("TMPDIR", str(of_machine))
+    first = world.start_worker()
+    world.start_reconciler()
+    world.hold(world.ask(world.add_drive(brief_drive)))
+    (of_first,) = of_workers.iterdir()
+    first.kill()
+    first.wait()
+    wait_until(lambda: world.children() == [], "the end of what it started")
+    second = world.start_worker()
+    (of_second,) = of_workers.iterdir()
+    assert of_second != of_first
+    second.terminate()
+    second.wait()
+    assert list(of_machine.iterdir()) == list(of_workers.iterdir()) == []
+
+
+def test_stage_gives_way_to_the_service(world: World, brief_drive: Path) -> None:
+    worker = world.start_worker()
+    world.start_reconciler()
+    job_id = world.ask(world.add_drive(brief_drive))
+    child = world.hold(job_id)
+    assert child.nice() > pool_process_of(worker.pid).nice()
+    child.resume()
+    assert_one_scene(world, job_id, ["succeeded"])
+
+
+def kill_stages(world: World, job_id: str, number: int, by: signal.Signals) -> list[int]:
+    """End the stages of so many attempts, one after the other, by a signal; their process ids."""
+    killed: list[int] = []
+    while len(killed) < number:
+        child = world.wait_for_child(job_id)
+        if child.pid not in killed:
+            child.send_signal(by)
+            killed.append(child.pid)
+            wait_until(lambda: is_gone(child), "its end")  # noqa: B023 (called at once)
+    return killed
+
+
 def test_stage_that_dies_every_time(world: World, brief_drive: Path) -> None:
     world.start_worker()
     world.start_reconciler()
     job_id = world.ask(world.add_drive(brief_drive))
-    killed: list[int] = []
-    while len(killed) < world.settings.max_attempts:
-        child = world.wait_for_child(job_id)
-        if child.pid not in killed:
-            child.kill()
-            killed.append(child.pid)
-            wait_until(lambda: is_gone(child), "its end")  # noqa: B023 (called at once)
+    kill_stages(world, job_id, world.settings.max_attempts, signal.SIGSEGV)
     job = world.wait_for_end(job_id)
     assert (job.state, job.attempt) == ("FAILED", 3)
     assert job.problem is not None
-    assert job.problem["type"] == PROBLEM_TYPE + "out-of-memory"
+    assert job.problem["type"] == PROBLEM_TYPE + "engine-abort"
     assert job.problem["remedy"]
-    assert world.outcomes(job_id) == ["out-of-memory"] * 3
+    assert world.outcomes(job_id) == ["engine-abort"] * 3
     assert all(attempt.problem and attempt.finished_us for attempt in world.attempts(job_id))
     assert world.scenes() == []
+
+
+def test_kills_alone_fail_no_job(world: World, brief_drive: Path) -> None:
+    """More of them than a job has retries."""
+    world.start_worker()
+    world.start_reconciler()
+    job_id = world.ask(world.add_drive(brief_drive))
+    number = world.settings.max_attempts + 1
+    assert len(kill_stages(world, job_id, number, signal.SIGKILL)) == number
+    assert_one_scene(world, job_id, [*["engine-killed"] * number, "succeeded"])
 
 
 def test_worker_that_was_silent_publishes_nothing(world: World, brief_drive: Path) -> None:
@@ -223,10 +271,10 @@ def test_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:
     first.wait(60)
     assert time.monotonic() - began_s < 30  # 3 s on an idle machine
     assert first.returncode == 0
-    assert (world.job(job_id).state, world.job(job_id).failures) == ("QUEUED", 0)
+    assert (world.job(job_id).state, world.job(job_id).blame) == ("QUEUED", 0)
     world.start_worker()
     assert_one_scene(world, job_id, ["released", "succeeded"])
-    assert (world.job(job_id).attempt, world.job(job_id).failures) == (2, 0)
+    assert (world.job(job_id).attempt, world.job(job_id).blame) == (2, 0)
     wait_until(lambda: not Wakeups(world.settings).waiting(), "no message is left behind")
 
 
@@ -242,7 +290,7 @@ def test_impatient_stop(world: World, brief_drive: Path, signals: list[str]) -> 
     worker.wait(60)
     wait_until(lambda: world.processes() == [], "the end of everything")
     assert world.outcomes(job_id) == ["released"]
-    assert (world.job(job_id).state, world.job(job_id).failures) == ("QUEUED", 0)
+    assert (world.job(job_id).state, world.job(job_id).blame) == ("QUEUED", 0)
 
 
 def test_all_of_a_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:

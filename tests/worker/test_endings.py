@@ -1,19 +1,27 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import signal
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import mrasfm_engine
 from mrasfm_engine.errors import InputError
 from tests.worker.conftest import settings_with
+from worker.child import EXIT_OUT_OF_MEMORY
 from worker.child_output import TAIL_BYTES, ChildOutput
+from worker.child_protocol import ChildError, ChildRequest, ChildResult, ErrorKind, Work
 from worker.engine_settings import engine_config
-from worker.escalation import SHUT_DOWN_GRACE_S, Escalation, StopReason
-from worker.messages import ChildError, ChildRequest, ChildResult, ErrorKind, Work
-from worker.oom import oom_kills
+from worker.log_paths import LogPaths
+from worker.oom import MemoryKills, memory_kills
 from worker.outcomes import Abandoned, Cancelled, Ending, Failed, Succeeded, outcome_of
+from worker.termination import SHUT_DOWN_GRACE_S, Escalation, StopReason
 
 GOOD = ChildResult(report={"sound": True})
 
@@ -25,7 +33,7 @@ def ending(**fields: object) -> Ending:
         result=None,
         stage="mapping",
         log_tail="the end\n",
-        oom_kills=0,
+        memory_kills=0,
         out=Path("scene"),
         timeout_s=60.0,
     )
@@ -83,9 +91,19 @@ def test_errors_of_the_engine_keep_their_words(kind: ErrorKind, retryable: bool)
 
 
 def test_kernel_that_says_so_makes_it_certain() -> None:
-    assert failed(returncode=-signal.SIGKILL, oom_kills=1).what == "memory ran out in stage 'mapping'"
-    for unknown in (0, None):
-        assert "was killed in stage 'mapping', most often" in failed(returncode=-signal.SIGKILL, oom_kills=unknown).what
+    risen = failed(returncode=-signal.SIGKILL, memory_kills=1)
+    assert (risen.code, risen.what, risen.blame) == ("out-of-memory", "memory ran out in stage 'mapping'", 1.0)
+    unchanged = failed(returncode=-signal.SIGKILL, memory_kills=0)
+    assert (unchanged.code, unchanged.blame) == ("engine-killed", 0.0)
+    assert "was killed in stage 'mapping', and not by the kernel" in unchanged.what
+    unknown = failed(returncode=-signal.SIGKILL, memory_kills=None)
+    assert (unknown.code, unknown.blame) == ("engine-killed", 0.5)
+    assert "was killed in stage 'mapping', most often because memory ran out" in unknown.what
+
+
+@pytest.mark.parametrize("returncode", [-signal.SIGSEGV, -signal.SIGABRT, -signal.SIGTERM, 1, 0, EXIT_OUT_OF_MEMORY])
+def test_other_ends_count_against_the_job(returncode: int) -> None:
+    assert failed(returncode=returncode).blame == 1.0
 
 
 def test_real_time_signal_has_no_name() -> None:
@@ -144,26 +162,103 @@ def test_output_is_decoded_leniently(tmp_path: Path) -> None:
     assert output.tail() == "one\ntwo [31mred\n€\n"
 
 
+def tail_of(folder: Path, text: str) -> str:
+    output = ChildOutput(folder / "child.log")
+    output.add(text.encode())
+    return output.tail()
+
+
+def test_the_tail_shows_no_paths_of_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/worker")
+    attempt = tmp_path / "scratch" / "job_1.2"
+    attempt.mkdir(parents=True)
+    engine, numpy_file = Path(mrasfm_engine.__file__), Path(np.__file__)
+    library = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    lines = {
+        f'  File "{engine}", line 3, in run': '  File "mrasfm_engine/__init__.py", line 3, in run',
+        f'  File "{numpy_file}", line 3': '  File "numpy/__init__.py", line 3',
+        f'  File "{threading.__file__}", line 3': f'  File "{library}/threading.py", line 3',
+        f"{numpy_file.parent}.libs/libopenblas.so(+0x1f) [0x7f]": "numpy.libs/libopenblas.so(+0x1f) [0x7f]",
+        f"cannot read {attempt}/drive/images/a.png": "cannot read drive/images/a.png",
+        f"cannot read {attempt.parent}/job_2.1/a": "cannot read job_2.1/a",
+        f"in {attempt}: file://{attempt}/x": "in job_1.2: file://x",
+        "no model /home/worker/models/a.onnx": "no model ~/models/a.onnx",
+        "/home/workers/a /mnt/home/worker/a": "/home/workers/a /mnt/home/worker/a",
+        "/lib/x86_64-linux-gnu/libc.so.6 /usr/bin/x": "/lib/x86_64-linux-gnu/libc.so.6 /usr/bin/x",
+    }
+    assert tail_of(attempt, "\n".join(lines)).split("\n") == list(lines.values())
+
+
+def test_the_tail_of_a_traceback(tmp_path: Path) -> None:
+    """As the interpreter of the child prints it."""
+    code = "import json, numpy, mrasfm_engine.errors as e; numpy.linalg.inv(json.loads('[[0,0],[0,0]]'))"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
+    assert sys.prefix in done.stderr or str(Path(np.__file__).parents[1]) in done.stderr
+    tail = tail_of(tmp_path, done.stderr)
+    assert 'File "numpy/linalg/' in tail
+    assert "LinAlgError" in tail
+    for path in re.findall(r'File "(.*?)"', tail):
+        assert not path.startswith("/"), path
+
+
+def test_a_home_that_is_the_root_hides_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/")
+    assert tail_of(tmp_path, "/etc/hosts and /") == "/etc/hosts and /"
+
+
+def test_logs_of_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    assert LogPaths([tmp_path]).shorten(f"{tmp_path}/x.py") == "x.py"
+
+
 def test_one_endless_line_has_a_tail(tmp_path: Path) -> None:
     output = ChildOutput(tmp_path / "no-folder" / "child.log")  # nor does a file that cannot be written hurt
     output.add(b"x" * 100_000)
     assert output.tail() == "x" * TAIL_BYTES
 
 
-def test_oom_counts_of_both_control_group_versions(tmp_path: Path) -> None:
-    groups, mounts = tmp_path / "cgroup", tmp_path / "mounts"
-    groups.write_text("9:name=systemd:/\n4:memory,hugetlb:/jobs/one\n0::/\n", encoding="utf-8")
-    assert oom_kills(groups=groups, mounts=mounts) is None
+def test_memory_kills_of_both_control_group_versions(tmp_path: Path) -> None:
+    proc, mounts = tmp_path / "proc", tmp_path / "mounts"
+
+    def count() -> int | None:
+        found = memory_kills(proc=proc, mounts=mounts)
+        return None if found is None else found.count
+
+    (proc / "self").mkdir(parents=True)
+    group = proc / "self/cgroup"
+    group.write_text("9:name=systemd:/\n4:memory,hugetlb:/jobs/one\n0::/\n", encoding="utf-8")
+    assert count() is None
     (mounts / "memory/jobs/one").mkdir(parents=True)
     (mounts / "memory/jobs/one/memory.oom_control").write_text(
         "oom_kill_disable 0\nunder_oom 0\noom_kill 3\n", encoding="utf-8"
     )
-    assert oom_kills(groups=groups, mounts=mounts) == 3
+    assert count() == 3
     # In a container: one hierarchy, and the path is the host's.
-    groups.write_text("0::/docker/abc\n", encoding="utf-8")
+    group.write_text("0::/docker/abc\n", encoding="utf-8")
     (mounts / "memory.events").write_text("low 0\noom 7\noom_kill 5\noom_group_kill 0\n", encoding="utf-8")
-    assert oom_kills(groups=groups, mounts=mounts) == 5
-    assert oom_kills(groups=tmp_path / "nothing", mounts=mounts) is None
+    assert count() == 5
+    group.unlink()
+    assert count() is None
+    (proc / "vmstat").write_text("nr_free_pages 1\noom_kill 2\n", encoding="utf-8")
+    assert count() == 2, "without a control group, the machine's"
+
+
+def test_memory_kills_are_compared_within_one_counter(tmp_path: Path) -> None:
+    before, now = MemoryKills("group", 3), MemoryKills("group", 5)
+    assert now.since(before) == 2
+    assert now.since(None) is None
+    assert now.since(MemoryKills("another", 3)) is None
+    assert before.since(now) is None, "a counter that fell began anew"
+    path = tmp_path / "kills.json"
+    assert MemoryKills.read(path) is None
+    now.write(path)
+    assert MemoryKills.read(path) == now
+    for damaged in ("", "[1]", '{"counter": 1, "count": "x"}', '{"counter": "group"}'):
+        path.write_text(damaged, encoding="utf-8")
+        assert MemoryKills.read(path) is None
 
 
 def test_messages_come_back_as_they_were(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.persistence.wakeups import Wakeups
-from tests.worker.service_world import World, wait_until
+from service.job_queue import Wakeups
+from tests.helpers.service_world import World, wait_until
 
 VISIBILITY_TIMEOUT_S = 6.0
 HELD_S = 22.0

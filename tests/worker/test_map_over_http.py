@@ -17,10 +17,10 @@ from schemas.api.aggregations import AggregationRequest
 from schemas.api.jobs import JobResource
 from schemas.api.maps import MapFileResource, MapVersionResource
 from service.client import Client, DriveFolder, UploadState, download_map, start_aggregation, upload_drive
-from service.persistence.keys import create_key
-from service.persistence.tables import Project
-from tests.service.live_api import ApiProcess, api_process
-from tests.worker.service_world import TERMINAL, World, environment_of, kill, wait_until
+from service.database.tables import Project
+from service.domain.keys import create_key
+from tests.helpers.live_api import ApiProcess, api_process
+from tests.helpers.service_world import TERMINAL, World, environment_of, kill, wait_until
 
 DRIVES, BROKEN = 7, 4
 UNITS, CAMERAS = 24, 4  # drives so long that their positions place them

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from schemas.api.jobs import ReconstructionSettings
-from worker.messages import Work
+from worker.child_protocol import Work
 from worker.progress import UNITS, WEIGHTS, Progress, ProgressMeter
 from worker.progress_pipe import ProgressReader, ProgressWriter, StageReport
 

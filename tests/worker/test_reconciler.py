@@ -11,14 +11,15 @@ from typing import Any
 
 import pytest
 import redis
-from sqlalchemy import insert
+from sqlalchemy import insert, update
 
 import worker.reconciler
-from service.persistence import collecting, jobs
-from service.persistence.storing import file_sha256, store_file
-from service.persistence.tables import Blob, Drive, IdempotencyKey, Job, JobEvent, Project, Scene, new_id, now_us
-from service.persistence.wakeups import QUEUES, Wakeups
-from tests.worker.service_world import World, wait_until
+from service.database.tables import Blob, Drive, IdempotencyKey, Job, JobEvent, Project, Scene, new_id, now_us
+from service.domain import jobs
+from service.job_queue import QUEUES, Wakeups
+from service.storage import garbage_collection
+from service.storage.blob_writer import file_sha256, store_file
+from tests.helpers.service_world import World, wait_until
 from worker.reconciler import Reconciler
 
 DAY_US = 86_400_000_000
@@ -151,6 +152,9 @@ def test_broker_that_is_away(world: World, brief_drive: Path) -> None:
 def test_silent_worker(world: World, brief_drive: Path) -> None:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     reconciler = Reconciler(world.settings)
+    with world.database.write() as session:
+        losses = world.settings.max_losses - 3
+        session.execute(update(Job).values(losses=losses))
     for attempt in (1, 2, 3):
         with world.database.write() as session:
             assert jobs.claim(session, job_id, owner=f"worker {attempt}", lease_us=0)
@@ -245,7 +249,7 @@ def test_objects_that_no_record_names(world: World, brief_drive: Path, monkeypat
     reconciler.collect_orphans()
     assert unnamed in objects(world)
     tomorrow: Callable[[], int] = lambda: now_us() + DAY_US + HOUR_US  # noqa: E731
-    monkeypatch.setattr(collecting, "now_us", tomorrow)
+    monkeypatch.setattr(garbage_collection, "now_us", tomorrow)
     reconciler.collect_orphans()
     assert unnamed in objects(world), "the store was listed within the day, maybe by a process that is gone"
     monkeypatch.setattr(worker.reconciler, "now_us", tomorrow)

@@ -13,11 +13,11 @@ import pytest
 
 from service.settings import Settings
 from tests.worker.conftest import go_on, is_gone, meter_of, settings_with, wait_until
+from worker.attempt import AttemptFolder, Command, Tick, Verdict, supervise
 from worker.child_output import FILE_BYTES, TAIL_BYTES
-from worker.escalation import StopReason
 from worker.outcomes import Abandoned, Cancelled, Failed, Outcome
 from worker.progress import Progress
-from worker.stages import AttemptFolder, Command, Tick, Verdict, supervise
+from worker.termination import StopReason
 
 STUBBORN = """
 import os, signal, sys, time
@@ -47,8 +47,8 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from tests.worker.conftest import go_on, meter_of, settings_with
-from worker.messages import Work
-from worker.stages import Attempt, AttemptFolder, run_attempt, supervise
+from worker.child_protocol import Work
+from worker.attempt import Attempt, AttemptFolder, run_attempt, supervise
 scratch, what = Path(sys.argv[1]), sys.argv[2]
 common = dict(tick=go_on, meter=meter_of(), settings=settings_with(scratch))
 if what == "drive":
@@ -164,7 +164,7 @@ def test_grandchild_does_not_survive(scratch: Path, settings: Settings) -> None:
         ("import os, signal; os.kill(os.getpid(), signal.SIGTERM)", "engine-abort", "SIGTERM"),
         ("raise SystemExit(70)", "engine-abort", "exit code 70"),
         ("raise SystemExit(71)", "out-of-memory", "memory ran out before its first stage"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "out-of-memory", "was killed"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "engine-killed", "was killed"),
     ],
 )
 def test_ends_without_a_result(scratch: Path, settings: Settings, source: str, code: str, words: str) -> None:

@@ -14,10 +14,12 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "reconciler",
         help="run the service's reconciler",
-        description="Wakes workers up for jobs whose message was lost, frees jobs of workers that died, deletes what "
-        "has passed its retention date. Settings: environment MRASFM_*.",
+        description="Sends lost messages of jobs again, frees jobs of workers that died, deletes what "
+        "has passed its retention date. Settings are environment variables, see mrasfm describe service.",
     )
-    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+    parser.add_argument(
+        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="least severe messages"
+    )
     parser.set_defaults(run=run)
 
 

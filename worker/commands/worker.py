@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from service.settings import Settings
 
@@ -12,23 +13,28 @@ QUEUES = ("checks", "reconstructions")
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
-        "worker", help="run a worker of the service", description="Settings: environment MRASFM_*."
+        "worker",
+        help="run a worker of the service",
+        description="Run a worker of the service. Settings are environment variables, see mrasfm describe service.",
     )
     parser.add_argument(
-        "--queues", default=",".join(QUEUES), help="checks (of drives), reconstructions, or both (default)"
+        "--queues",
+        default=",".join(QUEUES),
+        help="checks (of drives), reconstructions, or both separated by a comma (default: both)",
     )
-    parser.add_argument("--concurrency", type=int, default=1, help="jobs at one time (default 1)")
-    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
+    parser.add_argument("--concurrency", type=int, default=1, help="jobs at one time (default: 1)")
+    parser.add_argument(
+        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="least severe messages"
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Work until told to stop; a job under way is given back, and another worker goes on with it."""
-    import os
-    import socket
     import sys
+    import tempfile
 
-    from worker.app import make_app
+    from service.storage.process_folder import own_folder
 
     wanted = arguments.queues.split(",")
     unknown = sorted(set(wanted) - set(QUEUES))
@@ -38,13 +44,24 @@ def run(arguments: argparse.Namespace) -> int:
         what = f"--queues: there is no queue {unknown[0]!r}, only {' and '.join(QUEUES)}" if unknown else what
         print(f"mrasfm: error: {what}", file=sys.stderr)
         return 2
-    app = make_app(settings, log_level=arguments.log_level)
-    worker = app.Worker(
-        hostname=f"{wanted[0] if len(wanted) == 1 else 'all'}.{os.getpid()}@{socket.gethostname()}",
-        queues=wanted,
-        concurrency=arguments.concurrency,
+    with own_folder(settings.temporary_dir, "worker") as temporary:
+        # Celery's pool keeps files here that a killed process leaves behind.
+        tempfile.tempdir = str(temporary)
+        return _work(settings, wanted, concurrency=arguments.concurrency, log_level=arguments.log_level)
+
+
+def _work(settings: Settings, queues: Sequence[str], *, concurrency: int, log_level: str) -> int:
+    import os
+    import socket
+
+    from worker.app import make_app
+
+    worker = make_app(settings, log_level=log_level).Worker(
+        hostname=f"{queues[0] if len(queues) == 1 else 'all'}.{os.getpid()}@{socket.gethostname()}",
+        queues=queues,
+        concurrency=concurrency,
         pool="prefork",
-        loglevel=arguments.log_level.upper(),
+        loglevel=log_level.upper(),
         without_gossip=True,
         without_mingle=True,
         without_heartbeat=True,

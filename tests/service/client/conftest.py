@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from service.client import Client
-from tests.service.live_api import Client as TestClient
-from tests.service.tiny_drive import TinyDrive, tiny_drive
+from tests.helpers.live_api import Client as TestClient
+from tests.helpers.tiny_drive import TinyDrive, tiny_drive
 
 WriteTiny = Callable[..., Path]
 Connect = Callable[..., Client]

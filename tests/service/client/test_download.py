@@ -9,10 +9,10 @@ import pytest
 
 from service.client import ApiError, SceneFolderError, download_scene
 from service.client.download import MARKER_NAME
-from tests.service.client.bad_network import Cut, bad_network
+from tests.helpers.bad_network import Cut, bad_network
+from tests.helpers.live_api import Api, Client, sha256_of
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.client.conftest import Connect
-from tests.service.live_api import Api, Client, sha256_of
-from tests.service.tiny_drive import tiny_drive
 
 LARGE = os.urandom(3_000_000)
 FILES = {

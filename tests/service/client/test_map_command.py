@@ -14,11 +14,11 @@ import pytest
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.client import SceneFolderError, download_map
 from service.commands import map as map_command
-from service.persistence import jobs
-from service.persistence.tables import Job
+from service.database.tables import Job
+from service.domain import jobs
+from tests.helpers.live_api import ONE_ATTEMPT, Client
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.client.conftest import Connect, written
-from tests.service.live_api import Client
-from tests.service.tiny_drive import tiny_drive
 
 FILES = {"points.ply": b"ply" * 1000, "calibration/a.json": b"{}", "map.json": b"{}", "report.json": b"{}"}
 BROKEN = Problem(type=PROBLEM_TYPE + "no-overlap", title="T", detail="it broke", remedy="Look.", retryable=False)
@@ -48,7 +48,7 @@ def worker(client: Client) -> Iterator[Callable[[set[str]], None]]:
                         jobs.record_findings(session, held, [], sound=True)
                 elif client.get(f"/v1/drives/{job.drive_id}").json()["name"] in broken:
                     with client.api.database.write() as session:
-                        jobs.fail(session, held, BROKEN, max_attempts=1, retry_delay_us=0)
+                        jobs.fail(session, held, BROKEN, limits=ONE_ATTEMPT, retry_delay_us=0)
                 else:
                     client.publish(held, {"points.ply": job.id.encode()})
 

@@ -16,14 +16,14 @@ from service.client.drive_folder import LocalFile, identify
 from service.client.parallel import Meter, no_report
 from service.client.resumable import ResumableUpload
 from service.client.upload_state import STATE_NAME
-from service.persistence.tables import Drive
-from service.uploads.resumable import PartialFile
-from tests.service.client.bad_network import Cut, bad_network
+from service.database.tables import Drive
+from service.storage.uploads.resumable import PartialFile
+from tests.helpers.bad_network import Cut, bad_network
+from tests.helpers.live_api import Api, Client, wait_until
+from tests.helpers.tiny_drive import TinyDrive, tiny_drive
 from tests.service.client.conftest import Connect, written
 from tests.service.conftest import StartApi
-from tests.service.live_api import Api, Client, wait_until
 from tests.service.test_uploads import image
-from tests.service.tiny_drive import TinyDrive, tiny_drive
 
 SIZE_BYTES = 6_000_000
 

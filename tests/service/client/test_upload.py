@@ -33,10 +33,10 @@ from service.client.drive_folder import identify
 from service.client.parallel import in_parallel
 from service.client.transport import Transport
 from service.client.upload_state import STATE_NAME
-from tests.service.client.bad_network import Cut, Recorder, bad_network
+from tests.helpers.bad_network import Cut, Recorder, bad_network
+from tests.helpers.live_api import DEADLINE_S, Client, free_port, wait_until
+from tests.helpers.tiny_drive import png, tiny_drive
 from tests.service.client.conftest import Connect, written
-from tests.service.live_api import DEADLINE_S, Client, free_port, wait_until
-from tests.service.tiny_drive import png, tiny_drive
 
 
 def drives_of(client: Client) -> list[dict[str, Any]]:

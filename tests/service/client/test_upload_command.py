@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from service.api.context import Context
 from service.client.upload_state import STATE_NAME
-from service.context import Context
-from service.persistence import jobs
-from tests.service.client.bad_network import Cut, bad_network
-from tests.service.client.conftest import written
-from tests.service.live_api import (
+from service.domain import jobs
+from tests.helpers.bad_network import Cut, bad_network
+from tests.helpers.live_api import (
     DEADLINE_S,
+    ONE_ATTEMPT,
     REPOSITORY,
     ApiProcess,
     Client,
@@ -30,7 +30,8 @@ from tests.service.live_api import (
     settings_of,
     wait_until,
 )
-from tests.service.tiny_drive import tiny_drive
+from tests.helpers.tiny_drive import tiny_drive
+from tests.service.client.conftest import written
 
 # -P: the repository may hold the metadata of an older build, which names fewer commands.
 MRASFM = (sys.executable, "-P", "-c", "from mrasfm_engine.cli import main; raise SystemExit(main())")
@@ -121,6 +122,20 @@ def test_from_drive_to_scene(client: Client, drive: Path, tmp_path: Path) -> Non
     code, again, told = upload(client, drive, "--no-gnss", "--out", str(out))
     assert (code, again["scene_id"], again["bytes_sent"]) == (0, scene_id, 0)
     assert "0 files received, 2 were there" in told
+
+
+def test_the_reports_findings_are_told(client: Client, drive: Path) -> None:
+    """Those of a job that succeeded; a report that is none tells nothing."""
+    running = Upload(drive, "--wait", url=client.api.url, key=client.key)
+    wait_until(lambda: _reconstructions(client), "the job's start")
+    what = "1 of 6 images are truncated and left out: front/000001.png"
+    finding = {"severity": "warning", "code": "truncated-images", "what": what, "remedy": "Copy them again."}
+    report = json.dumps({"stages": [], "findings": [finding]}).encode()
+    client.publish(client.claim(_reconstructions(client)[0]["id"]), {"report.json": report})
+    code, summary, told = running.ended()
+    assert code == 0, told
+    assert f"  warning: {what}. Copy them again." in told.splitlines()
+    assert [(found["code"], found["what"]) for found in summary["findings"]] == [("truncated-images", what)]
 
 
 def _reconstructions(client: Client) -> list[dict[str, Any]]:
@@ -263,7 +278,7 @@ def test_a_failed_job_is_3_with_its_problem(client: Client, drive: Path) -> None
         retryable=False,
     )
     with client.api.database.write() as session:
-        jobs.fail(session, held, problem, max_attempts=1, retry_delay_us=0)
+        jobs.fail(session, held, problem, limits=ONE_ATTEMPT, retry_delay_us=0)
     code, summary, told = running.ended()
     assert (code, summary["job_state"]) == (3, "FAILED")
     for what in (problem.detail, problem.remedy, "front/000001.png is blurred", "    last line"):

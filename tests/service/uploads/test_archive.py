@@ -23,8 +23,8 @@ import numpy as np
 import pytest
 
 from service.errors import ServiceError
-from service.uploads.archive import ArchiveLimits, unpack
-from service.uploads.spool import Spooled
+from service.storage.spool import Spooled
+from service.storage.uploads.archive import ArchiveLimits, unpack
 
 LIMITS: dict[str, Any] = {
     "max_entries": 1000,

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from test_archive import LIMITS, Unpacker, png, zip_of
 
-from service.uploads.archive import ArchiveLimits
-from service.uploads.zip_reader import ZipReader
+from service.storage.uploads.archive import ArchiveLimits
+from service.storage.uploads.zip_reader import ZipReader
 
 NAME = "front/0.png"
 
@@ -325,7 +325,7 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
 import resource, sys
 from pathlib import Path
 from service.errors import ServiceError
-from service.uploads.archive import ArchiveLimits, unpack
+from service.storage.uploads.archive import ArchiveLimits, unpack
 
 root = Path(sys.argv[1])
 limits = ArchiveLimits(max_entries=200_000, max_bytes=10**9, max_ratio=200, max_file_bytes=10**9, min_free_bytes=0)

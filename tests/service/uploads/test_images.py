@@ -11,7 +11,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import read_header
 from schemas.image_header import MAX_IMAGE_PIXELS, ImageHeaderError, ImageKind, header_of
 from service.errors import ServiceError
-from service.uploads.images import check_image
+from service.storage.uploads.images import check_image
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:

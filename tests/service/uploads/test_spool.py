@@ -19,9 +19,9 @@ import anyio
 import pytest
 from starlette.requests import ClientDisconnect, Request
 
+from service.digests import format_digest, parse_digest
 from service.errors import ServiceError
-from service.uploads.digests import format_digest, parse_digest
-from service.uploads.spool import BATCH_BYTES, Spooled, SpoolWriter, receive, sweep
+from service.storage.spool import BATCH_BYTES, Spooled, SpoolWriter, receive, sweep
 
 EMPTY_SHA256 = hashlib.sha256(b"").hexdigest()
 
@@ -139,7 +139,7 @@ FULL = """
 import asyncio, resource, sys
 from pathlib import Path
 from service.errors import ServiceError
-from service.uploads.spool import receive
+from service.storage.spool import receive
 
 async def body():
     for _ in range(64):
@@ -262,7 +262,7 @@ def test_memory_is_constant(folder: Path) -> None:
 
 def test_what_a_killed_process_left_is_swept(folder: Path) -> None:
     script = (
-        "import sys, os, signal; from pathlib import Path; from service.uploads.spool import SpoolWriter;"
+        "import sys, os, signal; from pathlib import Path; from service.storage.spool import SpoolWriter;"
         "SpoolWriter(Path(sys.argv[1]), min_free_bytes=0).write(b'half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", script, folder], timeout=120)

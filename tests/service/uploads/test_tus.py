@@ -7,8 +7,8 @@ import hashlib
 
 import pytest
 
+from service.api.http.tus import http_date, parse_announced, parse_checksum, parse_metadata, parse_number
 from service.errors import ServiceError
-from service.uploads.tus import http_date, parse_announced, parse_checksum, parse_metadata, parse_number
 
 
 def metadata(**values: str) -> str:

@@ -7,15 +7,15 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from export_example import make_scene
 from pyproj import Transformer
 
 from mrasfm_engine.aggregation.association import associate, choose_pairs, coarse_transform
 from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import geodesy, se3
-from mrasfm_engine.io.export_scene import write_scene
+from tests.helpers.export_example import make_scene
 
 
 def test_the_best_candidates_of_every_scene_are_compared() -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import ANTENNA_M, CONFIG, Driven, Street, drive_along, make_street
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.positions import drive_positions, with_bias
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
+from tests.helpers.small_scenes import ANTENNA_M, CONFIG, Driven, Street, drive_along, make_street
 
 BIAS_M = (1.4, -0.9, 0.6)
 UNITS = 40

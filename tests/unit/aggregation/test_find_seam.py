@@ -7,7 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import (
+
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.association import coarse_transform
+from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
+from mrasfm_engine.aggregation.seam import Seam, find_seam
+from mrasfm_engine.aggregation.seam_refinement import Shared, adjust_transform, matches_fit, merge_points, scale_ratio
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
+from tests.helpers.small_scenes import (
     CONFIG,
     Driven,
     Street,
@@ -22,16 +32,6 @@ from small_scenes import (
     true_matches,
     with_noise,
 )
-
-from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.association import coarse_transform
-from mrasfm_engine.aggregation.fine import Shared, adjust_transform, matches_fit, merge_points, scale_ratio
-from mrasfm_engine.aggregation.matching import CrossMatcher, CrossMatches
-from mrasfm_engine.aggregation.seam import Seam, find_seam
-from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.matching import NearestNeighbourMatcher
-from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.geometry import se3
 
 WAY_A, WAY_B = np.arange(0.0, 16.0, 2.0), np.arange(3.0, 19.0, 2.0)
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_example import make_scene
 
 from mrasfm_engine.aggregation.load import BETWEEN_NAMES, name_scenes, read_scene
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.export.scene import write_scene
+from tests.helpers.export_example import make_scene
 
 
 @pytest.fixture

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from export_example import UNITS, make_scene
 
 from mrasfm_engine.aggregation.pipeline import aggregate
+from mrasfm_engine.commands.stage_progress import StageLines
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.scene.drive import Drive
 from schemas import Pose
 from schemas.drive import RoughPose, RoughTrajectory
+from tests.helpers.export_example import UNITS, make_scene
 
 # The example has 50 points; its scenes lie upon one another.
 CONFIG = EngineConfig.model_validate({"aggregation": {"min_inliers": 20}, "threads": 1})
@@ -38,6 +39,22 @@ def test_pictures_of_seams_whose_names_could_be_mixed_up(tmp_path: Path) -> None
     assert sorted(named) == sorted(f"pictures/{file.name}" for file in (out / "pictures").iterdir())
     assert len(named) == len(set(named)) == 2 * len(accepted)
     assert len(list((out / "seams").iterdir())) == len(seams), "each is kept for the next version"
+
+
+def test_stages_tell_when_they_begin_end_and_are_reused(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        write_scene(make_scene(folder=name), tmp_path / name, REPORT)
+    said: list[list[str]] = []
+    for _ in range(2):
+        said.append([])
+        lines = StageLines(said[-1].append, lambda: 0.0)
+        aggregate([tmp_path / "one", tmp_path / "two"], tmp_path / "map", CONFIG, progress=lines.update)
+        lines.finish("done")
+    stages = ["scenes", "association", "seams", "joint", "adjustment", "pictures", "export"]
+    whats = [f"[00:00] {stage}: {what}" for stage in stages for what in ("begins", "done")]
+    assert [line.split(",")[0] for line in said[0]] == whats
+    reused = "[00:00] seams: reused from an earlier run"
+    assert [line.split(",")[0] for line in said[1]] == [*whats[:4], reused, *whats[6:]]
 
 
 def rough_scene(folder: Path, start_m: float, *, world: str = "site", sigma_m: float = 0.5) -> Path:

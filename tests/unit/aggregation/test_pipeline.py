@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from export_example import make_scene
 
 from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.export_scene import write_scene
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.pipeline import reconstruct
+from tests.helpers.export_example import make_scene
 
 REPORT = {"settings": {"features": {"extractor": "sift"}}}
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_scenes import CONFIG, Driven, drive_along, make_street, true_a_from_b
 
 from mrasfm_engine.aggregation.footprint import footprints, overlaps, rig_height_m
 from mrasfm_engine.aggregation.pairs import common_view, guided_pairs, nearest_distance_m, probes, thinned
 from mrasfm_engine.geometry import se3
+from tests.helpers.small_scenes import CONFIG, Driven, drive_along, make_street, true_a_from_b
 
 SETTINGS = CONFIG.aggregation
 FRONT, LEFT, RIGHT, BACK = range(4)

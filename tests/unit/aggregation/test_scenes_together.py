@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import CONFIG, Driven, Street, drive_along, make_street
 
 from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.stage_store import StageStore
+from tests.helpers.small_scenes import CONFIG, Driven, Street, drive_along, make_street
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from small_scenes import Driven, configured, drive_along, make_street
 
 from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.read_map import MapPoses, read_map
 from mrasfm_engine.scene.drive import matrix_from_pose
 from schemas import Pose
+from tests.helpers.small_scenes import Driven, configured, drive_along, make_street
 
 UNITS = 8
 BIAS_M = {"a": (1.0, -0.6, 0.4), "b": (-1.2, 0.8, -0.2), "c": (0.6, 0.4, -0.5), "far": (0.7, 0.2, 0.3)}

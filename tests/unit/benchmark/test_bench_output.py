@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.benchmark.datasets import SceneResult
-from mrasfm_engine.benchmark.growth import Growth, GrowthRow
 from mrasfm_engine.benchmark.mapping import Prepared
+from mrasfm_engine.benchmark.scaling import Growth, GrowthRow
 from mrasfm_engine.benchmark.side_by_side import Comparison, Row, peers_named
 from mrasfm_engine.commands import bench
 from mrasfm_engine.commands.bench_datasets_output import KittiOutput, NuScenesOutput

@@ -16,7 +16,7 @@ from mrasfm_engine.benchmark.side_by_side import Settings
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError, ReconstructionError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.io.drive_bundle import read_drive
+from mrasfm_engine.preflight.drive_reader import read_drive
 
 CALIBRATION = "".join(f"P{k}: 40 0 23.5 {-20.0 * (k % 2)} 0 40 15.5 0 0 0 1 0\n" for k in range(4))
 FRAMES = 5

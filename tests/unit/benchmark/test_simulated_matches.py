@@ -7,13 +7,13 @@ import pytest
 
 from mrasfm_engine.benchmark.simulated_matches import FALSE_MATCHES, WRONG, simulate_matches
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.correspondence.verification import epipolar_errors, in_front_of_both
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.verification import epipolar_errors, in_front_of_both
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.synthetic.city import city_route
 from mrasfm_engine.synthetic.long_route import LongRoute, observe_route
 from mrasfm_engine.synthetic.rigs import true_cameras
-from tests.simulated_drive import make_drive
+from tests.helpers.simulated_drive import make_drive
 
 CONFIG = EngineConfig()
 UNITS_ONCE, UNITS = 25, 50

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from export_example import MISSING_UNIT, make_scene
 
 from mrasfm_engine.evaluation.pose_errors import compare_scene
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.scene.scene import Scene
+from tests.helpers.export_example import MISSING_UNIT, make_scene
 
 
 def truth_of(scene: Scene) -> tuple[Trajectory, np.ndarray]:

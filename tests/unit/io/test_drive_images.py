@@ -154,7 +154,7 @@ def test_damaged_png_is_refused(tmp_path: Path, picture: np.ndarray, capfd: pyte
     file.write_bytes(data)
     with pytest.raises(InputError, match="damaged") as caught:
         read_image_gray(file)
-    assert caught.value.code == "damaged-image"
+    assert caught.value.code == "corrupt-image"
     capfd.readouterr()  # the decoder's own complaint
 
 

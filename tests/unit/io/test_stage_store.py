@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import StorageError
-from mrasfm_engine.io.drive_bundle import read_drive
 from mrasfm_engine.io.stage_store import StageStore, drive_fingerprint, fingerprint
+from mrasfm_engine.preflight.drive_reader import read_drive
 
 ARRAYS = {
     "descriptors": np.random.default_rng(0).integers(0, 256, (40, 128), dtype=np.uint8),

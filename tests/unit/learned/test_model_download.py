@@ -7,7 +7,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import learned_graphs
 import pytest
 
 from mrasfm_engine.errors import InputError, StorageError
@@ -16,6 +15,7 @@ from mrasfm_engine.learned.catalogue import KnownModel, known_model
 from mrasfm_engine.learned.download import pull
 from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.learned.onnx_file import sha256_of
+from tests.helpers import learned_graphs
 
 DATA = learned_graphs.aliked()
 

@@ -5,13 +5,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import learned_graphs
 import pytest
 
 from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.learned import catalogue, model_folder
 from mrasfm_engine.learned.model_folder import ModelFolder, default_folder
 from mrasfm_engine.learned.onnx_file import sha256_of
+from tests.helpers import learned_graphs
 
 
 def write(folder: Path, data: bytes) -> Path:

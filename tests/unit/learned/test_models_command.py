@@ -2,15 +2,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
-import learned_graphs
 import pytest
 
 from mrasfm_engine.commands import models
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.catalogue import CATALOGUE
 from mrasfm_engine.learned.onnx_file import sha256_of
+from tests.helpers import learned_graphs
 
 
 def run(*words: str) -> int:
@@ -64,3 +68,81 @@ def test_an_own_name_is_listed_too(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(InputError, match="there is no model nothing"):
         run("pull", "nothing")
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def link_to_a_pipe(path: Path) -> None:
+    os.mkfifo(path.with_name("pipe"))
+    path.symlink_to(path.with_name("pipe"))
+
+
+def folder_of_that_name(path: Path) -> None:
+    path.mkdir()
+
+
+def empty(path: Path) -> None:
+    path.touch()
+
+
+def missing(path: Path) -> None:
+    path.unlink(missing_ok=True)
+
+
+def link_to_itself(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def too_large(path: Path) -> None:
+    with path.open("wb") as file:
+        file.write(learned_graphs.superpoint())
+        file.truncate(2**31)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (device, "is a device"),
+        (pipe, "is a pipe"),
+        (link_to_a_pipe, "is a pipe"),
+        (folder_of_that_name, "is a folder"),
+        (empty, "it is empty (0 bytes)"),
+        (missing, "cannot be read: No such file or directory"),
+        (link_to_itself, "cannot be read: Too many levels of symbolic links"),
+        (too_large, "has more than 2147483647 bytes"),
+    ],
+)
+def test_what_cannot_be_a_models_file_is_refused(
+    tmp_path: Path, folder: Path, make: Callable[[Path], None], words: str
+) -> None:
+    """At once: without waiting for a writer, and without reading what never ends into memory."""
+    path = tmp_path / "given.onnx"
+    make(path)
+    # Of little memory, so that reading on and on ends soon; in a process of its own, as it may wait for ever.
+    script = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30));"
+        "from mrasfm_engine.cli import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-P", "-c", script, "models", "add", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2, done.stderr
+    what, remedy = done.stderr.splitlines()
+    assert what.startswith("mrasfm: error: ")
+    assert str(path) in what
+    assert words in what
+    assert remedy.startswith("  ")
+    assert not folder.exists()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "sp.onnx").write_bytes(learned_graphs.superpoint())
+    (tmp_path / "sp.onnx").chmod(0)
+    with pytest.raises(InputError, match=r"sp\.onnx cannot be read: Permission denied"):
+        run("add", str(tmp_path / "sp.onnx"))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
-import learned_graphs
 import numpy as np
 import onnxruntime
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from mrasfm_engine.errors import InputError, ReconstructionError
 from mrasfm_engine.learned import signatures
 from mrasfm_engine.learned.network import CPU_PROVIDER, GPU_PROVIDERS, Network
+from tests.helpers import learned_graphs
 
 
 def test_many_threads_share_one_network() -> None:

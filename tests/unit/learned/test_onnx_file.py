@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import learned_graphs
 import numpy as np
 import onnx
 import pytest
@@ -10,6 +9,7 @@ from onnx import helper, numpy_helper
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.onnx_file import external_tensors, read_model
+from tests.helpers import learned_graphs
 
 
 def write(folder: Path, data: bytes) -> Path:
@@ -61,6 +61,13 @@ def test_a_damaged_model_is_no_crash(tmp_path: Path) -> None:
         except InputError:
             refused += 1
     assert 150 < refused <= 300
+
+
+def test_a_large_model_is_read_in_pieces_to_its_end(tmp_path: Path) -> None:
+    tensor = numpy_helper.from_array(np.arange(700_000, dtype=np.float32), "large")
+    data = helper.make_model(helper.make_graph([], "g", [], [], [tensor])).SerializeToString()
+    assert len(data) > 2**21
+    assert read_model(write(tmp_path, data)) == data
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:

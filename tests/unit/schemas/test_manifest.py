@@ -3,14 +3,27 @@ from __future__ import annotations
 import copy
 import json
 import re
+import tracemalloc
+import unicodedata
+from collections.abc import Iterator
 from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
 
-from schemas import BodyAxes, DocumentError, DriveManifest, LabelMap, Pose, SemanticClass, parse_manifest
+from schemas import (
+    BodyAxes,
+    DocumentError,
+    DriveManifest,
+    LabelMap,
+    Pose,
+    SemanticClass,
+    parse_manifest,
+    parse_new_manifest,
+)
 from schemas.export import SCHEMA_FILE, schema_text
+from schemas.file_names import name_problems
 from schemas.parsing import parse_document
 
 README = SCHEMA_FILE.with_name("README.md")
@@ -193,3 +206,126 @@ def test_a_pose_that_was_written_reads_back_as_it_was() -> None:
         again = Pose.model_validate_json(pose.model_dump_json())
         assert again == pose
     assert 0 < np.linalg.norm(Pose(rotation_xyzw=[0, 0, 0, 1.0005], translation_m=[0, 0, 0]).rotation_xyzw) < 1 + 1e-12
+
+
+@pytest.mark.parametrize("version", [True, 1.0])
+def test_a_version_that_only_equals_one(example: dict[str, Any], version: object) -> None:
+    """A new drive is refused, and one that was accepted before is read."""
+    example["version"] = version
+    with pytest.raises(DocumentError, match=f"version: must be the integer 1, is {json.dumps(version)}") as refused:
+        parse_new_manifest(encoded(example))
+    assert [problem.path for problem in refused.value.problems] == ["version"]
+    read = parse_manifest(encoded(example)).version
+    assert (read, type(read)) == (1, int)
+
+
+def test_a_version_may_be_left_out(example: dict[str, Any]) -> None:
+    del example["version"]
+    assert parse_new_manifest(encoded(example)).version == 1
+
+
+@pytest.mark.parametrize("key", ["00", " 0", "0 ", "+0", "-0", "0.0", "1_0"])
+def test_ids_in_another_form(example: dict[str, Any], key: str) -> None:
+    example["label_map"]["ids"] = {key: "road"}
+    with pytest.raises(DocumentError, match=r"label_map\.ids: '.*' must be an integer without"):
+        parse_new_manifest(encoded(example))
+    assert parse_manifest(encoded(example)).label_map is not None
+
+
+def test_all_defects_of_a_new_manifest_are_told_at_once(example: dict[str, Any]) -> None:
+    example["version"], example["name"] = True, ""
+    with pytest.raises(DocumentError) as refused:
+        parse_new_manifest(encoded(example))
+    assert [problem.path for problem in refused.value.problems] == ["version", "name"]
+
+
+def is_refused(raw: bytes) -> bool:
+    try:
+        parse_new_manifest(raw)
+    except DocumentError:
+        return True
+    return False
+
+
+def leaves(document: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    inner = document.items() if isinstance(document, dict) else enumerate(document)
+    for key, value in inner:
+        if isinstance(value, dict | list):
+            yield from leaves(value, (*path, key))
+        else:
+            yield (*path, key), value
+
+
+def test_no_field_takes_a_value_of_another_type(example: dict[str, Any]) -> None:
+    example["rig"]["cameras"][0] |= {"sigma_focal_px": 2.0, "readout_us": 1}
+    for path, value in leaves(example):
+        others: list[Any] = [True, str(value)] if not isinstance(value, str) else [True, 1]
+        if isinstance(value, int) and path[-1] not in (0, 1, 2, 3):  # in a list of floats JSON may leave the point out
+            others.append(float(value))
+        for other in others:
+            changed = copy.deepcopy(example)
+            inner: Any = changed
+            for key in path[:-1]:
+                inner = inner[key]
+            inner[path[-1]] = other
+            assert is_refused(encoded(changed)), f"{path} takes {other!r}"
+
+
+COMPOSED, DECOMPOSED = unicodedata.normalize("NFC", "stra\u00dfe/\u00fc.png"), "stra\u00dfe/u\u0308.png"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        ("images/A.png", "images/a.png", "one file with 'images/A.png'"),
+        ("Images/a.png", "images/a.png", "one file with 'Images/a.png'"),
+        (COMPOSED, DECOMPOSED, "one file with"),
+        ("STRASSE/a.png", "stra\u00dfe/a.png", "one file with"),
+        ("front", "FRONT/a.png", "a folder that has the name of the file 'front'"),
+        ("Drive.JSON", "b.png", "the manifest's own name"),
+        ("drive.json/a.png", "b.png", "a folder that has the name of the file 'drive.json'"),
+    ],
+)
+@pytest.mark.parametrize("field", ["file", "mask"])
+def test_files_that_are_one_on_many_systems(
+    example: dict[str, Any], first: str, second: str, words: str, field: str
+) -> None:
+    images = example["frames"][0]["images"]
+    images["front"]["file"], images["left"][field] = first, second
+    with pytest.raises(DocumentError, match=re.escape(words)) as refused:
+        parse_new_manifest(encoded(example))
+    assert {problem.path for problem in refused.value.problems} <= {first, second}
+    assert parse_manifest(encoded(example)).frames[0].images["front"].file == first
+
+
+def test_how_names_of_one_look_differ_is_shown(example: dict[str, Any]) -> None:
+    images = example["frames"][0]["images"]
+    images["front"]["file"], images["left"]["file"] = DECOMPOSED, COMPOSED
+    with pytest.raises(DocumentError) as refused:
+        parse_new_manifest(encoded(example))
+    assert ascii(DECOMPOSED) in str(refused.value)
+
+
+def test_one_mask_may_serve_several_images(example: dict[str, Any]) -> None:
+    for image in example["frames"][0]["images"].values():
+        image["mask"] = "masks/Same.png"
+    assert parse_new_manifest(encoded(example))
+
+
+def test_deep_folders_take_no_more_memory_than_their_paths() -> None:
+    """All folders of a path of a kilobyte are a hundred times its length."""
+    paths = [f"{number:05d}/" + "a/" * 480 + "b.png" for number in range(500)]
+    tracemalloc.start()
+    try:
+        assert list(name_problems(paths)) == []
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 5 * sum(map(len, paths))
+
+
+@pytest.mark.parametrize("depth", [1, 2, 40])
+def test_a_file_is_no_folder_of_another(depth: int) -> None:
+    folder = "/".join(["a"] * depth)
+    assert [path for path, _ in name_problems([folder.upper(), f"{folder}/b/c.png"])] == [f"{folder}/b/c.png"]
+    assert [path for path, _ in name_problems([f"drive.json/{folder}/c.png"])] == [f"drive.json/{folder}/c.png"]

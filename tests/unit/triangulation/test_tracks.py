@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from simulated_drive import make_simulated_drive, true_matches
 
 from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, build_tracks
+from tests.helpers.simulated_drive import make_simulated_drive, true_matches
 
 
 def keypoints_of(per_image: list[int]) -> Keypoints:

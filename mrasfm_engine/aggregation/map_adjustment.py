@@ -1,0 +1,210 @@
+"""The last adjustment of a map: units vary on their own again, those at the seams or all of them.
+
+Scenes that moved as one each are as bent as they were. Where two overlap, their units now settle between what their own
+scene and what the other one says. Every drive has a calibration of its own, which settles within what its scene left
+uncertain (see `calibrations`), and its receiver's positions as a prior, with a constant error of its own that is
+estimated in turns with the units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.calibrations import calibration_priors
+from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
+from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
+from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
+from mrasfm_engine.bundle_adjustment.priors import Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.problem import Layout
+from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Bools, Floats, Ints
+
+ROUNDS = 2
+MIN_SHARED_POINTS = 12  # of other scenes that a unit sees, to vary on its own in the overlap
+OBSERVATIONS_OF_IMAGE = 300  # from which poses are estimated
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapModel:
+    """Everything of a map in its frame: poses, points, and what observes them."""
+
+    state: State  # points are the map's
+    rows: Ints  # (n,) keypoints of the assembly that observe a point, sorted by point
+    point: Ints  # (n,)
+    owner: Ints  # (p,) the map's point that every scene's point became, -1 where it was dropped
+    joined: Bools  # (points,) which several scenes see
+    errors_px: Floats  # (n,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinalResult:
+    """The map's model and how its last adjustment went."""
+
+    model: MapModel
+    positions: dict[int, DrivePositions]  # by scene
+    reports: tuple[Report, ...]
+    free_units: int
+    free_cameras: int
+    dropped_observations: int
+    dropped_points: int
+
+
+def all_points(owner: Ints) -> Ints:
+    """Owners (p,) with every point that is not joined as one of its own, joined ones first."""
+    result = owner.copy()
+    alone = np.flatnonzero(owner < 0)
+    result[alone] = (int(owner.max()) + 1 if len(owner) else 0) + np.arange(len(alone))
+    return result
+
+
+def adjust_map(
+    assembly: Assembly,
+    world_from_scene: Floats,
+    owner: Ints,
+    positions: dict[int, DrivePositions],
+    config: EngineConfig,
+    *,
+    cancel: Callable[[], bool],
+) -> FinalResult:
+    """Let units at the seams (or all, or none, as the settings say) settle; then filter what does not fit.
+
+    Parameters
+    ----------
+    owner
+        The joined point (p,) of the assembly's points, -1 for points of one scene alone.
+    positions
+        Of the assembly's scenes that have any; their bias is estimated here.
+    """
+    state = assembly.state(world_from_scene)
+    owners = all_points(owner)
+    tracks = tracks_of(assembly, owners)
+    joined = np.arange(tracks.count) <= int(owner.max(initial=-1))
+    state = replace(state, points_m=joined_points_m(state, tracks))
+    cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
+    problem = Problem(
+        state=state,
+        camera_kind=assembly.camera_kind,
+        observations=assembly.observations(tracks.rows, tracks.point, tracks.count),
+        layout=Layout.of(np.zeros(len(assembly.registered), dtype=np.bool_), cameras),
+        options=_options(config),
+        motion=assembly.motion,
+    )
+    free = _free_units(assembly, problem, joined, config)
+    calibrations = calibration_priors(assembly, state, free, config.adjustment)
+    for prior in calibrations:
+        cameras[prior.camera] = True
+    o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
+    seen[o.point[free[o.unit]]] = True
+    reports: list[Report] = []
+    positions = {k: with_bias(p, state) for k, p in positions.items()}
+    for _ in range(ROUNDS if free.any() else 0):
+        part = replace(
+            problem.of_points(seen),
+            layout=Layout.of(free, cameras),
+            terms=[*_terms(assembly, positions, free), *calibrations],
+        )
+        solution, report = solve_with_chosen_points(
+            part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
+        )
+        reports.append(report)
+        points = problem.state.points_m.copy()
+        points[seen] = solution.points_m
+        problem = replace(problem, state=replace(solution, points_m=points))
+        positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
+    problem = _others_settled(problem, seen, cameras)
+    model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
+    return FinalResult(
+        model=model,
+        positions=positions,
+        reports=tuple(reports),
+        free_units=int(free.sum()),
+        free_cameras=int(cameras.sum()),
+        dropped_observations=observations,
+        dropped_points=points_dropped,
+    )
+
+
+def _others_settled(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:
+    """The problem with points where calibrations that vary have got, but for those (p,) that varied with units."""
+    o, follow = problem.observations, np.zeros_like(varied)
+    follow[o.point[free_cameras[o.camera]]] = True
+    follow &= ~varied
+    if not follow.any():
+        return problem
+    part = problem.of_points(follow)
+    points = problem.state.points_m.copy()
+    points[follow] = part.with_points_settled(part.state).points_m
+    return replace(problem, state=replace(problem.state, points_m=points))
+
+
+def _options(config: EngineConfig) -> SolverOptions:
+    return SolverOptions(
+        max_iterations=20,
+        function_tolerance=1e-5,
+        loss_scale=config.adjustment.loss_scale,
+        threads=config.threads,
+    )
+
+
+def _free_units(assembly: Assembly, problem: Problem, joined: Bools, config: EngineConfig) -> Bools:
+    """Which units (u,) vary: all registered ones, those that see what is shared, or none."""
+    which = config.aggregation.final_adjustment
+    if which == "none":
+        return np.zeros(len(assembly.registered), dtype=np.bool_)
+    if which == "all":
+        return assembly.registered.copy()
+    o = problem.observations
+    counts = np.bincount(o.unit[joined[o.point]], minlength=len(assembly.registered))
+    result: Bools = assembly.registered & (counts >= MIN_SHARED_POINTS)
+    return result
+
+
+def _terms(assembly: Assembly, positions: dict[int, DrivePositions], free: Bools) -> Sequence[Term]:
+    terms: list[Term] = []
+    for k, p in positions.items():
+        terms.append(p.prior)
+        units = np.flatnonzero((assembly.scene_of_unit == k) & free)
+        if len(units) and assembly.scenes[k].common_world is None:
+            terms.append(
+                UprightPrior(
+                    unit=units,
+                    sigma_roll_rad=float(SIGMA_ROLL_RAD),
+                    sigma_pitch_rad=float(SIGMA_PITCH_RAD),
+                    up=p.up,
+                )
+            )
+    return terms
+
+
+def _filtered(
+    assembly: Assembly, problem: Problem, rows: Ints, owners: Ints, config: EngineConfig
+) -> tuple[MapModel, int, int]:
+    """The model without observations that do not fit and points that are left with fewer than two."""
+    o = problem.observations
+    errors = np.sqrt(problem.errors_px2(problem.state))
+    keep = errors < config.mapping.filter_error_px
+    left = np.bincount(o.point[keep], minlength=o.num_points)
+    alive = left >= 2
+    keep &= alive[o.point]
+    number = np.where(alive, np.cumsum(alive) - 1, -1)
+    # What was to be joined may be left to one scene.
+    scene = assembly.scene_of_unit[o.unit[keep]]
+    first, last = np.full(o.num_points, len(assembly.scenes)), np.full(o.num_points, -1)
+    np.minimum.at(first, o.point[keep], scene)
+    np.maximum.at(last, o.point[keep], scene)
+    model = MapModel(
+        state=replace(problem.state, points_m=problem.state.points_m[alive]),
+        rows=rows[keep],
+        point=number[o.point[keep]],
+        owner=np.where(owners >= 0, number[owners], -1),
+        joined=(first < last)[alive],
+        errors_px=errors[keep],
+    )
+    return model, int((~keep).sum()), int((~alive).sum())

@@ -1,0 +1,248 @@
+"""How one scene lies in another, from the poses of several of its units, and whether these agree.
+
+Every unit of scene b that sees points of scene a gets a pose there by one PnP over its cameras, and with it says how
+all of b lies in a: a_from_b = a_from_rig * inverse(b_from_rig). One unit alone can be wrong: a facade that repeats
+gives it a perfect pose at another house. So the hypothesis with which most units agree wins, it must be a clear
+majority of those that have something to say, and no other place may explain nearly as much: what is left of a unit's
+matches without those that fit is asked for a pose again, and where several units have a second one that is nearly as
+good as the first, something repeats, and which of the places is the right one nothing says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.config import AggregationConfig
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_cameras, reprojection_errors_focal
+from mrasfm_engine.mapping.resection import resect
+from mrasfm_engine.types import Bools, Floats, Ints
+
+MAX_ERROR_FOCAL = 0.012  # of the focal length: reprojection error of an inlier between two scenes, which may be bent
+MIN_SHARE = 0.35  # of a unit's matches that must fit, for it to agree
+MIN_MAJORITY = 0.5  # of the units that have something to say
+MAX_RUNNER_UP = 0.5  # of the winner's units for which another place may be nearly as good
+RIVAL_SHARE = 0.3  # of a unit's inliers at the winner's place that make another place nearly as good
+SAME_PLACE_M, SAME_PLACE_DEG = 1.5, 4.0  # hypotheses nearer than that are one place
+TRIALS = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sightings:
+    """What units of scene b see of scene a: image points of b and points of a that they show."""
+
+    unit: Ints  # (n,) of b
+    image: Ints  # (n,) of b
+    xy_px: Floats  # (n, 2)
+    points_m: Floats  # (n, 3) in a's frame
+
+    def of(self, rows: Ints | Bools) -> Sightings:
+        """Some of them."""
+        return Sightings(
+            unit=self.unit[rows], image=self.image[rows], xy_px=self.xy_px[rows], points_m=self.points_m[rows]
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consensus:
+    """How b lies in a, and who says so; without a transform they do not agree, and the reason says why."""
+
+    a_from_b: Floats | None
+    reason: str
+    units_asked: int  # units with matches enough to have something to say
+    units_agreeing: tuple[int, ...]  # units of b
+    runner_up: int  # units for which the best other place is nearly as good
+    inliers: int  # image points that fit
+
+
+def sightings(a: SourceScene, b: SourceScene, keypoints_a: Ints, keypoints_b: Ints, image_of_b: Ints) -> Sightings:
+    """Matches (n,) of keypoints as image points of b and points of a, each pair of these once."""
+    pairs = np.column_stack([keypoints_b, a.keypoint_point[keypoints_a]])
+    _, first = np.unique(pairs, axis=0, return_index=True)
+    image = image_of_b[keypoints_b[first]]
+    return Sightings(
+        unit=b.image_unit[image],
+        image=image,
+        xy_px=b.keypoint_xy_px[keypoints_b[first]].astype(np.float64),
+        points_m=a.points_m[a.keypoint_point[keypoints_a[first]]],
+    )
+
+
+class Relocaliser:
+    """Finds units of a scene among another scene's points."""
+
+    def __init__(self, b: SourceScene, config: AggregationConfig, *, seed: int) -> None:
+        self._b, self._config, self._seed = b, config, seed
+        self._kind, self._params = pack_cameras(b.drive.cameras)
+        self._cameras = [
+            pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=c.params) for c in b.drive.cameras
+        ]
+        self._b_from_cam = b.world_from_cam
+
+    def errors_focal(self, a_from_b: Floats, seen: Sightings) -> Floats:
+        """Reprojection errors (n,) in focal lengths if b lies so in a; infinite behind a camera."""
+        cam_from_a = se3.inverse(a_from_b @ self._b_from_cam[seen.image])
+        points = np.einsum("nij,nj->ni", cam_from_a[:, :3, :3], seen.points_m) + cam_from_a[:, :3, 3]
+        camera = self._b.image_camera[seen.image]
+        return reprojection_errors_focal(self._kind, self._params, camera, points, seen.xy_px)
+
+    def hypothesis(self, unit: int, seen: Sightings) -> Floats | None:
+        """How b lies in a (4, 4) by one unit alone."""
+        own = seen.of(seen.unit == unit)
+        if len(own.unit) < self._config.min_unit_inliers:
+            return None
+        found = self._unit_pose(unit, own)
+        if found is None:
+            return None
+        a_from_b: Floats = found @ se3.inverse(self._b.world_from_rig[unit])
+        refined = self.refined(a_from_b, own)
+        return a_from_b if refined is None else refined
+
+    def _unit_pose(self, unit: int, own: Sightings) -> Floats | None:
+        """a_from_rig of a unit."""
+        images, eye = np.unique(own.image, return_inverse=True)
+        rig_from_eye = se3.inverse(self._b.world_from_rig[unit]) @ self._b_from_cam[images]
+        cameras = [self._cameras[int(self._b.image_camera[i])] for i in images]
+        ransac = pycolmap.RANSACOptions()
+        focal = float(np.mean([self._params[int(self._b.image_camera[i]), :2].mean() for i in images]))
+        ransac.max_error = MAX_ERROR_FOCAL * focal
+        ransac.min_num_trials, ransac.max_num_trials = 50, TRIALS
+        ransac.random_seed = self._seed
+        if len(images) == 1:
+            options = pycolmap.AbsolutePoseEstimationOptions()
+            options.ransac = ransac
+            result = pycolmap.estimate_and_refine_absolute_pose(
+                own.xy_px, own.points_m, cameras[0], estimation_options=options
+            )
+            key, eye_from_rig = "cam_from_world", se3.inverse(rig_from_eye[0])
+        else:
+            poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(m[:3, :3]), m[:3, 3]) for m in se3.inverse(rig_from_eye)]
+            result = pycolmap.estimate_and_refine_generalized_absolute_pose(
+                own.xy_px, own.points_m, [int(e) for e in eye], poses, cameras, estimation_options=ransac
+            )
+            key, eye_from_rig = "rig_from_world", np.eye(4)
+        if result is None or result["num_inliers"] < self._config.min_unit_inliers:
+            return None
+        pose = result[key]
+        eye_from_a = se3.transform(pose.rotation.matrix(), pose.translation)
+        return se3.inverse(eye_from_a) @ eye_from_rig
+
+    def refined(self, a_from_b: Floats, seen: Sightings) -> Floats | None:
+        """The transform near a given one that fits best what all units see, b being one rig with an eye an image."""
+        images, eye = np.unique(seen.image, return_inverse=True)
+        camera = self._b.image_camera[images]
+        return resect(
+            a_from_b,
+            seen.xy_px,
+            seen.points_m,
+            eye.astype(np.int64),
+            self._b_from_cam[images],
+            self._kind[camera],
+            self._params[camera],
+        )
+
+    def agreeing(self, a_from_b: Floats, seen: Sightings) -> tuple[Ints, Bools]:
+        """Units that agree with a transform, and which image points (n,) fit."""
+        fits = self.errors_focal(a_from_b, seen) < MAX_ERROR_FOCAL
+        units, index = np.unique(seen.unit, return_inverse=True)
+        counts, inliers = np.bincount(index), np.bincount(index, fits)
+        good = (inliers >= self._config.min_unit_inliers) & (inliers >= MIN_SHARE * counts)
+        return units[good], fits
+
+    def consensus(self, seen: Sightings) -> Consensus:
+        """How b lies in a by all units that see points of a."""
+        units, counts = np.unique(seen.unit, return_counts=True)
+        asked = units[counts >= self._config.min_unit_inliers]
+        if not self._config.consensus and len(asked):
+            return self._best_unit_alone(seen, int(units[counts.argmax()]), len(asked))
+        proposals: list[tuple[Floats, Ints, int]] = []
+        for unit in asked:
+            a_from_b = self.hypothesis(int(unit), seen)
+            if a_from_b is not None:
+                proposals.append(self._with_all_units(a_from_b, seen))
+        if not proposals:
+            return _none(f"of {len(asked)} units with enough matches none finds a pose", len(asked))
+        best = max(proposals, key=lambda p: (len(p[1]), p[2]))
+        return self._judged(best, self._rivals(best, proposals, asked, seen), asked)
+
+    def _with_all_units(self, a_from_b: Floats, seen: Sightings) -> tuple[Floats, Ints, int]:
+        """A transform refined by all units that agree with it, these, and how many image points of theirs fit."""
+        for _ in range(2):
+            agreeing, fits = self.agreeing(a_from_b, seen)
+            better = self.refined(a_from_b, seen.of(fits & np.isin(seen.unit, agreeing)))
+            if better is None or not len(agreeing):
+                break
+            a_from_b = better
+        agreeing, fits = self.agreeing(a_from_b, seen)
+        return a_from_b, agreeing, int((fits & np.isin(seen.unit, agreeing)).sum())
+
+    def _rivals(
+        self,
+        best: tuple[Floats, Ints, int],
+        proposals: Sequence[tuple[Floats, Ints, int]],
+        asked: Ints,
+        seen: Sightings,
+    ) -> int:
+        """For how many units the best other place is nearly as good."""
+        a_from_b, agreeing, _ = best
+        _, fits = self.agreeing(a_from_b, seen)
+        rest = seen.of(~fits)
+        at_best = {int(u): int((fits & (seen.unit == u)).sum()) for u in asked}
+        others = [p[0] for p in proposals]
+        others += [h for u in asked if (h := self.hypothesis(int(u), rest)) is not None]
+        most = 0
+        for other in others:
+            if self._same_place(other, a_from_b, agreeing):
+                continue
+            fitting = self.errors_focal(other, rest) < MAX_ERROR_FOCAL
+            counts = {u: int((fitting & (rest.unit == u)).sum()) for u in at_best}
+            needed = {u: max(self._config.min_unit_inliers, RIVAL_SHARE * at_best[u]) for u in at_best}
+            most = max(most, sum(counts[u] >= needed[u] for u in at_best))
+        return most
+
+    def _best_unit_alone(self, seen: Sightings, unit: int, asked: int) -> Consensus:
+        """The one unit that sees most decides, as in the paper."""
+        a_from_b = self.hypothesis(unit, seen)
+        if a_from_b is None:
+            return _none("the unit that sees most finds no pose", asked)
+        _, fits = self.agreeing(a_from_b, seen)
+        return _found((a_from_b, np.array([unit]), int(fits.sum())), asked, 0, "the best unit alone decides")
+
+    def _judged(self, best: tuple[Floats, Ints, int], runner_up: int, asked: Ints) -> Consensus:
+        agreeing = best[1]
+        reason = ""
+        if len(agreeing) < self._config.min_units:
+            reason = f"{len(agreeing)} units agree how the scenes lie, {self._config.min_units} are needed"
+        elif len(agreeing) < MIN_MAJORITY * len(asked):
+            reason = f"only {len(agreeing)} of {len(asked)} units agree how the scenes lie"
+        elif runner_up > MAX_RUNNER_UP * len(agreeing):
+            reason = f"{len(agreeing)} units agree on one place, but for {runner_up} another is nearly as good"
+        if reason:
+            return _none(reason, len(asked), runner_up=runner_up)
+        return _found(best, len(asked), runner_up, "")
+
+    def _same_place(self, one: Floats, other: Floats, units: Ints) -> bool:
+        at = self._b.world_from_rig[units].mean(0)[:3, 3] if len(units) else np.zeros(3)
+        shift = np.linalg.norm(se3.apply(one, at[None])[0] - se3.apply(other, at[None])[0])
+        turn = float(se3.rotation_angle_deg(one[:3, :3] @ other[:3, :3].T))
+        return bool(shift <= SAME_PLACE_M and turn <= SAME_PLACE_DEG)
+
+
+def _none(reason: str, asked: int, *, runner_up: int = 0) -> Consensus:
+    return Consensus(a_from_b=None, reason=reason, units_asked=asked, units_agreeing=(), runner_up=runner_up, inliers=0)
+
+
+def _found(best: tuple[Floats, Ints, int], asked: int, runner_up: int, reason: str) -> Consensus:
+    return Consensus(
+        a_from_b=best[0],
+        reason=reason,
+        units_asked=asked,
+        units_agreeing=tuple(int(u) for u in best[1]),
+        runner_up=runner_up,
+        inliers=best[2],
+    )

@@ -1,0 +1,556 @@
+"""The compiled inner loops of camera set bundle adjustment: residuals, Jacobians, Schur complement over points.
+
+One observation of point X by camera c of unit u, with (R_u, t_u) = world_from_rig, (A, b) = unit_from_shot,
+(R_c, t_c) = rig_from_cam:
+
+    x_rig = R_u' (X - t_u)      x_shot = A' (x_rig - b)      x_cam = R_c' (x_shot - t_c)
+    residual = (pixel(x_cam) - observed) / sigma
+
+With P = d pixel / d x_cam (2x3), M = P R_c', Q = M A' and N = Q R_u' the derivatives in the steps of `problem` are,
+row by row,
+
+    d/dX     =  N                       d/dtau_u = -N            d/domega_u = N x (X - t_u)
+    d/dtau_c = -M                       d/domega_c = M x (x_shot - t_c)
+    d/dphi   =  pixel - principal point
+
+because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
+reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
+
+Where the motion within a unit follows from the trajectory, a shot's pose takes part in steps of up to three units
+(`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_shot). Left out is that a turned unit
+also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A shot
+that is held to its unit has no other support, and the derivatives above. Where all images are taken at their unit's
+time, shot_r, shot_t, support, weight and obs_shot are None: numba compiles the kernels without them, so that nobody
+pays for what is not there.
+
+Products of Jacobians need not be formed one observation at a time. With d = X - t_u and V = N' N all that an
+observation adds to its unit's block follows from V and V [d]x, and as d/dcamera = d/dunit T with a T that all
+observations of an image share (`add_images`), these sums by image make the unreduced matrix of units and cameras.
+
+For every point its 3x3 block V (now summed over its observations) and gradient e are eliminated on the spot: with W_i
+its coupling to free block i,
+
+    S_ij -= W_i V^-1 W_j'         g_i -= W_i V^-1 e
+
+Points are damped as V + lambda diag V. S is kept as blocks: of the units' pattern (`coupling`), of a dense border of
+the cameras' rows, and of the cameras' own square; each holds its entries row by row.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS
+from mrasfm_engine.geometry.camera_model import project
+
+BEHIND_PX = 1000.0  # what an observation costs whose point is behind the camera
+MIN_DEPTH_M = 1e-3
+IMAGE_SUMS = 35  # unit's block by its lower triangle, gradient, with the focal length, focal length's own
+
+
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def camera_point(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
+    from_unit: Any, rig: Any, cam: Any,
+) -> None:  # fmt: skip
+    """from_unit = X - t_u (X - t_shot where the shot follows several units), rig = x_shot - t_c, cam = x_cam."""
+    for i in range(3):
+        from_unit[i] = x[i] - unit_t[i]
+    if shot_r is None:
+        for i in range(3):
+            rig[i] = unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
+    else:
+        for i in range(3):
+            cam[i] = (
+                unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2]
+                - shot_t[shot, i]
+            )  # fmt: skip
+        if follows:
+            for i in range(3):
+                from_unit[i] = unit_r[i, 0] * cam[0] + unit_r[i, 1] * cam[1] + unit_r[i, 2] * cam[2]
+        for i in range(3):
+            rig[i] = shot_r[shot, 0, i] * cam[0] + shot_r[shot, 1, i] * cam[1] + shot_r[shot, 2, i] * cam[2] - cam_t[i]
+    for i in range(3):
+        cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def squared_errors(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
+) -> None:  # fmt: skip
+    """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared behind the camera."""
+    d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
+    for n in range(lo, hi):
+        u, c = obs_unit[n], obs_camera[n]
+        shot = 0 if obs_shot is None else obs_shot[n]
+        camera_point(
+            unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam
+        )
+        if cam[2] < MIN_DEPTH_M:
+            out[n] = BEHIND_PX * BEHIND_PX
+            continue
+        project(kind[c], params[c], cam[0], cam[1], cam[2], work, proj)
+        out[n] = (proj[0] - obs_xy[n, 0]) ** 2 + (proj[1] - obs_xy[n, 1]) ** 2
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def linearise(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any,
+    kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
+    d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
+) -> bool:  # fmt: skip
+    """Weighted residual, and its derivatives in the point and the camera, of one observation; False behind the camera.
+
+    Those in the unit follow from jx = N and d = X - t_u.
+    """
+    camera_point(unit_r, unit_t, shot_r, shot_t, shot, follows, cam_r, cam_t, x, d, rig, cam)
+    if cam[2] < MIN_DEPTH_M:
+        return False
+    project(kind, k, cam[0], cam[1], cam[2], work, proj)
+    r0, r1 = (proj[0] - xy[0]) / sigma, (proj[1] - xy[1]) / sigma
+    sw = math.sqrt(1.0 / (1.0 + (r0 * r0 + r1 * r1) / loss2))
+    res[0], res[1] = r0 * sw, r1 * sw
+    s = sw / sigma
+    for i in range(2):
+        p0, p1, p2 = proj[2 + 3 * i] * s, proj[3 + 3 * i] * s, proj[4 + 3 * i] * s
+        m0 = p0 * cam_r[0, 0] + p1 * cam_r[0, 1] + p2 * cam_r[0, 2]
+        m1 = p0 * cam_r[1, 0] + p1 * cam_r[1, 1] + p2 * cam_r[1, 2]
+        m2 = p0 * cam_r[2, 0] + p1 * cam_r[2, 1] + p2 * cam_r[2, 2]
+        if shot_r is None:
+            q0, q1, q2 = m0, m1, m2
+        else:
+            q0 = m0 * shot_r[shot, 0, 0] + m1 * shot_r[shot, 0, 1] + m2 * shot_r[shot, 0, 2]
+            q1 = m0 * shot_r[shot, 1, 0] + m1 * shot_r[shot, 1, 1] + m2 * shot_r[shot, 1, 2]
+            q2 = m0 * shot_r[shot, 2, 0] + m1 * shot_r[shot, 2, 1] + m2 * shot_r[shot, 2, 2]
+        n0 = q0 * unit_r[0, 0] + q1 * unit_r[0, 1] + q2 * unit_r[0, 2]
+        n1 = q0 * unit_r[1, 0] + q1 * unit_r[1, 1] + q2 * unit_r[1, 2]
+        n2 = q0 * unit_r[2, 0] + q1 * unit_r[2, 1] + q2 * unit_r[2, 2]
+        jx[i, 0], jx[i, 1], jx[i, 2] = n0, n1, n2
+        jc[i, 0], jc[i, 1], jc[i, 2] = m1 * rig[2] - m2 * rig[1], m2 * rig[0] - m0 * rig[2], m0 * rig[1] - m1 * rig[0]
+        jc[i, 3], jc[i, 4], jc[i, 5] = -m0, -m1, -m2
+        jc[i, 6] = (proj[i] - k[2 + i]) * s
+    return True
+
+
+@njit(cache=True, inline="always")
+def _find(blocks: Any, begin: int, end: int, block: int) -> int:
+    """Where in blocks[begin:end] a block is, counted from begin; -1 where it is not."""
+    for i in range(begin, end):
+        if blocks[i] == block:
+            return i - begin
+    return -1
+
+
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def invert3(v: Any, out: Any) -> bool:
+    """Inverse of a symmetric 3x3 matrix [00, 01, 02, 11, 12, 22]; False where it is singular."""
+    c0, c1, c2 = v[3] * v[5] - v[4] * v[4], v[2] * v[4] - v[1] * v[5], v[1] * v[4] - v[2] * v[3]
+    det = v[0] * c0 + v[1] * c1 + v[2] * c2
+    if not det > 1e-14 * v[0] * v[3] * v[5] or not det > 0.0:
+        return False
+    i = 1.0 / det
+    out[0], out[1], out[2] = c0 * i, c1 * i, c2 * i
+    out[3], out[4], out[5] = (
+        (v[0] * v[5] - v[2] * v[2]) * i,
+        (v[1] * v[2] - v[0] * v[4]) * i,
+        (v[0] * v[3] - v[1] * v[1]) * i,
+    )
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def accumulate(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_image: Any, obs_xy: Any, first: Any,
+    fixed: Any, unit_slot: Any, camera_slot: Any, num_units: int,
+    order: Any, first_point: Any, blocks: Any, first_block: Any, places: Any, first_place: Any,
+    sigma: float, loss2: float, damping: float, lo: int, hi: int,
+    images: Any, s_units: Any, s_border: Any, s_cameras: Any, g: Any, v_inverse: Any, v_gradient: Any,
+) -> None:  # fmt: skip
+    """Eliminate points order[lo:hi].
+
+    Sums of observations by image are added to images (images, IMAGE_SUMS). What elimination takes off the matrix is
+    taken off blocks s_units (b, 36) of the units' pattern, s_border (cameras, units, 42) and s_cameras (cameras,
+    cameras, 49), of all three the lower blocks; what it takes off the gradient, off g (n,). Every point's V^-1 (p, 6)
+    and gradient (p, 3) are kept.
+    """
+    d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
+    jx, jc = np.empty((2, 3)), np.empty((2, 7))
+    v, inv, e = np.empty(6), np.empty(6), np.empty(3)
+    w = np.empty((MAX_BLOCKS, 3, 7))  # coupling of a point to its blocks, transposed
+    tiled, repeated = np.empty((MAX_BLOCKS, 3 * 42)), np.empty(3 * 42)  # W_j and W_i V^-1, spread over blocks' entries
+    group = np.searchsorted(first_point, lo, side="right") - 1
+    for index in range(lo, hi):
+        while index >= first_point[group + 1]:
+            group += 1
+        b0, b1 = first_block[group], first_block[group + 1]
+        p = order[index]
+        v[:] = 0.0
+        e[:] = 0.0
+        w[: b1 - b0] = 0.0
+        for n in range(first[p], first[p + 1]):
+            u, c = obs_unit[n], obs_camera[n]
+            shot = 0 if obs_shot is None else obs_shot[n]
+            follows = False if weight is None else weight[shot, 0] != 1.0
+            if not linearise(
+                unit_r[u], unit_t[u], shot_r, shot_t, shot, follows, cam_r[c], cam_t[c],
+                kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
+                d, rig, cam, work, proj, res, jx, jc,
+            ):  # fmt: skip
+                continue
+            a0, a1, a2 = jx[0, 0], jx[0, 1], jx[0, 2]
+            c0, c1, c2 = jx[1, 0], jx[1, 1], jx[1, 2]
+            r0, r1 = res[0], res[1]
+            v00, v01, v02 = a0 * a0 + c0 * c0, a0 * a1 + c0 * c1, a0 * a2 + c0 * c2
+            v11, v12, v22 = a1 * a1 + c1 * c1, a1 * a2 + c1 * c2, a2 * a2 + c2 * c2
+            e0, e1, e2 = a0 * r0 + c0 * r1, a1 * r0 + c1 * r1, a2 * r0 + c2 * r1
+            v[0] += v00
+            v[1] += v01
+            v[2] += v02
+            v[3] += v11
+            v[4] += v12
+            v[5] += v22
+            e[0] += e0
+            e[1] += e1
+            e[2] += e2
+            # V [d]x, row by row: the rotation's part of W', and of the unit's own block.
+            d0, d1, d2 = d[0], d[1], d[2]
+            t00, t01, t02 = v01 * d2 - v02 * d1, v02 * d0 - v00 * d2, v00 * d1 - v01 * d0
+            t10, t11, t12 = v11 * d2 - v12 * d1, v12 * d0 - v01 * d2, v01 * d1 - v11 * d0
+            t20, t21, t22 = v12 * d2 - v22 * d1, v22 * d0 - v02 * d2, v02 * d1 - v12 * d0
+            s = images[obs_image[n]]
+            s[0] += d2 * t10 - d1 * t20
+            s[1] += d0 * t20 - d2 * t00
+            s[2] += d0 * t21 - d2 * t01
+            s[3] += d1 * t00 - d0 * t10
+            s[4] += d1 * t01 - d0 * t11
+            s[5] += d1 * t02 - d0 * t12
+            s[6] -= t00
+            s[7] -= t01
+            s[8] -= t02
+            s[9] += v00
+            s[10] -= t10
+            s[11] -= t11
+            s[12] -= t12
+            s[13] += v01
+            s[14] += v11
+            s[15] -= t20
+            s[16] -= t21
+            s[17] -= t22
+            s[18] += v02
+            s[19] += v12
+            s[20] += v22
+            s[21] += e1 * d2 - e2 * d1
+            s[22] += e2 * d0 - e0 * d2
+            s[23] += e0 * d1 - e1 * d0
+            s[24] -= e0
+            s[25] -= e1
+            s[26] -= e2
+            if weight is None:
+                su = unit_slot[u]
+                at = -1 if su < 0 else _find(blocks, b0, b1, su)
+                if at >= 0:
+                    _add_unit(w[at], 1.0, t00, t01, t02, t10, t11, t12, t20, t21, t22, v00, v01, v02, v11, v12, v22)
+            else:
+                for k in range(3):
+                    su = -1 if weight[shot, k] == 0.0 else unit_slot[support[shot, k]]
+                    at = -1 if su < 0 else _find(blocks, b0, b1, su)
+                    if at >= 0:
+                        _add_unit(
+                            w[at], weight[shot, k],
+                            t00, t01, t02, t10, t11, t12, t20, t21, t22, v00, v01, v02, v11, v12, v22,
+                        )  # fmt: skip
+            sc = camera_slot[c]
+            if sc >= 0:
+                f0, f1 = jc[0, 6], jc[1, 6]
+                n0, n1, n2 = f0 * a0 + f1 * c0, f0 * a1 + f1 * c1, f0 * a2 + f1 * c2
+                s[27] += n1 * d2 - n2 * d1
+                s[28] += n2 * d0 - n0 * d2
+                s[29] += n0 * d1 - n1 * d0
+                s[30] -= n0
+                s[31] -= n1
+                s[32] -= n2
+                s[33] += f0 * f0 + f1 * f1
+                s[34] += f0 * r0 + f1 * r1
+                at = _find(blocks, b0, b1, num_units + sc)
+                if at >= 0:
+                    wc = w[at]
+                    for i in range(7):
+                        x0, x1 = jc[0, i], jc[1, i]
+                        wc[0, i] += x0 * a0 + x1 * c0
+                        wc[1, i] += x0 * a1 + x1 * c1
+                        wc[2, i] += x0 * a2 + x1 * c2
+        for i in range(3):
+            v_gradient[p, i] = e[i]
+        v[0] += damping * v[0]
+        v[3] += damping * v[3]
+        v[5] += damping * v[5]
+        if fixed[p] or not invert3(v, inv):
+            # A point that is fixed or without depth stays where it is, and takes no part in the reduction.
+            v_inverse[p, :] = 0.0
+            continue
+        for i in range(6):
+            v_inverse[p, i] = inv[i]
+        x0 = inv[0] * e[0] + inv[1] * e[1] + inv[2] * e[2]
+        x1 = inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2]
+        x2 = inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2]
+        for i in range(b1 - b0):
+            block = blocks[b0 + i]
+            rows = 6 if block < num_units else 7
+            o = 6 * block if block < num_units else 6 * num_units + 7 * (block - num_units)
+            for a in range(rows):
+                g[o + a] -= w[i, 0, a] * x0 + w[i, 1, a] * x1 + w[i, 2, a] * x2
+        _subtract_products(
+            w, inv, tiled, repeated, blocks, b0, b1, num_units, places, first_place[group], s_units, s_border, s_cameras
+        )
+
+
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _add_unit(
+    w: Any, weight: float, t00: float, t01: float, t02: float, t10: float, t11: float, t12: float, t20: float,
+    t21: float, t22: float, v00: float, v01: float, v02: float, v11: float, v12: float, v22: float,
+) -> None:  # fmt: skip
+    """Add weight [V [d]x, -V] to w (3, 7)."""
+    w[0, 0] += weight * t00
+    w[0, 1] += weight * t01
+    w[0, 2] += weight * t02
+    w[0, 3] -= weight * v00
+    w[0, 4] -= weight * v01
+    w[0, 5] -= weight * v02
+    w[1, 0] += weight * t10
+    w[1, 1] += weight * t11
+    w[1, 2] += weight * t12
+    w[1, 3] -= weight * v01
+    w[1, 4] -= weight * v11
+    w[1, 5] -= weight * v12
+    w[2, 0] += weight * t20
+    w[2, 1] += weight * t21
+    w[2, 2] += weight * t22
+    w[2, 3] -= weight * v02
+    w[2, 4] -= weight * v12
+    w[2, 5] -= weight * v22
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _subtract_products(
+    w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int, places: Any,
+    place: int, s_units: Any, s_border: Any, s_cameras: Any,
+) -> None:  # fmt: skip
+    """S_ij -= W_i V^-1 W_j' for all pairs of a point's blocks.
+
+    Entry (a, b) of a product needs row a of W_i V^-1 and row b of W_j. Both are first spread over the 6 columns of a
+    block, so that one loop without gaps runs over all of its entries.
+    """
+    count = b1 - b0
+    for i in range(count):
+        block = blocks[b0 + i]
+        rows = 6 if block < num_units else 7
+        for a in range(rows):
+            x0, x1, x2 = w[i, 0, a], w[i, 1, a], w[i, 2, a]
+            y0 = x0 * inv[0] + x1 * inv[1] + x2 * inv[2]
+            y1 = x0 * inv[1] + x1 * inv[3] + x2 * inv[4]
+            y2 = x0 * inv[2] + x1 * inv[4] + x2 * inv[5]
+            for k in range(6 * a, 6 * a + 6):
+                repeated[k], repeated[42 + k], repeated[84 + k] = y0, y1, y2
+        if rows == 6:
+            for a in range(6):
+                x0, x1, x2 = w[i, 0, a], w[i, 1, a], w[i, 2, a]
+                for k in range(a, 42, 6):
+                    tiled[i, k], tiled[i, 42 + k], tiled[i, 84 + k] = x0, x1, x2
+        entries = 6 * rows
+        for j in range(i + 1):
+            other = blocks[b0 + j]
+            if other >= num_units:
+                target = s_cameras[block - num_units, other - num_units]
+                for a in range(7):
+                    y0, y1, y2 = repeated[6 * a], repeated[42 + 6 * a], repeated[84 + 6 * a]
+                    for b in range(7):
+                        target[7 * a + b] -= y0 * w[j, 0, b] + y1 * w[j, 1, b] + y2 * w[j, 2, b]
+                continue
+            target = s_units[places[place + i * (i + 1) // 2 + j]] if rows == 6 else s_border[block - num_units, other]
+            source = tiled[j]
+            for k in range(entries):
+                target[k] -= (
+                    repeated[k] * source[k] + repeated[42 + k] * source[42 + k] + repeated[84 + k] * source[84 + k]
+                )
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def add_images(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_t: Any, support: Any, weight: Any, image_unit: Any,
+    image_camera: Any, image_shot: Any, unit_slot: Any, camera_slot: Any, num_units: int, first_row: Any, rows: Any,
+    images: Any, s_units: Any, s_border: Any, s_cameras: Any, diagonal: Any, g: Any,
+) -> None:  # fmt: skip
+    """Add the sums of every image to the matrix, to the undamped diagonal (n,) and to the gradient (n,).
+
+    A camera's derivatives follow from the unit's: d/dcamera = d/dunit T with
+
+        T = [ R     0 ]      R = world_from_shot's rotation, q = the camera's place from that about which the unit turns
+            [ [q]xR R ]
+
+    so that of all products of Jacobians only the unit's are summed over observations.
+    """
+    h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
+    for image in range(len(images)):
+        u, c, shot = image_unit[image], image_camera[image], image_shot[image]
+        s = images[image]
+        k = 0
+        for i in range(6):
+            for j in range(i + 1):
+                h[i, j] = h[j, i] = s[k]
+                k += 1
+        sc = camera_slot[c]
+        if sc >= 0:
+            _camera_from_unit(unit_r[u], shot_r, shot_t, weight, shot, cam_t[c], r, q, t)
+            for i in range(6):
+                for j in range(6):
+                    x = 0.0
+                    for k in range(6):
+                        x += t[k, i] * h[k, j]
+                    th[i, j] = x
+            o = 6 * num_units + 7 * sc
+            square = s_cameras[sc, sc]
+            for i in range(6):
+                x, y = 0.0, 0.0
+                for k in range(6):
+                    x += t[k, i] * s[21 + k]
+                    y += t[k, i] * s[27 + k]
+                g[o + i] += x
+                square[42 + i] += y
+                for j in range(6):
+                    z = 0.0
+                    for k in range(6):
+                        z += th[i, k] * t[k, j]
+                    square[7 * i + j] += z
+                    if i == j:
+                        diagonal[o + i] += z
+            g[o + 6] += s[34]
+            square[48] += s[33]
+            diagonal[o + 6] += s[33]
+        for a in range(3):
+            if weight is None:
+                if a > 0:
+                    break
+                wa, sa = 1.0, unit_slot[u]
+            else:
+                wa = weight[shot, a]
+                sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
+            if sa < 0:
+                continue
+            for i in range(6):
+                g[6 * sa + i] += wa * s[21 + i]
+                diagonal[6 * sa + i] += wa * wa * h[i, i]
+            if sc >= 0:
+                border = s_border[sc, sa]
+                for j in range(6):
+                    for i in range(6):
+                        border[6 * i + j] += wa * th[i, j]
+                    border[36 + j] += wa * s[27 + j]
+            for b in range(3):
+                if weight is None:
+                    if b > 0:
+                        break
+                    wb, sb = 1.0, sa
+                else:
+                    wb = weight[shot, b]
+                    sb = -1 if wb == 0.0 else unit_slot[support[shot, b]]
+                if sb < 0 or sb > sa:
+                    continue
+                at = first_row[sb] + np.searchsorted(rows[first_row[sb] : first_row[sb + 1]], sa)
+                if at >= first_row[sb + 1] or rows[at] != sa:
+                    continue  # only where points have more units than they may couple
+                block = s_units[at]
+                for i in range(6):
+                    for j in range(6):
+                        block[6 * i + j] += wa * wb * h[i, j]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _camera_from_unit(
+    unit_r: Any, shot_r: Any, shot_t: Any, weight: Any, shot: int, cam_t: Any, r: Any, q: Any, t: Any
+) -> None:
+    """R, q and T of `add_images` for one image."""
+    if shot_r is None:
+        for i in range(3):
+            q[i] = 0.0
+            for j in range(3):
+                r[i, j] = unit_r[i, j]
+                q[i] += unit_r[i, j] * cam_t[j]
+    else:
+        follows = False if weight is None else weight[shot, 0] != 1.0
+        for i in range(3):
+            q[i] = 0.0
+            for j in range(3):
+                r[i, j] = 0.0
+                for k in range(3):
+                    r[i, j] += unit_r[i, k] * shot_r[shot, k, j]
+                q[i] += r[i, j] * cam_t[j]
+                if not follows:
+                    q[i] += unit_r[i, j] * shot_t[shot, j]
+    for j in range(3):
+        for i in range(3):
+            t[i, j] = t[3 + i, 3 + j] = r[i, j]
+        t[3, j] = q[1] * r[2, j] - q[2] * r[1, j]
+        t[4, j] = q[2] * r[0, j] - q[0] * r[2, j]
+        t[5, j] = q[0] * r[1, j] - q[1] * r[0, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def substitute(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any,
+    unit_slot: Any, camera_slot: Any, num_units: int,
+    sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
+) -> None:  # fmt: skip
+    """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
+    d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
+    jx, jc, e = np.empty((2, 3)), np.empty((2, 7)), np.empty(3)
+    for p in range(lo, hi):
+        for i in range(3):
+            e[i] = v_gradient[p, i]
+        for n in range(first[p], first[p + 1]):
+            u, c = obs_unit[n], obs_camera[n]
+            su, sc = unit_slot[u], camera_slot[c]
+            if weight is None and su < 0 and sc < 0:
+                continue
+            shot = 0 if obs_shot is None else obs_shot[n]
+            follows = False if weight is None else weight[shot, 0] != 1.0
+            if not linearise(
+                unit_r[u], unit_t[u], shot_r, shot_t, shot, follows, cam_r[c], cam_t[c],
+                kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
+                d, rig, cam, work, proj, res, jx, jc,
+            ):  # fmt: skip
+                continue
+            # A unit's step moves the residual as moving the point by (X - t_u) x omega - tau does.
+            x0, x1, x2 = 0.0, 0.0, 0.0
+            for a in range(3):
+                if weight is None:
+                    if a > 0:
+                        break
+                    wa, sa = 1.0, su
+                else:
+                    wa = weight[shot, a]
+                    sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
+                if sa >= 0:
+                    o = 6 * sa
+                    x0 += wa * (d[1] * step[o + 2] - d[2] * step[o + 1] - step[o + 3])
+                    x1 += wa * (d[2] * step[o] - d[0] * step[o + 2] - step[o + 4])
+                    x2 += wa * (d[0] * step[o + 1] - d[1] * step[o] - step[o + 5])
+            m0 = jx[0, 0] * x0 + jx[0, 1] * x1 + jx[0, 2] * x2
+            m1 = jx[1, 0] * x0 + jx[1, 1] * x1 + jx[1, 2] * x2
+            if sc >= 0:
+                o = 6 * num_units + 7 * sc
+                for i in range(7):
+                    m0 += jc[0, i] * step[o + i]
+                    m1 += jc[1, i] * step[o + i]
+            for i in range(3):
+                e[i] += jx[0, i] * m0 + jx[1, i] * m1
+        inv = v_inverse[p]
+        out[p, 0] = points[p, 0] - (inv[0] * e[0] + inv[1] * e[1] + inv[2] * e[2])
+        out[p, 1] = points[p, 1] - (inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2])
+        out[p, 2] = points[p, 2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])

@@ -1,0 +1,144 @@
+"""How well the adjustment knows what it estimated: marginal covariances, and scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Reduced
+from mrasfm_engine.bundle_adjustment.solver import Problem
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Bools, Floats
+
+LARGEST_DENSE = 4000  # unknowns
+SINGULAR = 1e-11  # pivots and eigenvalues of the scaled matrix below this are rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class Covariances:
+    """Marginal standard deviations; infinite where nothing determines an unknown."""
+
+    sigma_unit_position_m: Floats  # (u, 3), NaN for fixed units
+    sigma_camera: Floats  # (c, 7) rotation (rad), translation (m), log focal; NaN for fixed cameras
+    sigma_scale: float  # relative, of the trajectory's size
+    calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
+
+
+def covariances(problem: Problem, state: State) -> Covariances:
+    """Marginals at a solution, from the inverse of the reduced normal equations (Gauss-Newton, robust weights).
+
+    Scale is the functional sum (p_i - mean)' dp_i / sum |p_i - mean|^2 of the free units' positions: it does not change
+    when the scene is moved or turned. What nothing determines has an infinite sigma; which unknowns share in that is
+    told up to `LARGEST_DENSE` unknowns, beyond that all have one.
+    """
+    layout = problem.layout
+    reduced = problem.normal_equations(state, 0.0)
+    position = state.unit_position_m[layout.unit_slot >= 0]
+    found = _regular_marginals(reduced, position)
+    if found is None:
+        found = _dense_marginals(reduced, position)
+    per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
+    per_unit[layout.unit_slot >= 0] = np.sqrt(found.units)
+    per_camera = np.full((len(layout.camera_slot), CAMERA_DOF), np.nan)
+    per_camera[layout.camera_slot >= 0] = np.sqrt(np.diagonal(found.cameras)).reshape(-1, CAMERA_DOF)
+    poses = (CAMERA_DOF * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
+    return Covariances(
+        sigma_unit_position_m=per_unit[:, 3:],
+        sigma_camera=per_camera,
+        sigma_scale=found.sigma_scale,
+        calibration=found.cameras[np.ix_(poses, poses)],
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Marginals:
+    units: Floats  # (free units, 6) variances
+    cameras: Floats  # (7 c, 7 c) covariance of the free cameras; zero where held
+    sigma_scale: float
+
+
+def _regular_marginals(reduced: Reduced, position: Floats) -> _Marginals | None:
+    """By eliminating units and cameras; None where something besides single unknowns is not determined."""
+    layout = reduced.layout
+    split = UNIT_DOF * layout.num_units
+    unseen = ~(reduced.matrix_diagonal() > 0.0)
+    solved = reduced.eliminate(unseen.astype(np.float64))
+    if solved is None or solved.smallest_pivot(reduced, unseen) < SINGULAR:
+        return None
+    units, cameras = solved.inverse()
+    variance = np.diagonal(units, axis1=1, axis2=2).copy()
+    variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
+    covariance = np.zeros((CAMERA_DOF * layout.num_cameras,) * 2)
+    covariance[np.ix_(solved.free, solved.free)] = cameras
+    loose = solved.free[unseen[split:][solved.free]]
+    covariance[loose, loose] = np.inf
+    scale = float("nan")
+    if np.isinf(variance[:, 3:]).any():
+        scale = np.inf
+    elif len(position) >= 2:
+        functional = _scale_functional(position)
+        scale = float(np.sqrt(max(solved.inverse_form(functional), 0.0)))
+    return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
+
+
+def _dense_marginals(reduced: Reduced, position: Floats) -> _Marginals:
+    """By the inverse without its null space."""
+    layout = reduced.layout
+    size, split = layout.size, UNIT_DOF * layout.num_units
+    if size > LARGEST_DENSE:
+        cameras = np.diag(np.full(size - split, np.inf))
+        return _Marginals(units=np.full((layout.num_units, UNIT_DOF), np.inf), cameras=cameras, sigma_scale=np.inf)
+    matrix = reduced.matrix
+    free = np.setdiff1d(np.arange(size), layout.held())
+    free = free[np.diagonal(matrix)[free] > 0.0]
+    inverse, loose = _inverse(matrix[np.ix_(free, free)])
+    variance = np.full(size, np.inf)
+    variance[layout.held()] = 0.0
+    variance[free] = np.where(loose, np.inf, np.maximum(np.diagonal(inverse), 0.0))
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(free, free)] = inverse
+    covariance[np.diag_indices(size)] = variance
+    units = variance[:split].reshape(-1, UNIT_DOF)
+    scale = float("nan")
+    if np.isinf(units[:, 3:]).any():
+        scale = np.inf
+    elif len(position) >= 2:
+        functional = _scale_functional(position)
+        scale = float(np.sqrt(max(float(functional @ covariance[:split, :split] @ functional), 0.0)))
+    return _Marginals(units=units, cameras=covariance[split:, split:], sigma_scale=scale)
+
+
+def _inverse(matrix: Floats) -> tuple[Floats, Bools]:
+    """Inverse (n, n) of a symmetric matrix without its null space, and which unknowns (n,) take part in that."""
+    n = len(matrix)
+    if n == 0:
+        return matrix, np.zeros(0, dtype=np.bool_)
+    # Scaled to a unit diagonal first: metres and radians differ by orders of magnitude.
+    d = 1.0 / np.sqrt(np.diagonal(matrix))
+    scaled = matrix * d[:, None] * d[None, :]
+    loose = np.zeros(n, dtype=np.bool_)
+    try:
+        factor = scipy.linalg.cho_factor(scaled, lower=True)
+        regular = float((np.diagonal(factor[0]) ** 2).min()) > SINGULAR
+    except np.linalg.LinAlgError:
+        regular = False
+    if regular:
+        inverse = np.asarray(scipy.linalg.cho_solve(factor, np.eye(n)))
+    else:
+        values, vectors = scipy.linalg.eigh(scaled)
+        null = values < SINGULAR * values[-1]
+        loose = (vectors[:, null] ** 2).sum(1) > 1e-9
+        inverse = (vectors[:, ~null] / values[~null]) @ vectors[:, ~null].T
+    result: Floats = inverse * d[:, None] * d[None, :]
+    return result, loose
+
+
+def _scale_functional(position: Floats) -> Floats:
+    """What a step (6 units,) of the units changes of the trajectory's size, relative to it."""
+    centred = position - position.mean(0)
+    functional = np.zeros((len(position), UNIT_DOF))
+    functional[:, 3:] = centred / max(float((centred**2).sum()), 1e-12)
+    return functional.ravel()

@@ -1,0 +1,77 @@
+"""Which points poses are estimated from, where there are far more than needed.
+
+Long tracks tie a unit to others; observations all over an image hold its rotation and position apart. So the tracks
+with most observations are asked first, and one is taken if any of its images still wants an observation in the cell of
+its grid where it is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.bundle_adjustment.problem import Observations
+from mrasfm_engine.bundle_adjustment.solver import Problem, Report, solve
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Bools, Cancel, Floats
+
+GRID = (8, 5)  # columns and rows of cells of an image
+
+
+def solve_with_chosen_points(
+    problem: Problem, image_size_px: Floats, *, an_image: int, cancel: Cancel | None = None
+) -> tuple[State, Report]:
+    """As `solve`, with poses and calibration from the chosen points (see `choose_points`), which all others follow.
+
+    With `an_image` zero it is `solve` with all of them.
+    """
+    if not an_image:
+        return solve(problem, cancel=cancel)
+    chosen = choose_points(problem.observations, problem.layout.unit_slot >= 0, image_size_px, an_image=an_image)
+    solution, report = solve(problem.of_points(chosen), cancel=cancel)
+    points_m = problem.state.points_m.copy()
+    points_m[chosen] = solution.points_m
+    return problem.with_points_settled(replace(solution, points_m=points_m)), report
+
+
+def choose_points(observations: Observations, free_units: Bools, image_size_px: Floats, *, an_image: int) -> Bools:
+    """Points (p,) that give every image of a free unit about so many observations, spread over it.
+
+    Parameters
+    ----------
+    observations
+        Of all points.
+    free_units
+        Which units (u,) are to be estimated: images of others want nothing.
+    image_size_px
+        Width and height of every camera's images (c, 2).
+    an_image
+        Observations an image wants. It gets fewer where it has fewer, and more where its points serve other images.
+    """
+    o, (columns, rows) = observations, GRID
+    cell_px = image_size_px[o.camera] / GRID
+    place = np.clip((o.xy_px / cell_px).astype(np.int64), 0, np.array(GRID) - 1)
+    slot = np.where(free_units, np.cumsum(free_units) - 1, -1)[o.unit]
+    bucket = ((slot * len(image_size_px) + o.camera) * rows + place[:, 1]) * columns + place[:, 0]
+    cells = int(free_units.sum()) * len(image_size_px) * rows * columns
+    wanted = np.full(cells, -(-an_image // (rows * columns)), dtype=np.int64)
+    length = np.diff(o.first_of_point)
+    result: Bools = _choose(np.argsort(-length, kind="stable"), o.first_of_point, bucket, wanted)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _choose(order: Any, first: Any, bucket: Any, wanted: Any) -> Any:
+    chosen = np.zeros(len(order), np.bool_)
+    for p in order:
+        for n in range(first[p], first[p + 1]):
+            if bucket[n] >= 0 and wanted[bucket[n]] > 0:  # below: images of units that are held
+                chosen[p] = True
+        if chosen[p]:
+            for n in range(first[p], first[p + 1]):
+                if bucket[n] >= 0:
+                    wanted[bucket[n]] -= 1
+    return chosen

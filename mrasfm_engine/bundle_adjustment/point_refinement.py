@@ -1,0 +1,156 @@
+"""Points that move by themselves: what their observations cost, and one step of each where poses are held.
+
+In a step of Levenberg-Marquardt, points follow the poses by their derivatives (`normal_equations.substitute`). Where
+that throws a few of little depth far away, the whole step would be refused for them; and where a robust weight changes,
+a point has further to go. Both cost iterations of the whole system. Here every point goes on towards its own minimum
+once the poses have moved, as in Ceres' inner iterations or in variable projection (Golub and Pereyra, 1973): an
+iteration then costs a little more, and there are far fewer.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.bundle_adjustment.kernels import BEHIND_PX, MIN_DEPTH_M, camera_point, invert3, linearise
+from mrasfm_engine.geometry.camera_model import project
+
+SETTLED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
+WORTH = 3e-2  # gain an observation, after which a point is still far enough from its minimum for one more step
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _point_cost(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, scale2: float, x: Any,
+    d: Any, rig: Any, cam: Any, work: Any, proj: Any,
+) -> float:  # fmt: skip
+    """Sum of log(1 + r^2 / scale^2) over a point's observations begin..end, were it at x; r in pixels."""
+    result, product = 0.0, 1.0
+    for n in range(begin, end):
+        u, c = obs_unit[n], obs_camera[n]
+        shot = 0 if obs_shot is None else obs_shot[n]
+        camera_point(unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], x, d, rig, cam)
+        r2 = BEHIND_PX * BEHIND_PX
+        if cam[2] >= MIN_DEPTH_M:
+            project(kind[c], params[c], cam[0], cam[1], cam[2], work, proj)
+            r2 = (proj[0] - obs_xy[n, 0]) ** 2 + (proj[1] - obs_xy[n, 1]) ** 2
+        product *= 1.0 + r2 / scale2
+        if product > 1e200:  # one logarithm for many factors
+            result += math.log(product)
+            product = 1.0
+    return result + math.log(product)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _point_system(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, sigma: float, loss2: float,
+    x: Any, d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
+) -> None:  # fmt: skip
+    """V (6,) and gradient e (3,) of a point at x over its observations begin..end."""
+    v[:] = 0.0
+    e[:] = 0.0
+    for n in range(begin, end):
+        u, c = obs_unit[n], obs_camera[n]
+        shot = 0 if obs_shot is None else obs_shot[n]
+        if not linearise(
+            unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], kind[c], params[c], x, obs_xy[n],
+            sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
+        ):  # fmt: skip
+            continue
+        a0, a1, a2 = jx[0, 0], jx[0, 1], jx[0, 2]
+        c0, c1, c2 = jx[1, 0], jx[1, 1], jx[1, 2]
+        v[0] += a0 * a0 + c0 * c0
+        v[1] += a0 * a1 + c0 * c1
+        v[2] += a0 * a2 + c0 * c2
+        v[3] += a1 * a1 + c1 * c1
+        v[4] += a1 * a2 + c1 * c2
+        v[5] += a2 * a2 + c2 * c2
+        e[0] += a0 * res[0] + c0 * res[1]
+        e[1] += a1 * res[0] + c1 * res[1]
+        e[2] += a2 * res[0] + c2 * res[1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def settle(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, fixed: Any,
+    sigma: float, loss2: float, before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
+) -> None:  # fmt: skip
+    """Move points lo..hi, in place, to where the poses and the calibration of now want them; what they cost to costs.
+
+    Points have followed a step of the poses by its derivatives. One that costs more than `costs_before` where it was
+    `before` goes back there if that is better. A point whose cost has hardly changed needs no more; every other makes a
+    step of its own, if it is for the better, and up to `steps` as long as these gain.
+    """
+    d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
+    jx, jc, v, e, inv = np.empty((2, 3)), np.empty((2, 7)), np.empty(6), np.empty(3), np.empty(6)
+    x, trial = np.empty(3), np.empty(3)
+    scale2 = loss2 * sigma * sigma
+    for p in range(lo, hi):
+        begin, end = first[p], first[p + 1]
+        for i in range(3):
+            x[i] = points[p, i]
+        cost = _point_cost(
+            unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+            begin, end, scale2, x, d, rig, cam, work, proj,
+        )  # fmt: skip
+        if fixed[p]:
+            costs[p] = cost
+            continue
+        if cost > costs_before[p]:
+            for i in range(3):
+                trial[i] = before[p, i]
+            back = _point_cost(
+                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                begin, end, scale2, trial, d, rig, cam, work, proj,
+            )  # fmt: skip
+            if back < cost:
+                cost = back
+                for i in range(3):
+                    x[i] = trial[i]
+        gained, enough = abs(cost - costs_before[p]), SETTLED
+        for _ in range(steps):
+            if gained <= enough * (end - begin):
+                break
+            enough = WORTH
+            gained = 0.0
+            _point_system(
+                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
+            )  # fmt: skip
+            if not invert3(v, inv):
+                break
+            trial[0] = x[0] - (inv[0] * e[0] + inv[1] * e[1] + inv[2] * e[2])
+            trial[1] = x[1] - (inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2])
+            trial[2] = x[2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])
+            own = _point_cost(
+                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                begin, end, scale2, trial, d, rig, cam, work, proj,
+            )  # fmt: skip
+            if own < cost:
+                gained = cost - own
+                cost = own
+                for i in range(3):
+                    x[i] = trial[i]
+        costs[p] = cost
+        for i in range(3):
+            points[p, i] = x[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def point_costs(
+    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, scale2: float, lo: int, hi: int, costs: Any,
+) -> None:  # fmt: skip
+    """What points lo..hi cost: sums of log(1 + r^2 / scale^2) over their observations."""
+    d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
+    for p in range(lo, hi):
+        costs[p] = _point_cost(
+            unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+            first[p], first[p + 1], scale2, points[p], d, rig, cam, work, proj,
+        )  # fmt: skip

@@ -1,0 +1,270 @@
+"""Terms of the adjustment that are not image observations: calibration, focal lengths, positions, gauges.
+
+Every term adds its cost, and the gradient and Gauss-Newton matrix of its residuals in the reduced vector. There are a
+few rows a unit or camera, so plain numpy does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, Layout
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Bools, Floats, Ints
+
+# How firmly a gauge is held, relative to the priors: firm enough to hold, soft enough not to hurt the conditioning.
+GAUGE_STIFFNESS = 1e6
+HELD_SHARE = 0.02  # of a prior's sigma that is left in a direction that is held
+GAUGE_USUAL = 3.0  # cameras farther off than this many usual distances hardly count in the gauge, nearer ones alike
+
+
+class Term(Protocol):
+    """Part of the cost over units and cameras."""
+
+    def cost(self, state: State) -> float:
+        """Half the (robust) sum of squared residuals."""
+        ...
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """Add J'J (both triangles) and J'r."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationPrior:
+    """Keeps `rig_from_cam` near what was given, and holds the gauge between cameras and units.
+
+    Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes, with a
+    Cauchy loss over those that are not held: what is held comes back from wherever it has got. Moving all cameras by
+    one transform and all units by its inverse changes no image: the weighted mean correction of all cameras is held at
+    zero. The weights stay fixed during a solve, so that the gauge is linear; they are renewed from the corrections
+    between solves, see `robust_gauge_weights`.
+    """
+
+    rotation: Floats  # (c, 3, 3) given
+    position_m: Floats  # (c, 3) given
+    sigma_rotation_rad: Floats  # (c,)
+    sigma_translation_m: Floats  # (c,)
+    gauge_weights: Floats | None = None  # (c,) equal if None
+    loss_scale: float = 3.0  # in sigmas, of one camera's correction as a whole
+    held: Bools | None = None  # (c, 6) directions that stay as given, as the drive does not observe them
+
+    def corrections(self, state: State) -> Floats:
+        """Rotation vectors (rad) and translations (m) of all cameras (c, 6) from given to current, in rig axes."""
+        return _corrections(state.camera_rotation, state.camera_position_m, self.rotation, self.position_m)
+
+    def with_weights(self, state: State) -> CalibrationPrior:
+        """This prior with the gauge's weights renewed from the corrections of a state."""
+        return replace(self, gauge_weights=robust_gauge_weights(self._whitened(state)[0]))
+
+    def _whitened(self, state: State) -> tuple[Floats, Floats]:
+        sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
+        return self.corrections(state) / sigma, sigma
+
+    def _held(self) -> Bools:
+        return np.zeros((len(self.rotation), 6), dtype=np.bool_) if self.held is None else self.held
+
+    def _gauge(self) -> Floats:
+        w = np.ones(len(self.rotation)) if self.gauge_weights is None else self.gauge_weights
+        return np.repeat((w / w.sum() * np.sqrt(len(w)))[:, None], 6, axis=1)
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return _cost_of_rig(self._whitened(state)[0], self._held(), self._gauge(), self.loss_scale)
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        r, sigma = self._whitened(state)
+        cameras = np.arange(len(r))
+        _add_rig(layout, extra, cameras, r, sigma=sigma, held=self._held(), gauge=self._gauge(), loss=self.loss_scale)
+
+
+def _corrections(rotation: Floats, position_m: Floats, from_rotation: Floats, from_position_m: Floats) -> Floats:
+    """Rotation vectors (rad) and translations (m) of cameras (n, 6) to poses in the rig, in its axes."""
+    turn = se3.log_so3(rotation @ np.swapaxes(from_rotation, 1, 2))
+    return np.concatenate([turn, position_m - from_position_m], axis=1)
+
+
+def _cost_of_rig(r: Floats, held: Bools, gauge: Floats, loss_scale: float) -> float:
+    """Of a rig's corrections over their sigmas (n, 6), and of their mean, in which they have weights gauge (n, 6).
+
+    Of a camera's own there is a Cauchy loss over those that are not held, and squares of the rest.
+    """
+    s2 = loss_scale**2
+    loose, firm = ((np.where(mask, r, 0.0) ** 2).sum(1) for mask in (~held, held))
+    own = 0.5 * (s2 * np.log1p(loose / s2) + firm / HELD_SHARE**2).sum()
+    return float(own + 0.5 * GAUGE_STIFFNESS * ((gauge * r).sum(0) ** 2).sum())
+
+
+def _add_rig(
+    layout: Layout, extra: Extra, cameras: Ints, r: Floats, *, sigma: Floats, held: Bools, gauge: Floats, loss: float
+) -> None:
+    """Add what belongs to `_cost_of_rig`, of cameras (n,) with corrections r over sigma (n, 6) each."""
+    step = np.tile(np.eye(6), (len(r), 1, 1))  # derivatives of corrections by steps of their cameras
+    step[:, :3, :3] = se3.inverse_left_jacobian((r * sigma)[:, :3])
+    free = np.flatnonzero(layout.camera_slot[cameras] >= 0)
+    rows = (CAMERA_DOF * layout.camera_slot[cameras[free]])[:, None] + np.arange(6)
+    j = (step / sigma[:, :, None])[free]
+
+    loose = (np.where(held, 0.0, r) ** 2).sum(1, keepdims=True)
+    weights = np.where(held, HELD_SHARE**-2, 1.0 / (1.0 + loose / loss**2))[free]
+    j_w = np.swapaxes(weights[:, :, None] * j, 1, 2)
+    extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
+    extra.camera_gradient[rows] += (j_w @ r[free, :, None])[:, :, 0]
+
+    if not len(free):
+        return
+    together = np.concatenate(np.sqrt(GAUGE_STIFFNESS) * gauge[free, :, None] * j, axis=1)  # (6, 6 free)
+    extra.cameras[np.ix_(rows.ravel(), rows.ravel())] += together.T @ together
+    extra.camera_gradient[rows.ravel()] += np.sqrt(GAUGE_STIFFNESS) * together.T @ (gauge * r).sum(0)
+
+
+def robust_gauge_weights(whitened: Floats) -> Floats:
+    """Weights (c,) of cameras in the gauge from their corrections in sigmas (c, 6).
+
+    A camera is compared with how far cameras are from their common correction as a rule, not with the prior's sigma:
+    one that is 3 deg off would pass for usual under a prior of 2 deg, and turn the whole vehicle with it. Usual ones
+    weigh the same: of errors that are all of one kind the plain mean is nearest to zero. With fewer than three cameras
+    there is no majority, and all weigh the same.
+    """
+    if len(whitened) < 3:
+        return np.ones(len(whitened))
+    distance = np.linalg.norm(whitened - np.median(whitened, axis=0), axis=1)
+    usual = max(float(np.median(distance)), 1e-3)
+    result: Floats = 1.0 / (1.0 + (distance / (GAUGE_USUAL * usual)) ** 8)
+    return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPosePrior:
+    """Keeps the cameras of one rig near where an earlier adjustment found them, direction by direction.
+
+    Residuals of a camera: rotation vector of R R_found' and t - t_found over their sigmas, in rig axes, with a Cauchy
+    loss over those that are not held. The gauge between cameras and units: the cameras' mean correction is held at
+    zero. It is a plain mean, in which no camera stands for the rig because more is known of it.
+    """
+
+    camera: Ints  # (n,) all cameras of the rig
+    rotation: Floats  # (n, 3, 3)
+    position_m: Floats  # (n, 3)
+    sigma: Floats  # (n, 6) rotation (rad), translation (m)
+    held: Bools  # (n, 6) directions that hardly vary: their residuals are multiplied
+    loss_scale: float = 3.0
+
+    def _whitened(self, state: State) -> Floats:
+        found = state.camera_rotation[self.camera], state.camera_position_m[self.camera]
+        return _corrections(*found, self.rotation, self.position_m) / self.sigma
+
+    def _gauge(self) -> Floats:
+        """Weights (n, 6) of whitened corrections in their mean, which is in parts of the largest sigma."""
+        result: Floats = self.sigma / self.sigma.max(0) / np.sqrt(len(self.camera))
+        return result
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return _cost_of_rig(self._whitened(state), self.held, self._gauge(), self.loss_scale)
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        r = self._whitened(state)
+        gauge, loss = self._gauge(), self.loss_scale
+        _add_rig(layout, extra, self.camera, r, sigma=self.sigma, held=self.held, gauge=gauge, loss=loss)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FocalPrior:
+    """Keeps focal lengths near what was given: residual log(f / f_given) / sigma, sigma relative to f."""
+
+    focal_px: Floats  # (c,) given
+    sigma: Floats  # (c,)
+
+    def _residuals(self, state: State) -> Floats:
+        result: Floats = np.log(state.camera_params[:, 0] / self.focal_px) / self.sigma
+        return result
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return float(0.5 * (self._residuals(state) ** 2).sum())
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        if not layout.free_focal:
+            return
+        cameras = np.flatnonzero(layout.camera_slot >= 0)
+        rows = CAMERA_DOF * layout.camera_slot[cameras] + 6
+        extra.cameras[rows, rows] += 1.0 / self.sigma[cameras] ** 2
+        extra.camera_gradient[rows] += self._residuals(state)[cameras] / self.sigma[cameras]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionPrior:
+    """Measured positions of a point of the vehicle (antenna, or the rig's origin), with a Cauchy loss.
+
+    Residual: (t + R lever - measured) / sigma by axis of the world frame.
+    """
+
+    unit: Ints  # (n,) units that have a measurement
+    position_m: Floats  # (n, 3) in the world frame
+    sigma_m: Floats  # (n, 3)
+    lever_arm_m: Floats  # (3,) in the rig frame
+    loss_scale: float = 3.0
+
+    def _residuals(self, state: State) -> tuple[Floats, Floats]:
+        arm = state.unit_rotation[self.unit] @ self.lever_arm_m
+        return arm, (state.unit_position_m[self.unit] + arm - self.position_m) / self.sigma_m
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        _, r = self._residuals(state)
+        s2 = self.loss_scale**2
+        return float(0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum())
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        arm, r = self._residuals(state)
+        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
+        # d (R arm) / d omega = -[R arm]x in world axes
+        j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+        j = j / self.sigma_m[:, :, None]
+        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
+        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
+        np.add.at(extra.units, slots, j_w @ j[free])
+        np.add.at(extra.unit_gradient, slots, (j_w @ r[free, :, None])[:, :, 0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class UprightPrior:
+    """Vehicles are upright on average: roll and pitch are zero within a road's cross fall and grade.
+
+    A road's slope is common to the units of a drive, so together they count as one measurement. On a straight way this
+    alone says how the scene is turned about that line.
+    """
+
+    unit: Ints  # (n,)
+    sigma_roll_rad: float
+    sigma_pitch_rad: float
+    up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit vector of the world frame
+
+    def _rows(self, state: State) -> tuple[Floats, Floats]:
+        # The rig's y axis (left) tells roll, its x axis (forward) pitch.
+        axes = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]], 1, 2)  # (n, 2, 3)
+        scale = np.array([self.sigma_roll_rad, self.sigma_pitch_rad]) * np.sqrt(len(self.unit))
+        jacobian = np.cross(axes, self.up) / scale[:, None]
+        return axes @ self.up / scale, jacobian
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return float(0.5 * (self._rows(state)[0] ** 2).sum())
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        r, j = self._rows(state)
+        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
+        slots, j_t = layout.unit_slot[self.unit[free]], np.swapaxes(j[free], 1, 2)
+        np.add.at(extra.units[:, :3, :3], slots, j_t @ j[free])
+        np.add.at(extra.unit_gradient[:, :3], slots, (j_t @ r[free, :, None])[:, :, 0])

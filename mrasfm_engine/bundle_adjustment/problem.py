@@ -1,0 +1,134 @@
+"""What camera set bundle adjustment adjusts.
+
+Variables are the poses of rigid units, `rig_from_cam` and one focal factor of every camera, and points. A pose is
+stored as rotation and position of the moving frame in the fixed one (`world_from_rig`, `rig_from_cam`), so that a step
+
+    R <- exp(omega) R,   t <- t + tau
+
+has its rotation vector omega and translation tau in the axes of the fixed frame. All steps of all free units and
+cameras, in this order, make up the reduced vector of unknowns:
+
+    unit slot u:    [omega (3, rad), tau (3, m)]            at 6 u
+    camera slot c:  [omega (3, rad), tau (3, m), phi]       at 6 U + 7 c,   focal lengths <- focal lengths * exp(phi)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Bools, Floats, Ints
+
+UNIT_DOF = 6
+CAMERA_DOF = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """Image observations of points, sorted by point."""
+
+    unit: Ints  # (n,) indices into the units
+    camera: Ints  # (n,)
+    point: Ints  # (n,) ascending
+    xy_px: Floats  # (n, 2)
+    first_of_point: Ints = field(init=False)  # (p + 1,) observations of point i: first[i]:first[i + 1]
+    num_points: int
+    shot: Ints | None = None  # (n,) indices into the state's shots; without, all are at their unit's timestamp
+    fixed: Bools | None = None  # (p,) points that stay where they are; without, none does
+
+    def __post_init__(self) -> None:
+        first = np.searchsorted(self.point, np.arange(self.num_points + 1))
+        if self.fixed is None:
+            object.__setattr__(self, "fixed", np.zeros(self.num_points, dtype=np.bool_))
+        object.__setattr__(self, "first_of_point", first.astype(np.int64))
+
+    @property
+    def num_free_points(self) -> int:
+        """How many points may move."""
+        return self.num_points if self.fixed is None else self.num_points - int(self.fixed.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotMotion:
+    """How shots follow the trajectory of the units that are adjusted."""
+
+    support: Ints  # (s, 3) units whose steps move a shot; -1 where weight is 0
+    weight: Floats  # (s, 3) by how much; (1, 0, 0) where it is held to its unit
+    follow: Callable[[State], State]  # the state with its shots computed anew from its units
+
+    @staticmethod
+    def held(shot_unit: Ints) -> ShotMotion:
+        """Shots (s,) that stay where they are relative to their units."""
+        support = np.full((len(shot_unit), 3), -1, dtype=np.int64)
+        support[:, 0] = shot_unit
+        return ShotMotion(support=support, weight=np.tile([1.0, 0.0, 0.0], (len(support), 1)), follow=lambda s: s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Which variables are free, and where their steps stand in the reduced vector."""
+
+    unit_slot: Ints  # (u,) -1 where fixed
+    camera_slot: Ints  # (c,) -1 where fixed
+    num_units: int
+    num_cameras: int
+    free_focal: bool
+
+    @staticmethod
+    def of(free_units: Bools, free_cameras: Bools, *, free_focal: bool = False) -> Layout:
+        """The layout with the marked units and cameras free."""
+        return Layout(
+            unit_slot=np.where(free_units, np.cumsum(free_units) - 1, -1).astype(np.int64),
+            camera_slot=np.where(free_cameras, np.cumsum(free_cameras) - 1, -1).astype(np.int64),
+            num_units=int(free_units.sum()),
+            num_cameras=int(free_cameras.sum()),
+            free_focal=free_focal,
+        )
+
+    @property
+    def size(self) -> int:
+        """Length of the reduced vector."""
+        return UNIT_DOF * self.num_units + CAMERA_DOF * self.num_cameras
+
+    def unit_offsets(self, units: Ints) -> Ints:
+        """Where the steps of (free) units begin."""
+        return UNIT_DOF * self.unit_slot[units]
+
+    def camera_offsets(self, cameras: Ints) -> Ints:
+        """Where the steps of (free) cameras begin."""
+        return UNIT_DOF * self.num_units + CAMERA_DOF * self.camera_slot[cameras]
+
+    def held(self) -> Ints:
+        """Positions of the reduced vector that have a slot but may not move (focal factors that are held)."""
+        if self.free_focal:
+            return np.zeros(0, dtype=np.int64)
+        return UNIT_DOF * self.num_units + CAMERA_DOF * np.arange(self.num_cameras, dtype=np.int64) + 6
+
+
+def retract(state: State, layout: Layout, step: Floats, points_m: Floats) -> State:
+    """The state after a step of the reduced vector, with new points."""
+    units = np.flatnonzero(layout.unit_slot >= 0)
+    cameras = np.flatnonzero(layout.camera_slot >= 0)
+    d_unit = step[: UNIT_DOF * layout.num_units].reshape(-1, UNIT_DOF)
+    d_camera = step[UNIT_DOF * layout.num_units :].reshape(-1, CAMERA_DOF)
+    unit_rotation, unit_position = state.unit_rotation.copy(), state.unit_position_m.copy()
+    unit_rotation[units] = se3.exp_so3(d_unit[:, :3]) @ unit_rotation[units]
+    unit_position[units] += d_unit[:, 3:]
+    camera_rotation, camera_position = state.camera_rotation.copy(), state.camera_position_m.copy()
+    camera_rotation[cameras] = se3.exp_so3(d_camera[:, :3]) @ camera_rotation[cameras]
+    camera_position[cameras] += d_camera[:, 3:6]
+    camera_params = state.camera_params.copy()
+    camera_params[cameras, :2] *= np.exp(d_camera[:, 6:])
+    return replace(
+        state,
+        unit_rotation=unit_rotation,
+        unit_position_m=unit_position,
+        camera_rotation=camera_rotation,
+        camera_position_m=camera_position,
+        camera_params=camera_params,
+        points_m=points_m,
+    )

@@ -1,0 +1,216 @@
+"""The reduced system of an adjustment, in which points are eliminated, and its solution.
+
+With units u and cameras c,
+
+    [ A  B' ] [ du ]     [ gu ]
+    [ B  C  ] [ dc ] = - [ gc ]
+
+A couples units that share points: sparse, factorised by blocks. B and C are a border that is as wide as there are
+cameras. With Z = A^-1 B' and z = A^-1 gu
+
+    (C - B Z) dc = B z - gc          du = -z - Z dc
+
+and in the inverse, the units' part is A^-1 + Z (C - B Z)^-1 Z', the cameras' part (C - B Z)^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from mrasfm_engine.bundle_adjustment.block_cholesky import BlockFactor
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout
+from mrasfm_engine.bundle_adjustment.schur_structure import Coupling
+from mrasfm_engine.types import Bools, Floats, Ints
+
+TINY = 1e-12  # damps what nothing observes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extra:
+    """What terms that are not image observations add: one block a unit, and the cameras' square."""
+
+    units: Floats  # (units, 6, 6)
+    cameras: Floats  # (7 cameras, 7 cameras)
+    gradient: Floats  # (n,)
+
+    @property
+    def unit_gradient(self) -> Floats:
+        """View (units, 6) of the units' gradient."""
+        return self.gradient[: UNIT_DOF * len(self.units)].reshape(-1, UNIT_DOF)
+
+    @property
+    def camera_gradient(self) -> Floats:
+        """View (7 cameras,) of the cameras' gradient."""
+        return self.gradient[UNIT_DOF * len(self.units) :]
+
+    @property
+    def matrix(self) -> Floats:
+        """All of it (n, n), for small problems."""
+        return scipy.linalg.block_diag(*self.units, self.cameras)
+
+    @staticmethod
+    def none(layout: Layout) -> Extra:
+        """Zeros to add to."""
+        return Extra(
+            units=np.zeros((layout.num_units, UNIT_DOF, UNIT_DOF)),
+            cameras=np.zeros((CAMERA_DOF * layout.num_cameras,) * 2),
+            gradient=np.zeros(layout.size),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduced:
+    """Normal equations with the points eliminated."""
+
+    layout: Layout
+    coupling: Coupling
+    units: Floats  # (blocks of the units' pattern, 6, 6); diagonal ones are symmetric
+    border: Floats  # (cameras, units, 7, 6)
+    cameras: Floats  # (7 cameras, 7 cameras)
+    diagonal: Floats  # (n,) of the matrix before points were eliminated: what Marquardt's damping scales
+    gradient: Floats  # (n,)
+    v_inverse: Floats  # (p, 6)
+    v_gradient: Floats  # (p, 3)
+
+    @staticmethod
+    def of(
+        layout: Layout,
+        coupling: Coupling,
+        sums: tuple[Floats, ...],
+        points: tuple[Floats, Floats],
+        extra: Extra,
+    ) -> Reduced:
+        """The system from what `accumulate` summed (units, border, cameras, diagonal, gradient) and other terms."""
+        c = layout.num_cameras
+        units = sums[0].reshape(-1, UNIT_DOF, UNIT_DOF)
+        border = sums[1].reshape(c, layout.num_units, CAMERA_DOF, UNIT_DOF)
+        squares = sums[2].reshape(c, c, CAMERA_DOF, CAMERA_DOF)
+        diagonal, gradient = sums[3:]
+        # Diagonal blocks come by their lower triangle.
+        on = coupling.pattern.first[:-1]
+        lower = np.tril(units[on])
+        units[on] = lower + np.swapaxes(np.tril(lower, -1), 1, 2) + extra.units
+        size = CAMERA_DOF * c
+        cameras = np.tril(np.swapaxes(squares, 1, 2).reshape(size, size))
+        cameras = cameras + np.tril(cameras, -1).T + extra.cameras
+        unit_diagonal = np.diagonal(extra.units, axis1=1, axis2=2).ravel()
+        return Reduced(
+            layout=layout,
+            coupling=coupling,
+            units=units,
+            border=border,
+            cameras=cameras,
+            diagonal=diagonal + np.concatenate([unit_diagonal, np.diagonal(extra.cameras)]),
+            gradient=gradient + extra.gradient,
+            v_inverse=points[0],
+            v_gradient=points[1],
+        )
+
+    @property
+    def matrix(self) -> Floats:
+        """All of it (n, n), for small problems."""
+        n, split = self.layout.size, UNIT_DOF * self.layout.num_units
+        result = np.zeros((n, n))
+        steps = np.arange(UNIT_DOF)
+        rows = (UNIT_DOF * self.coupling.pattern.row)[:, None, None] + steps[:, None]
+        columns = (UNIT_DOF * self.coupling.pattern.column_of_block())[:, None, None] + steps[None, :]
+        result[rows, columns] = self.units
+        result[columns, rows] = self.units
+        result[split:, :split] = self._border_rows()
+        result[:split, split:] = result[split:, :split].T
+        result[split:, split:] = self.cameras
+        return result
+
+    def _border_rows(self) -> Floats:
+        """B (7 cameras, 6 units)."""
+        size = CAMERA_DOF * self.layout.num_cameras
+        return np.swapaxes(self.border, 1, 2).reshape(size, UNIT_DOF * self.layout.num_units)
+
+    def matrix_diagonal(self) -> Floats:
+        """The diagonal (n,) of the matrix."""
+        units = np.diagonal(self.units[self.coupling.pattern.first[:-1]], axis1=1, axis2=2)
+        return np.concatenate([units.ravel(), np.diagonal(self.cameras)])
+
+    def step(self, damping: float) -> Floats | None:
+        """The damped step (n,), zero where held; None where the damped matrix is not positive definite."""
+        split = UNIT_DOF * self.layout.num_units
+        damped = damping * np.maximum(self.diagonal, TINY)
+        solved = self.eliminate(damped)
+        if solved is None:
+            return None
+        step = np.zeros(len(self.gradient))
+        step[:split] = -solved.units_of(self.gradient[:split])
+        if solved.cameras is not None:
+            right = -self.gradient[split:][solved.free] - solved.border @ step[:split]
+            cameras = scipy.linalg.cho_solve(solved.cameras, right, check_finite=False)
+            step[split:][solved.free] = cameras
+            step[:split] -= solved.coupled @ cameras
+        return step if np.isfinite(step).all() else None
+
+    def eliminate(self, damped: Floats) -> Eliminated | None:
+        """Eliminate the units, with something (n,) added to the diagonal; None where not positive definite."""
+        layout = self.layout
+        split = UNIT_DOF * layout.num_units
+        units = self.units.copy()
+        on = self.coupling.pattern.first[:-1]
+        axis = np.arange(UNIT_DOF)
+        units[on[:, None], axis, axis] += damped[:split].reshape(-1, UNIT_DOF)
+        factor = BlockFactor.of(self.coupling.elimination, units)
+        if factor is None:
+            return None
+        free = np.setdiff1d(np.arange(CAMERA_DOF * layout.num_cameras), layout.held() - split)
+        border = self._border_rows()[free]
+        coupled = factor.solve(np.ascontiguousarray(border.T))
+        square = self.cameras[np.ix_(free, free)] - border @ coupled
+        square[np.diag_indices(len(free))] += damped[split:][free]
+        try:
+            cameras = scipy.linalg.cho_factor(square, lower=True, check_finite=False) if len(free) else None
+        except np.linalg.LinAlgError:
+            return None
+        return Eliminated(factor=factor, free=free, border=border, coupled=coupled, cameras=cameras)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eliminated:
+    """A reduced system whose units are eliminated too."""
+
+    factor: BlockFactor
+    free: Ints  # (f,) of the cameras' unknowns
+    border: Floats  # (f, 6 units) B
+    coupled: Floats  # (6 units, f) A^-1 B'
+    cameras: tuple[Floats, bool] | None  # Cholesky factor of C - B A^-1 B', where cameras are free
+
+    def units_of(self, right: Floats) -> Floats:
+        """A^-1 (6 units,) of a right-hand side."""
+        return self.factor.solve(right)
+
+    def smallest_pivot(self, reduced: Reduced, replaced: Bools) -> float:
+        """The smallest pivot relative to the diagonal that it came from, where that was not `replaced` (n,)."""
+        split = UNIT_DOF * reduced.layout.num_units
+        diagonal = reduced.matrix_diagonal()
+        pivots = self.factor.pivots().ravel() / np.where(replaced, 1.0, diagonal)[:split]
+        smallest = float(pivots.min(initial=np.inf))
+        if self.cameras is not None:
+            own = np.where(replaced, 1.0, diagonal)[split:][self.free]
+            smallest = min(smallest, float((np.diagonal(self.cameras[0]) ** 2 / own).min()))
+        return smallest
+
+    def inverse(self) -> tuple[Floats, Floats]:
+        """Of the whole matrix's inverse the units' diagonal blocks (units, 6, 6) and the cameras' part (f, f)."""
+        units = self.factor.inverse_diagonal()
+        if self.cameras is None:
+            return units, np.zeros((0, 0))
+        cameras = scipy.linalg.cho_solve(self.cameras, np.eye(len(self.free)))
+        coupled = self.coupled.reshape(-1, UNIT_DOF, len(self.free))
+        return units + coupled @ cameras @ np.swapaxes(coupled, 1, 2), cameras
+
+    def inverse_form(self, functional: Floats) -> float:
+        """f' M^-1 f for a functional f (6 units,) of the units, M the whole matrix."""
+        value = float(functional @ self.units_of(functional))
+        if self.cameras is not None:
+            along = self.coupled.T @ functional
+            value += float(along @ scipy.linalg.cho_solve(self.cameras, along))
+        return value

@@ -1,0 +1,310 @@
+"""Levenberg-Marquardt over the reduced system of camera set bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+from mrasfm_engine.bundle_adjustment.kernels import IMAGE_SUMS, accumulate, add_images, squared_errors, substitute
+from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, settle
+from mrasfm_engine.bundle_adjustment.priors import Term
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, Reduced
+from mrasfm_engine.bundle_adjustment.rigid_groups import UnitSets
+from mrasfm_engine.bundle_adjustment.schur_structure import Coupling
+from mrasfm_engine.parallel import in_parts, in_ranges
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+
+SETTLING = 2  # steps of points whose poses have moved
+MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says little about where the minimum is
+
+
+class Termination(StrEnum):
+    """Why the solver stopped."""
+
+    CONVERGED = "converged"
+    ITERATIONS = "iteration limit"
+    NO_PROGRESS = "no step lowers the cost"
+    NOTHING_FREE = "nothing to adjust"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions:
+    """Options of one solve."""
+
+    max_iterations: int = 50
+    function_tolerance: float = 1e-6  # relative decrease of the cost below which it has converged
+    # Newton decrement below which poses and calibration have converged, in squared standard deviations: no combination
+    # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that settle
+    # between their robust weights, which moves no pose.
+    decrement_tolerance: float = 5e-3
+    initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most
+    loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
+    sigma_px: float = 1.0  # standard deviation of an observation
+    threads: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """How a solve went."""
+
+    initial_cost: float
+    final_cost: float
+    iterations: int
+    termination: Termination
+    observations: int
+    parameters: int  # all unknowns
+    pose_parameters: int  # those of units and cameras: the size of the reduced system
+
+
+@dataclass(kw_only=True)
+class Problem:
+    """One adjustment: what is observed, what is free and what else is known."""
+
+    state: State
+    camera_kind: Ints
+    observations: Observations
+    layout: Layout
+    terms: Sequence[Term] = ()
+    options: SolverOptions = field(default_factory=SolverOptions)
+    motion: ShotMotion | None = None  # needed where the state has shots
+    sets: UnitSets | None = None  # free units that move as one; then calibration is fixed
+
+    def errors_px2(self, state: State) -> Floats:
+        """Squared reprojection errors (n,) of all observations."""
+        o = self.observations
+        out = np.empty(len(o.unit))
+        in_ranges(
+            self.options.threads,
+            len(out),
+            lambda lo, hi, _: squared_errors(
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.point, o.xy_px, lo, hi, out
+            ),
+        )
+        return out
+
+    def _motion(self) -> tuple[NDArray[np.generic] | None, ...]:
+        return (None, None) if self.motion is None else (self.motion.support, self.motion.weight)
+
+    def retract(self, state: State, step: Floats, points_m: Floats) -> State:
+        """The state after a step of the reduced vector, with new points."""
+        move = retract if self.sets is None else self.sets.retract
+        after = move(state, self.layout, step, points_m)
+        return after if self.motion is None else self.motion.follow(after)
+
+    def cost(self, state: State) -> float:
+        """Half the robust sum of squares."""
+        return self._sum(state, self.point_costs(state))
+
+    def _sum(self, state: State, costs: Floats) -> float:
+        images = 0.5 * self.options.loss_scale**2 * costs.sum()
+        return float(images + sum(term.cost(state) for term in self.terms))
+
+    def point_costs(self, state: State) -> Floats:
+        """Sums (p,) of log(1 + r^2 / s^2) over the observations of every point."""
+        o, out = self.observations, np.empty(self.observations.num_points)
+        in_ranges(
+            self.options.threads,
+            len(out),
+            lambda lo, hi, _: point_costs(
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                (self.options.loss_scale * self.options.sigma_px) ** 2, lo, hi, out,
+            ),
+        )  # fmt: skip
+        return out
+
+    def of_points(self, chosen: Bools) -> Problem:
+        """The problem of some of the points (p,) and what observes them."""
+        o = self.observations
+        rows = chosen[o.point]
+        number = np.cumsum(chosen) - 1
+        return replace(
+            self,
+            state=replace(self.state, points_m=self.state.points_m[chosen]),
+            observations=Observations(
+                unit=o.unit[rows],
+                camera=o.camera[rows],
+                point=number[o.point[rows]],
+                xy_px=o.xy_px[rows],
+                num_points=int(chosen.sum()),
+                shot=None if o.shot is None else o.shot[rows],
+                fixed=None if o.fixed is None else o.fixed[chosen],
+            ),
+        )
+
+    def with_points_settled(self, state: State) -> State:
+        """The state with every point moved to where poses and calibration want it; only those that gain move."""
+        result = replace(state, points_m=state.points_m.copy())
+        self.settle(result, state, np.full(len(state.points_m), np.inf), steps=SETTLING)
+        return result
+
+    def settle(self, state: State, before: State, costs_before: Floats, *, steps: int = 1) -> tuple[Floats, float]:
+        """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
+        o, options, costs = self.observations, self.options, np.empty(self.observations.num_points)
+        in_ranges(
+            options.threads,
+            len(costs),
+            lambda lo, hi, _: settle(
+                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point, o.fixed,
+                options.sigma_px, options.loss_scale**2, before.points_m, costs_before, steps, lo, hi, costs,
+            ),
+        )  # fmt: skip
+        return costs, self._sum(state, costs)
+
+    @cached_property
+    def coupling(self) -> Coupling:
+        """Which blocks the points couple; the same for every state."""
+        return Coupling.of(self.observations, self.layout, self.motion)
+
+    def normal_equations(self, state: State, damping: float) -> Reduced:
+        """The reduced system at a state."""
+        o, layout, options, coupling = self.observations, self.layout, self.options, self.coupling
+        units, cameras, p = layout.num_units, layout.num_cameras, o.num_points
+        parts = min(options.threads, max(1, p // 256))
+        images = np.zeros((parts, len(coupling.image_unit), IMAGE_SUMS))
+        blocks = (
+            np.zeros((parts, len(coupling.pattern.row), UNIT_DOF * UNIT_DOF)),
+            np.zeros((parts, cameras, units, CAMERA_DOF * UNIT_DOF)),
+            np.zeros((parts, cameras, cameras, CAMERA_DOF * CAMERA_DOF)),
+        )
+        gradient = np.zeros((parts, layout.size))
+        v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
+        slots = layout.unit_slot, layout.camera_slot, units
+        in_parts(
+            coupling.shares(parts),
+            lambda lo, hi, t: accumulate(
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, coupling.image, o.xy_px,
+                o.first_of_point, o.fixed, *slots, *coupling.arrays,
+                options.sigma_px, options.loss_scale**2, damping, lo, hi,
+                images[t], *(part[t] for part in blocks), gradient[t], v_inverse, v_gradient,
+            ),
+        )  # fmt: skip
+        sums = tuple(part[0] if parts == 1 else part.sum(0) for part in (*blocks, np.zeros_like(gradient), gradient))
+        add_images(
+            *_arrays(state, self.camera_kind)[:4], state.camera_position_m, *self._motion(),
+            coupling.image_unit, coupling.image_camera, coupling.image_shot, *slots,
+            coupling.pattern.first, coupling.pattern.row,
+            images.sum(0), *sums,
+        )  # fmt: skip
+        extra = Extra.none(layout)
+        for term in self.terms:
+            term.add_to(state, layout, extra)
+        return Reduced.of(layout, coupling, sums, (v_inverse, v_gradient), extra)
+
+    def step(self, state: State, reduced: Reduced, damping: float) -> Floats | None:
+        """The damped step (n,) of the reduced vector; None where there is none."""
+        return reduced.step(damping) if self.sets is None else self.sets.step(reduced, state, damping)
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns the reduced vector really has."""
+        return self.layout.size - len(self.layout.held()) if self.sets is None else self.sets.size
+
+    def points_after(self, state: State, reduced: Reduced, step: Floats) -> Floats:
+        """Points (p, 3) that go with a step of the reduced vector."""
+        o, layout, options = self.observations, self.layout, self.options
+        out = np.empty_like(state.points_m)
+        in_ranges(
+            options.threads,
+            o.num_points,
+            lambda lo, hi, _: substitute(
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
+                step, reduced.v_inverse, reduced.v_gradient, lo, hi, out,
+            ),
+        )  # fmt: skip
+        return out
+
+
+def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic] | None, ...]:
+    return (
+        state.unit_rotation,
+        state.unit_position_m,
+        None if state.simultaneous else state.shot_rotation,
+        None if state.simultaneous else state.shot_position_m,
+        state.camera_rotation,
+        state.camera_position_m,
+        kind,
+        state.camera_params,
+        state.points_m,
+    )
+
+
+_THREADS = ThreadpoolController()
+SMALL_SYSTEM = 1500  # unknowns; on smaller ones BLAS threads cost more than they bring
+
+
+def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Report]:
+    """Minimise the problem's cost.
+
+    Parameters
+    ----------
+    problem
+        What to adjust; its state is where the search starts.
+    cancel
+        Asked between iterations; where it answers True the best state so far is returned.
+
+    Returns
+    -------
+    state, report
+        The state of lowest cost that was found, and how it went.
+
+    Notes
+    -----
+    Damping follows Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems" (2004), section 3.2.
+    """
+    if problem.layout.size < SMALL_SYSTEM:
+        with _THREADS.limit(limits=1, user_api="blas"):
+            return _minimise(problem, cancel)
+    return _minimise(problem, cancel)
+
+
+def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
+    options, state = problem.options, problem.state
+    costs = problem.point_costs(state)
+    cost = initial = problem._sum(state, costs)
+    damping, raise_by, iterations = options.initial_damping, 2.0, 0
+    termination = Termination.ITERATIONS
+    free = problem.unknowns
+    if not free and not problem.observations.num_free_points:
+        termination = Termination.NOTHING_FREE
+    while iterations < options.max_iterations and termination is Termination.ITERATIONS:
+        if cancel is not None and cancel():
+            break
+        iterations += 1
+        reduced = problem.normal_equations(state, damping)
+        step = problem.step(state, reduced, damping)
+        if step is not None:
+            trial = problem.retract(state, step, problem.points_after(state, reduced, step))
+            trial_costs, trial_cost = problem.settle(trial, state, costs)
+        if step is None or not trial_cost < cost:
+            if damping > 1e8:
+                termination = Termination.NO_PROGRESS
+            elif step is not None and trial_cost - cost <= options.function_tolerance * cost * 1e-3:
+                termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
+            damping, raise_by = damping * raise_by, raise_by * 2.0
+            continue
+        decrement = -float(step @ reduced.gradient)
+        if cost - trial_cost <= options.function_tolerance * cost or (
+            # A step that damping holds back is short wherever the minimum is.
+            free and damping <= MAX_DAMPING_OF_DECREMENT and decrement <= options.decrement_tolerance
+        ):
+            termination = Termination.CONVERGED
+        state, cost, costs = trial, trial_cost, trial_costs
+        damping, raise_by = max(damping / 5.0, 1e-10), 2.0
+    return state, Report(
+        initial_cost=initial,
+        final_cost=cost,
+        iterations=iterations,
+        termination=termination,
+        observations=len(problem.observations.unit),
+        parameters=free + 3 * problem.observations.num_free_points,
+        pose_parameters=free,
+    )

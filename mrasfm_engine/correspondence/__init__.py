@@ -1,1 +1,0 @@
-"""Stage one: which images see the same, and where."""

@@ -1,0 +1,114 @@
+"""`calibration.json`: the calibration as given, as refined, and how well the drive observed it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, Scene
+from mrasfm_engine.types import Floats
+from schemas import CAMERA_MODELS, Camera, Pose
+
+OBSERVED, ONLY_PRIOR = "observed", "only the prior"
+
+
+def calibration_document(scene: Scene) -> dict[str, Any]:
+    """By camera: `given`, `refined`, `difference` (about and along the rig's axes), `sigma` and `observed`.
+
+    `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
+    A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
+    `common` are the motions of all cameras together, of which no direction says anything: `observed` of a camera is
+    always among the others.
+    """
+    cameras = zip(scene.drive.cameras, scene.calibration, strict=True)
+    verdict = scene.calibration_verdict
+    return {
+        "version": 1,
+        **(
+            {} if verdict is None else {"adjusted": verdict.adjusted, "why": verdict.reason, "common": _common(verdict)}
+        ),
+        "axes": "rotation_vector_deg, translation_m, sigmas and observed are about and along the rig's x, y, z",
+        "cameras": {camera.name: _camera(camera, refined) for camera, refined in cameras},
+    }
+
+
+def _common(verdict: CalibrationVerdict) -> dict[str, Any]:
+    """Motions of all cameras together: images show none of them, and only positions can tell the scale."""
+    scale: dict[str, Any] = {"observed": verdict.scale_observed}
+    if np.isfinite(verdict.sigma_scale):
+        scale["sigma_relative"] = verdict.sigma_scale
+    return {
+        "rotation": {"observed": [False] * 3, "verdict": ["held"] * 3},
+        "translation": {"observed": [False] * 3, "verdict": ["held"] * 3},
+        "scale": scale | {"verdict": verdict.scale_rests_on},
+    }
+
+
+def settled_document(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
+    """A scene's `calibration.json` after its cameras have settled in a map: `refined` and `difference` are the map's.
+
+    `since_scene` is by how much that is another pose than the scene found, and absent where nothing moved; everything
+    else is as the scene found it.
+    """
+    return {**document, "cameras": {k: _settled(c, rig_from_cam[k]) for k, c in document["cameras"].items()}}
+
+
+def _settled(camera: Mapping[str, Any], rig_from_cam: Floats) -> dict[str, Any]:
+    given, found = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("given", "refined"))
+    if np.array_equal(found, rig_from_cam):
+        return dict(camera)
+    return {
+        **camera,
+        "refined": {**camera["refined"], "rig_from_cam": pose_from_matrix(rig_from_cam).model_dump()},
+        "difference": {**camera["difference"], **_difference(given, rig_from_cam)},
+        "since_scene": _difference(found, rig_from_cam),
+    }
+
+
+def _difference(given: Floats, refined: Floats) -> dict[str, Any]:
+    rotation = np.degrees(se3.log_so3(refined[:3, :3] @ given[:3, :3].T))
+    return {
+        "rotation_vector_deg": rotation.tolist(),
+        "rotation_deg": float(np.linalg.norm(rotation)),
+        "translation_m": (refined[:3, 3] - given[:3, 3]).tolist(),
+    }
+
+
+def verdict_in_words(refined: CameraCalibration) -> list[str]:
+    """Of the six directions of a camera: what its value rests on."""
+    return [OBSERVED if observed else ONLY_PRIOR for observed in refined.observed]
+
+
+def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
+    given = matrix_from_pose(camera.rig_from_cam)
+    names = CAMERA_MODELS[camera.model]
+    focal = [k for k, name in enumerate(names) if name in ("f", "fx", "fy")]
+    words = verdict_in_words(refined)
+    sigma = {
+        "rotation_deg": refined.sigma_rotation_deg,
+        "translation_m": refined.sigma_translation_m,
+        "focal_px": np.array(refined.sigma_focal_px),
+    }
+    return {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "param_names": list(names),
+        "given": {"rig_from_cam": camera.rig_from_cam.model_dump(), "params": list(camera.params)},
+        "refined": {
+            "rig_from_cam": pose_from_matrix(refined.rig_from_cam).model_dump(),
+            "params": refined.params.tolist(),
+        },
+        "difference": _difference(given, refined.rig_from_cam)
+        | {
+            "focal_px": float(np.mean([refined.params[k] - camera.params[k] for k in focal])),
+        },
+        "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},
+        "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()},
+        "verdict": {"rotation": words[:3], "translation": words[3:]},
+        "wrong": refined.is_wrong,
+    }

@@ -1,0 +1,86 @@
+"""`poses.json` and `poses.tum`: where the vehicle and its cameras were."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.geometry import geodesy
+from mrasfm_engine.io.trajectory_file import format_tum
+from mrasfm_engine.scene.drive import pose_from_matrix
+from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.types import Floats
+
+POSE_TIME = {
+    False: "an image's pose is at its unit's timestamp_us",
+    True: "a unit's pose is at its timestamp_us, an image's at its own: with a rolling shutter, of its middle row",
+}
+
+
+def poses_text(scene: Scene) -> str:
+    """`poses.tum`: `world_from_rig` of the registered units."""
+    kept = scene.unit_registered
+    return format_tum(scene.drive.timestamps_us[kept].tolist(), scene.world_from_rig[kept])
+
+
+def poses_document(scene: Scene) -> dict[str, Any]:
+    """`poses.json`: every unit and every image of the drive, with a pose where it is registered.
+
+    A value that does not exist (the pose of what is not registered, the geodetic position of a scene that is not
+    georeferenced, an unknown sigma) is absent, never zero or null.
+    """
+    cameras = scene.world_from_cam
+    unit_places, camera_places = _geodetic(scene, scene.world_from_rig), _geodetic(scene, cameras)
+    units = []
+    for u, frame in enumerate(scene.drive.manifest.frames):
+        registered = bool(scene.unit_registered[u])
+        unit: dict[str, Any] = {
+            "timestamp_us": frame.timestamp_us,
+            "source_frame": frame.source_frame,
+            "registered": registered,
+        }
+        if registered:
+            unit["world_from_rig"] = pose_from_matrix(scene.world_from_rig[u]).model_dump()
+            if np.isfinite(scene.sigma_position_m[u]).all():
+                unit["sigma_position_m"] = scene.sigma_position_m[u].tolist()
+            unit |= _place(unit_places, u)
+        units.append(unit)
+    images = []
+    for i, source in enumerate(scene.drive.images):
+        image: dict[str, Any] = {
+            "file": source.file,
+            "camera": scene.drive.cameras[source.camera].name,
+            "unit": source.unit,
+            "timestamp_us": source.timestamp_us,
+            "registered": bool(scene.image_registered[i]),
+        }
+        if image["registered"]:
+            image["world_from_cam"] = pose_from_matrix(cameras[i]).model_dump()
+            image |= _place(camera_places, i)
+        images.append(image)
+    return {
+        "version": 1,
+        "world": "the local frame of frame.json",
+        "pose_time": POSE_TIME[scene.unit_from_image is not None],
+        "units": units,
+        "images": images,
+    }
+
+
+def _geodetic(scene: Scene, world_from_any: Floats) -> Floats | None:
+    """Geodetic coordinates (n, 3) of the poses' origins; NaN where a pose is."""
+    if scene.georeference is None:
+        return None
+    positions = world_from_any[:, :3, 3]
+    known = np.isfinite(positions).all(axis=1)
+    places = np.full(positions.shape, np.nan)
+    places[known] = geodesy.geodetic_from_local(positions[known], scene.georeference.ecef_from_local)
+    return places
+
+
+def _place(places: Floats | None, index: int) -> dict[str, Any]:
+    if places is None:
+        return {}
+    latitude, longitude, height = places[index].tolist()
+    return {"geodetic": {"latitude_deg": latitude, "longitude_deg": longitude, "ellipsoidal_height_m": height}}

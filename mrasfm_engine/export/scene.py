@@ -1,0 +1,204 @@
+"""Writes a scene's files, checks them, and puts them in place.
+
+A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
+`poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
+scene can be aggregated without the drive), `pictures/` where any were drawn, `road.json` where the road was found, and
+`report.json`. One with a `report.json` is complete.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.export import (
+    calibration,
+    check,
+    check_colmap,
+    colmap,
+    coordinate_frame,
+    feature_database,
+    picture_files,
+    ply,
+    pose_files,
+    road,
+)
+from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
+from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.types import Floats, Ints
+
+PICTURES = "pictures"
+NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
+ROAD_FILE = "road.json"
+MANIFEST_FILE = "manifest.json"
+
+
+def write_scene(
+    scene: Scene, out: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes] = NO_PICTURES
+) -> None:
+    """Write all files of a scene into the folder `out`.
+
+    They are written into a temporary folder, read back and compared with the scene, and only then moved: an interrupted
+    or failed run leaves nothing half-written. A new folder appears at once; into an existing one the files move one by
+    one, its old `report.json` goes first and the new one comes last. Other files in it are kept.
+
+    Parameters
+    ----------
+    report
+        What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths.
+    pictures
+        PNG files of `pictures/` by name; those of an earlier scene there are removed.
+
+    Raises
+    ------
+    StorageError
+        Where the disk is full or cannot be written.
+    MrasfmError
+        Where the scene contradicts itself, or a file that was written does not read back.
+    """
+    check_scene(scene)
+    needed = _size_bytes(scene) + picture_files.size_bytes(pictures)
+    with publishing(out, needed, replaced=(PICTURES, ROAD_FILE)) as work:
+        picture_files.write_pictures(pictures, work / PICTURES)
+        _write(scene, work, report)
+
+
+def summary(scene: Scene) -> dict[str, Any]:
+    """The figures of `report.json`'s `summary`."""
+    figures: dict[str, Any] = {
+        "georeferenced": scene.georeference is not None,
+        "registered_units": int(scene.unit_registered.sum()),
+        "total_units": len(scene.unit_registered),
+        "registered_images": int(scene.image_registered.sum()),
+        "total_images": len(scene.image_registered),
+        "points": len(scene.points_m),
+        "observations": len(scene.observation_point),
+        "notes": list(scene.notes),
+    }
+    if len(scene.points_m):
+        figures["mean_track_length"] = len(scene.observation_point) / len(scene.points_m)
+        figures["mean_reprojection_error_px"] = float(scene.point_error_px.mean())
+    return figures
+
+
+def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
+    model, text = work / "model", work / "model" / "text"
+    text.mkdir(parents=True)
+    colmap.write_model(scene, model)
+    check_colmap.check_binary_model(scene, model)
+    colmap.write_text_model(model, text)
+    readable = colmap.text_model_fits(scene)
+    check_colmap.check_text_model(scene, text, through_colmap=readable)
+    figures = summary(scene)
+    if not readable:
+        shutil.rmtree(text)
+        figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
+    ply.write_ply(scene, work / "points.ply")
+    check.check_ply(scene, work / "points.ply")
+    feature_database.write_features(scene, work / "features.db")
+    check.check_features(scene, work / "features.db")
+    if scene.road is not None:
+        write_json(work / ROAD_FILE, road.road_document(scene))
+        check.check_road(scene, work / ROAD_FILE)
+    (work / "poses.tum").write_text(pose_files.poses_text(scene), encoding="utf-8")
+    write_json(work / "poses.json", pose_files.poses_document(scene))
+    write_json(work / "calibration.json", calibration.calibration_document(scene))
+    write_json(work / "frame.json", coordinate_frame.frame_document(scene))
+    manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
+    (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
+    check.check_manifest(scene, work / MANIFEST_FILE)
+    write_json(work / COMPLETE_MARK, {**report, "summary": figures})
+    check.check_documents(scene, work)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document.
+
+    Raises
+    ------
+    MrasfmError
+        Where a value has no JSON form.
+    """
+    try:
+        text = json.dumps(document, allow_nan=False, indent=1, ensure_ascii=False, default=_plain)
+    except (TypeError, ValueError) as error:
+        raise MrasfmError(
+            f"{path.name} cannot be written: {error}",
+            remedy="This is a defect of mrasfm, please report it.",
+            code="export-check-failed",
+        ) from error
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def _size_bytes(scene: Scene) -> int:
+    """About what the files take, with the database's write-ahead log."""
+    keypoints = sum(len(f.xy_px) for f in scene.features)
+    matches = sum(len(p.matches) for p in scene.pairs)
+    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 300 * len(scene.points_m) + 2_000_000
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse a scene whose arrays contradict each other before anything is written."""
+    for what, right in _consistency(scene):
+        if not right:
+            raise MrasfmError(
+                f"the scene contradicts itself: {what}",
+                remedy="This is a defect of mrasfm, please report it.",
+                code="inconsistent-scene",
+            )
+
+
+def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
+    """What must not be, and whether it is not; a later check relies on the earlier ones."""
+    images, units, points = len(scene.drive.images), len(scene.drive.manifest.frames), len(scene.points_m)
+    shapes = [
+        (scene.world_from_rig.shape, (units, 4, 4)),
+        (scene.sigma_position_m.shape, (units, 3)),
+        (scene.unit_registered.shape, (units,)),
+        (scene.image_registered.shape, (images,)),
+        (scene.point_colors.shape, (points, 3)),
+        (scene.point_error_px.shape, (points,)),
+        (scene.point_classes.shape, (points,)),
+        (scene.point_patches.shape, (points,)),
+        (len(scene.calibration), len(scene.drive.cameras)),
+    ]
+    unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)
+    sizes = np.array([len(features.xy_px) for features in scene.features], dtype=np.int64)
+    point, image, keypoint = scene.observation_point, scene.observation_image, scene.observation_keypoint
+    yield "array sizes do not fit the drive", all(actual == expected for actual, expected in shapes)
+    yield "it does not have features for every image", len(sizes) == images
+    yield "a registered unit's pose is not finite", _finite(scene.world_from_rig[scene.unit_registered])
+    yield "an image is registered without its unit", not (scene.image_registered & ~scene.unit_registered[unit]).any()
+    yield "a point is not finite", _finite(scene.points_m) and _finite(scene.point_error_px)
+    patches = 0 if scene.road is None else len(scene.road.surface)
+    yield "a point lies on no patch of the road", _inside(scene.point_patches.astype(np.int64) + 1, patches + 1)
+    yield "an observation names no point", _inside(point, points)
+    yield "observations are not sorted by point", not (np.diff(point) < 0).any()
+    yield "an observation names no image", _inside(image, images)
+    yield "an observation's image is not registered", bool(scene.image_registered[image].all())
+    yield "an observation names no keypoint", _inside(keypoint, sizes[image])
+    keys = image * (1 + sizes.max(initial=0)) + keypoint
+    yield "a keypoint observes two points", len(np.unique(keys)) == len(keys)
+
+
+def _finite(values: Floats) -> bool:
+    return bool(np.isfinite(values).all())
+
+
+def _inside(values: Ints, stop: int | Ints) -> bool:
+    return bool(((values >= 0) & (values < stop)).all())

@@ -1,0 +1,1 @@
+"""Keypoints, descriptors and semantic masks of the images of a drive."""

@@ -1,0 +1,188 @@
+"""Keypoints and descriptors of all images of a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.features.segmentation import Segmenter
+from mrasfm_engine.io.image_decoding import IncompleteImageError
+from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
+from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
+from mrasfm_engine.types import Bools, Bytes, Cancel, CountProgress
+from schemas import LabelMap
+
+DESCRIPTOR_SCALE = 512.0  # COLMAP stores unit-length descriptors times 512 in bytes
+SMALLEST_DESCRIPTOR_SUM = 1e-3
+_NOTHING = ImageFeatures(
+    xy_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 128), np.uint8), colors=np.zeros((0, 3), np.uint8)
+)
+
+
+class Extractor(Protocol):
+    """Finds keypoints in one image."""
+
+    def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
+        """Keypoints of an image (h, w, 3); where `mask` (h, w) is False nothing is extracted."""
+        ...
+
+
+class SiftExtractor:
+    """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012)."""
+
+    def __init__(self, config: FeatureConfig) -> None:
+        self._config = config
+
+    def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
+        """See `Extractor`."""
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        scale = min(1.0, self._config.max_side_px / max(gray.shape))
+        if scale < 1.0:
+            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small_mask, wanted = None, self._config.max_keypoints
+        if mask is not None:
+            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            # OpenCV masks only after it has chosen the strongest: the rest of the image must not use up the number.
+            wanted = round(wanted / max(float(small_mask.mean()), 0.05))
+        # A detector an image: OpenCV's objects must not be shared between threads. Without precise upscaling all its
+        # keypoints are 0.25 px too far right and down, which turns cameras by 0.02 deg against one another.
+        sift = cv2.SIFT.create(
+            nfeatures=wanted,
+            contrastThreshold=self._config.contrast_threshold,
+            enable_precise_upscale=True,
+        )
+        keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
+        if not keypoints:
+            return _NOTHING
+        order = np.argsort([-k.response for k in keypoints], kind="stable")[: self._config.max_keypoints]
+        # OpenCV puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
+        xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (
+            gray.shape[1] / rgb.shape[1],
+            gray.shape[0] / rgb.shape[0],
+        )
+        root = np.sqrt(
+            descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM)
+        )
+        return ImageFeatures(
+            xy_px=xy.astype(np.float32),
+            descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
+            colors=colors_at(rgb, xy),
+        )
+
+
+def colors_at(rgb: Bytes, xy_px: NDArray[Any]) -> Bytes:
+    """Colours (n, 3) of an image (h, w, 3) at keypoints (n, 2)."""
+    column = np.clip(xy_px[:, 0].astype(int), 0, rgb.shape[1] - 1)
+    row = np.clip(xy_px[:, 1].astype(int), 0, rgb.shape[0] - 1)
+    return np.ascontiguousarray(rgb[row, column])
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """OpenCV works in our threads instead of its own."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def extract_features(
+    drive: Drive,
+    extractor: Extractor,
+    *,
+    threads: int,
+    segmenter: Segmenter | None = None,
+    class_margin_px: int = 2,
+    progress: CountProgress | None = None,
+    cancel: Cancel | None = None,
+) -> list[ImageFeatures]:
+    """Features of every image of the drive, in the order of `drive.images`.
+
+    Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
+    have the class of what they show; within `class_margin_px` of another class they are unknown. Images without a mask
+    get theirs from `segmenter`, if there is one; it comes with their features.
+
+    An image whose pixels are not all there has no keypoints, and `left_out` says why: the grey that fills it up has
+    texture at its border.
+
+    Raises
+    ------
+    InputError
+        Where an image cannot be read at all or has another size than its camera.
+    CancelledError
+        Where `cancel` answers True.
+    """
+
+    def one(index: int) -> ImageFeatures | Incomplete:
+        if cancel is not None and cancel():
+            raise CancelledError
+        image = drive.images[index]
+        camera = drive.cameras[image.camera]
+        try:
+            rgb = read_image_rgb(drive.root / image.file)
+        except IncompleteImageError as problem:
+            return problem.reason
+        if rgb.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"{image.file} has {rgb.shape[1]}x{rgb.shape[0]} pixels, its camera {camera.name} "
+                f"{camera.width}x{camera.height}",
+                remedy="Give the calibration of images of this size, or images of the calibration's size.",
+            )
+        made_mask = None
+        if image.mask is not None:
+            mask = read_mask(drive.root / image.mask, drive.manifest.label_map)
+            if mask.shape != rgb.shape[:2]:
+                raise InputError(
+                    f"mask {image.mask} has {mask.shape[1]}x{mask.shape[0]} pixels, its image has "
+                    f"{rgb.shape[1]}x{rgb.shape[0]}",
+                    remedy="Give masks of their images' size, without interpolating between ids.",
+                    code="mask-size",
+                )
+        elif segmenter is not None:
+            mask = segmenter.segment(rgb)
+            made_mask = mask_png(mask)
+        else:
+            return extractor.extract(rgb, None)
+        codes = class_codes(mask, label_map)
+        found = extractor.extract(rgb, usable_pixels(codes))
+        classes = classes_at(confident_classes(codes, class_margin_px), found.xy_px)
+        return replace(found, classes=classes, made_mask=made_mask)
+
+    label_map = drive.manifest.label_map or LabelMap.cityscapes()
+    result: list[ImageFeatures | Incomplete] = []
+    with one_opencv_thread(), ThreadPoolExecutor(threads) as pool:
+        futures = [pool.submit(one, index) for index in range(len(drive.images))]
+        try:
+            for future in futures:
+                result.append(future.result())
+                if progress is not None:
+                    progress(len(result), len(futures))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return _with_left_out(result)
+
+
+def _with_left_out(found: Sequence[ImageFeatures | Incomplete]) -> list[ImageFeatures]:
+    """Features of all images: those left out have none, of the kind that the others have."""
+    kind = next((features for features in found if isinstance(features, ImageFeatures)), _NOTHING)
+    none = ImageFeatures(
+        xy_px=kind.xy_px[:0],
+        descriptors=kind.descriptors[:0],
+        colors=kind.colors[:0],
+        scores=None if kind.scores is None else kind.scores[:0],
+    )
+    return [replace(none, left_out=features) if isinstance(features, Incomplete) else features for features in found]

@@ -1,0 +1,214 @@
+"""Keypoints found by trained networks, each behind the `Extractor` interface.
+
+All coordinates become COLMAP's, where the centre of the top left pixel is at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.features.coverage import covering_order
+from mrasfm_engine.features.extraction import colors_at
+from mrasfm_engine.features.keypoint_refinement import snap_to_extrema
+from mrasfm_engine.features.tiles import Tile, cut, duplicates, lay_tiles
+from mrasfm_engine.learned.network import STRIDE_PX, Network
+from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.types import Bools, Bytes, Floats32, Ints
+
+MOST_ASKED = 65536  # keypoints of one tile
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What a network finds in one image or tile."""
+
+    xy_px: Floats32  # (n, 2), top left pixel's centre at (0.5, 0.5)
+    descriptors: Floats32  # (n, D)
+    scores: Floats32  # (n,)
+
+    def __getitem__(self, chosen: Bools | Ints) -> Detections:
+        return Detections(self.xy_px[chosen], self.descriptors[chosen], self.scores[chosen])
+
+
+class Detector(Protocol):
+    """One network: how its tensors become detections."""
+
+    network: Network
+    image: str  # its input for the image
+    is_refined: bool  # whether its keypoints are moved to the detail that they mean
+    takes_number: bool  # whether `wanted` has a meaning
+
+    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
+        """Detections in an image (h, w, 3) of a size that the network takes.
+
+        `wanted` and `min_score` are hints: not all networks can be told.
+        """
+        ...
+
+
+class LearnedExtractor:
+    """An `Extractor` around a network, which is given the whole image or, if its size is fixed, tiles of it."""
+
+    def __init__(self, detector: Detector, config: FeatureConfig) -> None:
+        self._detector = detector
+        self._config = config
+        self._fixed_size = detector.network.fixed_size(detector.image)
+
+    def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
+        """See `Extractor`."""
+        pixels = self._scaled(rgb)
+        size = pixels.shape[0], pixels.shape[1]
+        window = self._fixed_size or (_up(size[0]), _up(size[1]))
+        stretch = np.array([rgb.shape[1] / size[1], rgb.shape[0] / size[0]])
+
+        def usable(xy: Floats32) -> Bools:
+            if mask is None:
+                return np.ones(len(xy), dtype=np.bool_)
+            at = (xy * stretch).astype(int)
+            inside: Bools = mask[np.clip(at[:, 1], 0, mask.shape[0] - 1), np.clip(at[:, 0], 0, mask.shape[1] - 1)]
+            return inside
+
+        tiles = lay_tiles(size, window)
+        parts = [self._detect(cut(pixels, tile, window), tile, usable) for tile in tiles]
+        number = np.repeat(np.arange(len(parts)), [len(part.xy_px) for part in parts])
+        found = Detections(
+            *(np.concatenate([getattr(p, f) for p in parts]) for f in ("xy_px", "descriptors", "scores"))
+        )
+        found = found[~duplicates(found.xy_px, found.scores, number)]
+        found = found[np.argsort(-found.scores, kind="stable")]
+        if self._detector.is_refined and self._config.refine:
+            xy, there = snap_to_extrema(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), found.xy_px)
+            found = Detections(xy, found.descriptors, found.scores)[there & usable(xy)]
+        if self._config.spread:
+            found = found[covering_order(found.xy_px)]
+        found = found[np.arange(len(found.xy_px)) < self._config.max_keypoints]
+        xy = found.xy_px * stretch
+        return ImageFeatures(
+            xy_px=xy.astype(np.float32),
+            descriptors=np.ascontiguousarray(found.descriptors, dtype=np.float32),
+            colors=colors_at(rgb, xy),
+            scores=np.ascontiguousarray(found.scores, dtype=np.float32),
+        )
+
+    def _scaled(self, rgb: Bytes) -> Bytes:
+        scale = self._config.max_side_px / max(rgb.shape[:2])
+        if scale >= 1.0:
+            return rgb
+        return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def _detect(self, pixels: Bytes, tile: Tile, usable: Callable[[Floats32], Bools]) -> Detections:
+        """What of a tile's detections counts: in its core, not masked, not too weak; in pixels of the scaled image."""
+        wanted = self._config.max_keypoints
+        while True:
+            found = self._detector.detect(pixels, wanted, self._config.min_score)
+            self._check(found)
+            xy = found.xy_px + np.array([tile.column, tile.row], np.float32)
+            keep = tile.owns(xy) & usable(xy)
+            if self._config.min_score is not None:
+                keep &= found.scores >= self._config.min_score
+            cut_off = self._detector.takes_number and len(xy) >= wanted
+            # Masked areas and mirrored margins must not use up the number.
+            if keep.sum() >= self._config.max_keypoints or not cut_off or wanted >= MOST_ASKED:
+                return Detections(xy, found.descriptors, found.scores)[keep]
+            wanted *= 4
+
+    def _check(self, found: Detections) -> None:
+        count = len(found.xy_px)
+        shapes = [list(array.shape) for array in (found.xy_px, found.descriptors, found.scores)]
+        fits = found.descriptors.ndim == 2 and [shapes[0], shapes[1][:1], shapes[2]] == [[count, 2], [count], [count]]
+        if not fits or not np.isfinite(found.xy_px).all():
+            raise InputError(
+                f"model {self._detector.network.name} gives keypoints {shapes[0]}, descriptors {shapes[1]} and scores "
+                f"{shapes[2]}, or places that are no numbers",
+                remedy="Export it with one descriptor and one score a keypoint.",
+                code="bad-model",
+            )
+
+
+def _up(size: int) -> int:
+    return -(-size // STRIDE_PX) * STRIDE_PX
+
+
+def _planes(pixels: Bytes) -> Floats32:
+    """An image (h, w, 3) as (1, 3, h, w), 0 to 1."""
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], dtype=np.float32) / np.float32(255)
+
+
+class XFeatDetector:
+    """XFeat (Potje et al., CVPR 2024), exported with its own resampling to multiples of 32.
+
+    Its keypoints are whole pixels of the shrunk image, and refined: see `keypoint_refinement`.
+    """
+
+    image = "images"
+    takes_number = False
+    is_refined = True
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
+        """See `Detector`; number and least score are part of the exported network."""
+        found = self.network.run({"images": _planes(pixels)})
+        # The network shrinks the image to multiples of 32, takes whole pixels there, counted from 0, and multiplies
+        # them by the shrinkage.
+        rows, columns = pixels.shape[:2]
+        shrinkage = np.array([columns / _down(columns), rows / _down(rows)], np.float32)
+        half = np.float32(0.5) * shrinkage
+        return Detections(found["keypoints"] + half, found["descriptors"], found["scores"])
+
+
+def _down(size: int) -> int:
+    return size // STRIDE_PX * STRIDE_PX
+
+
+class AlikedDetector:
+    """ALIKED (Zhao et al., TIM 2023) as COLMAP publishes it."""
+
+    image = "image"
+    takes_number = True
+    is_refined = False
+    usual_min_score = 0.2  # COLMAP's
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
+        """See `Detector`."""
+        found = self.network.run(
+            {
+                "image": _planes(pixels),
+                "max_keypoints": np.array(wanted, np.int64),
+                "min_score": np.array(self.usual_min_score if min_score is None else min_score, np.float32),
+            }
+        )
+        # -1 and 1 are the centres of the first and last pixel.
+        rows, columns = pixels.shape[:2]
+        half_range = 0.5 * np.array([columns - 1, rows - 1], np.float32)
+        xy = (found["keypoints"][0] + np.float32(1)) * half_range + np.float32(0.5)
+        return Detections(xy, found["descriptors"][0], found["scores"][0])
+
+
+class SuperPointDetector:
+    """SuperPoint (DeTone et al., CVPRW 2018) as exported for LightGlue."""
+
+    image = "image"
+    takes_number = False
+    is_refined = False
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
+        """See `Detector`; number and least score are part of the exported network."""
+        gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        found = self.network.run({"image": gray[None, None].astype(np.float32) / np.float32(255)})
+        xy = found["keypoints"][0].astype(np.float32) + np.float32(0.5)
+        return Detections(xy, found["descriptors"][0], found["scores"][0])

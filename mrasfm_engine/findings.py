@@ -1,0 +1,63 @@
+"""Findings: results of checks, with severity, place and remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Severity(StrEnum):
+    """Severity of a finding: an error stops the reconstruction."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One defect of a drive, or one thing about it that a user should know.
+
+    Attributes
+    ----------
+    code
+        Stable identifier in lower case with dashes.
+    what
+        One sentence that names the file or field.
+    remedy
+        One sentence that says what to do.
+    """
+
+    severity: Severity
+    code: str
+    what: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.what}\n  {self.remedy}"
+
+
+def as_json(finding: Finding) -> dict[str, str]:
+    """A finding as it stands in a report."""
+    return {
+        "severity": str(finding.severity),
+        "code": finding.code,
+        "what": finding.what,
+        "remedy": finding.remedy,
+    }
+
+
+def error(code: str, what: str, remedy: str) -> Finding:
+    """A finding that stops the reconstruction."""
+    return Finding(severity=Severity.ERROR, code=code, what=what, remedy=remedy)
+
+
+def warning(code: str, what: str, remedy: str) -> Finding:
+    """A finding that does not."""
+    return Finding(severity=Severity.WARNING, code=code, what=what, remedy=remedy)
+
+
+def listed(names: Sequence[object], shown: int = 3) -> str:
+    """Names joined by commas; of many, the first few and how many more there are."""
+    head = ", ".join(str(name) for name in names[:shown])
+    return head if len(names) <= shown else f"{head} and {len(names) - shown} more"

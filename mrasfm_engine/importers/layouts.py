@@ -1,0 +1,137 @@
+"""Recognises the layout of a recording and imports it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.importers import kitti, nuscenes, rig_folder
+from mrasfm_engine.importers.drive_writer import ImportSummary, write_recording
+from mrasfm_engine.importers.recording import Recording, SourceUnit, select_cameras, select_units
+from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
+from mrasfm_engine.io.axes import flu_from_body
+from schemas import Gnss, GnssSample
+from schemas.drive import MAX_RIG_EXTENT_M
+
+LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, nuscenes)
+
+# GNSS samples this long before the first and after the last image are kept: they smooth the ends of the track.
+GNSS_MARGIN_US = 2_000_000
+
+
+def import_recording(
+    folder: Path,
+    out: Path,
+    *,
+    frames: str | None = None,
+    cameras: Sequence[str] | None = None,
+    gnss_file: Path | None = None,
+    scene: str | None = None,
+    copy: bool = False,
+    force: bool = False,
+) -> ImportSummary:
+    """Turn a recording in a known layout into a drive bundle.
+
+    Parameters
+    ----------
+    folder
+        The recording.
+    out
+        Where the drive goes.
+    frames
+        A slice START:STOP:STEP over the recording's frames in order of time.
+    cameras
+        Names of those that are wanted; all by default.
+    gnss_file
+        GNSS table to use instead of the recording's own; a relative path is looked up in `folder`, then in the working
+        directory.
+    scene
+        Name of the scene, for layouts that hold several.
+    copy, force
+        See `write_recording`.
+
+    Raises
+    ------
+    InputError
+        If the layout is not known or something in it is missing or malformed.
+    StorageError
+        If the drive cannot be written.
+    """
+    folder, out = Path(folder), Path(out)
+    if not folder.is_dir():
+        state = "is not a folder" if folder.exists() else "does not exist"
+        raise InputError(f"recording {folder} {state}", remedy="Check the path.", code="missing-folder")
+    if folder.resolve() == out.resolve() or out.resolve() in folder.resolve().parents:
+        raise InputError(
+            f"the drive {out} would replace the recording {folder}", remedy="Give another folder.", code="output-in-use"
+        )
+    recording = select_units(select_cameras(_read(folder, scene), cameras), frames)
+    return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
+
+
+def _read(folder: Path, scene: str | None) -> Recording:
+    for layout in LAYOUTS:
+        if not layout.recognises(folder):
+            continue
+        if layout is nuscenes:
+            return nuscenes.read(folder, scene)
+        if scene is not None:
+            raise InputError(f"recording {folder} has only one scene", remedy="Leave --scene out.", code="no-scenes")
+        recording: Recording = layout.read(folder)
+        return recording
+    looked_for = "; ".join(layout.DESCRIPTION for layout in LAYOUTS)
+    raise InputError(
+        f"the layout of {folder} is not known. Looked for: {looked_for}",
+        remedy="Give the folder that holds these files, or write a drive.json as `mrasfm describe manifest` explains.",
+        code="unknown-layout",
+    )
+
+
+def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Recording:
+    file = recording.default_gnss if gnss_file is None else _find(gnss_file, folder)
+    if file is None:
+        return recording
+    antenna_file = file.parent / ANTENNA_FILE
+    if not antenna_file.exists():
+        antenna_file = folder / ANTENNA_FILE
+    antenna = flu_from_body(recording.body_axes)[:3, :3] @ read_antenna(antenna_file)
+    if np.abs(antenna).max() > MAX_RIG_EXTENT_M:
+        raise InputError(
+            f"antenna position {antenna_file} is over {MAX_RIG_EXTENT_M:g} m from the vehicle's origin",
+            remedy="Give metres in the body axes of the calibration.",
+        )
+    samples = samples_around(read_gnss_csv(file), recording.units)
+    gnss = Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[float(v) for v in antenna], samples=samples)
+    return replace(recording, gnss=gnss)
+
+
+def _find(gnss_file: Path, folder: Path) -> Path:
+    candidates = [folder / gnss_file, gnss_file]  # joining an absolute path gives that path
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    tried = " and ".join(dict.fromkeys(str(c.absolute()) for c in candidates))
+    raise InputError(f"GNSS file {gnss_file} was not found: tried {tried}", remedy="Check the path.")
+
+
+def samples_around(samples: list[GnssSample], units: list[SourceUnit]) -> list[GnssSample]:
+    """The samples that matter to the units, in the order of the file.
+
+    Those within `GNSS_MARGIN_US` of the units' time span, and the nearest beyond each end, so that positions at the
+    first and last image can be interpolated. If none is near, all are kept: the mismatch is then seen when the drive
+    is checked.
+    """
+    times = np.array([sample.timestamp_us for sample in samples], dtype=np.int64)
+    start, end = units[0].timestamp_us, units[-1].timestamp_us
+    before, after = times[times <= start], times[times >= end]
+    lower = min(start - GNSS_MARGIN_US, int(before.max()) if len(before) else start)
+    upper = max(end + GNSS_MARGIN_US, int(after.min()) if len(after) else end)
+    inside = (times >= lower) & (times <= upper)
+    if not ((times >= start - GNSS_MARGIN_US) & (times <= end + GNSS_MARGIN_US)).any():
+        return samples
+    return [sample for sample, keep in zip(samples, inside, strict=True) if keep]

@@ -1,0 +1,176 @@
+"""What every importer produces: a recording in the engine's axes, before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.axes import flu_from_body
+from mrasfm_engine.types import Floats
+from schemas import BodyAxes, Camera, Gnss, LabelMap
+
+# Calibrations made with OpenCV's tools put the origin at the centre of the top left pixel; manifests, as COLMAP, at its
+# corner. The principal point moves by this, focal length and distortion are the same in both.
+PIXEL_CENTER_PX = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceImage:
+    """One image where the recording has it."""
+
+    file: Path
+    timestamp_us: int | None = None  # None: taken with its unit
+    mask: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceUnit:
+    """All images of one instant."""
+
+    source_frame: int
+    timestamp_us: int
+    images: dict[str, SourceImage]  # by camera name
+    world_from_rig: Floats | None = None  # the truth, where the recording has it
+    rough_world_from_rig: Floats | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A recording with all rotations in the engine's axes: x forward, y left, z up."""
+
+    layout: str
+    name: str
+    cameras: list[Camera]
+    units: list[SourceUnit]  # in order of time
+    body_axes: BodyAxes = BodyAxes.FLU  # of files that belong to the recording, as the antenna's position
+    default_gnss: Path | None = None
+    gnss: Gnss | None = None
+    label_map: LabelMap | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def parse_slice(text: str) -> slice:
+    """A Python slice from START:STOP:STEP, of which every part may be empty and the first two negative.
+
+    Raises
+    ------
+    InputError
+        If the text is no slice or its step is not positive.
+    """
+    remedy = "Give START:STOP or START:STOP:STEP as in Python, such as 0:35:2 or :100; STOP is not included."
+    parts = text.split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+    except ValueError:
+        numbers = []
+    if not 2 <= len(numbers) <= 3:
+        raise InputError(f"--frames {text!r} is not a slice", remedy=remedy, code="bad-slice")
+    if len(numbers) == 3 and numbers[2] is not None and numbers[2] <= 0:
+        raise InputError(f"--frames {text!r} has a step of {numbers[2]}: drives run forward", remedy=remedy)
+    return slice(*numbers)
+
+
+def select_units(recording: Recording, frames: str | None) -> Recording:
+    """The recording with only the units that the slice `frames` selects, which keep their numbers and times.
+
+    Raises
+    ------
+    InputError
+        If the slice is malformed or selects nothing.
+    """
+    if frames is None:
+        return recording
+    units = recording.units[parse_slice(frames)]
+    if not units:
+        raise InputError(
+            f"--frames {frames!r} selects none of the {len(recording.units)} frames",
+            remedy=f"Select among 0:{len(recording.units)}.",
+            code="empty-selection",
+        )
+    return replace(recording, units=units)
+
+
+def select_cameras(recording: Recording, names: Sequence[str] | None) -> Recording:
+    """The recording with only the named cameras, in its own order.
+
+    Raises
+    ------
+    InputError
+        If it has no camera of such a name.
+    """
+    if names is None:
+        return recording
+    known = [camera.name for camera in recording.cameras]
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(
+            f"the recording has no camera {', '.join(unknown)}",
+            remedy=f"Choose among {', '.join(known)}.",
+            code="unknown-camera",
+        )
+    units = [
+        replace(unit, images={name: image for name, image in unit.images.items() if name in names})
+        for unit in recording.units
+    ]
+    return replace(
+        recording,
+        cameras=[camera for camera in recording.cameras if camera.name in names],
+        units=[unit for unit in units if unit.images],
+    )
+
+
+def flu_world(world_from_rig: Floats) -> Floats | None:
+    """The rotation (4, 4) that turns the world of vehicle poses so that its z axis points up.
+
+    Datasets give poses in a world with z up, with z down, or (KITTI) in the axes of the first camera, y down. Which of
+    these holds shows in where the vehicle's own z axis points on average.
+
+    Parameters
+    ----------
+    world_from_rig
+        Poses (n, 4, 4) of a rig with z up.
+
+    Returns
+    -------
+    NDArray or None
+        `upright_from_world`, or None if no axis of the world is within 30 degrees of the vehicle's up.
+    """
+    up = np.asarray(world_from_rig)[:, :3, 2].mean(0)
+    norm = float(np.linalg.norm(up))
+    if norm < 0.5:
+        return None
+    for axes in (BodyAxes.FLU, BodyAxes.RDF, BodyAxes.FRD):
+        rotation = flu_from_body(axes)
+        if (rotation[:3, :3] @ up)[2] / norm > np.cos(np.radians(30)):
+            return rotation
+    return None
+
+
+def proper_transform(matrix: Floats, *, what: str) -> Floats:
+    """A rigid transform (4, 4) from a matrix whose rotation is one up to rounding.
+
+    Parameters
+    ----------
+    matrix
+        (3, 4) or (4, 4).
+    what
+        What it is and where it stands, for messages.
+
+    Raises
+    ------
+    InputError
+        If it is not finite or its rotation is not orthonormal within 1e-3 or mirrors.
+    """
+    remedy = "Give a rotation matrix and a translation in metres."
+    r = matrix[:3, :3]
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{what} holds a value that is not finite", remedy=remedy, code="bad-transform")
+    if abs(r @ r.T - np.eye(3)).max() > 1e-3:
+        raise InputError(f"{what} is not a rigid transform: its rotation is not orthonormal", remedy=remedy)
+    if np.linalg.det(r) < 0:
+        raise InputError(f"{what} mirrors: its rotation has determinant -1", remedy=remedy, code="bad-transform")
+    return se3.transform(se3.rotation_from_quaternion(se3.quaternion_from_rotation(r)), matrix[:3, 3])

@@ -1,0 +1,232 @@
+"""Imports a folder with `rig.json`, a folder of numbered images per camera, and tables of poses and times."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.importers.recording import (
+    PIXEL_CENTER_PX,
+    Recording,
+    SourceImage,
+    SourceUnit,
+    flu_world,
+    proper_transform,
+)
+from mrasfm_engine.importers.tables import read_poses, read_times
+from mrasfm_engine.io.axes import flu_from_body
+from mrasfm_engine.io.documents import read_document
+from mrasfm_engine.scene.drive import pose_from_matrix
+from mrasfm_engine.types import Floats
+from schemas import BodyAxes, Camera, LabelMap
+from schemas.drive import MAX_CAMERAS, Finite, Name
+
+DESCRIPTION = "rig.json and a folder of numbered images for every camera"
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+DEFAULT_FRAME_INTERVAL_US = 100_000  # where times.txt is missing
+
+_Row3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+_Row4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
+
+
+class _RigCamera(BaseModel):
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    model: str = "PINHOLE"
+    width: int
+    height: int
+    K: Annotated[list[_Row3], Field(min_length=3, max_length=3)] | None = None
+    params: list[Finite] | None = None
+    T_body_cam: Annotated[list[_Row4], Field(min_length=3, max_length=4)]
+
+    @model_validator(mode="after")
+    def _one_way(self) -> _RigCamera:
+        if self.params is None and (self.K is None or self.model != "PINHOLE"):
+            raise ValueError(f"camera model {self.model} needs 'params' (PINHOLE: 'K' or 'params')")
+        if self.params is not None and self.K is not None:
+            raise ValueError("give 'K' or 'params', not both")
+        return self
+
+
+class _RigFile(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    body_axes: BodyAxes
+    cameras: Annotated[dict[Name, _RigCamera], Field(min_length=1, max_length=MAX_CAMERAS)]
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (folder / "rig.json").is_file()
+
+
+def read(folder: Path) -> Recording:
+    """Read the recording; images are not opened.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or malformed.
+    """
+    rig_file = folder / "rig.json"
+    rig = read_document(rig_file, _RigFile, what="calibration")
+    flu_body = flu_from_body(rig.body_axes)
+    cameras = [_camera(name, camera, flu_body, rig_file) for name, camera in rig.cameras.items()]
+    images = {name: numbered_images(folder / name) for name in rig.cameras}
+    masks = {name: _masks(folder / "semantics" / name) for name in rig.cameras}
+    frames = sorted({frame for files in images.values() for frame in files})
+    if not frames:
+        raise InputError(
+            f"recording {folder} has no images in {', '.join(rig.cameras)}",
+            remedy="Give a folder of images named by frame number, as 000000.png, for every camera of rig.json.",
+            code="no-images",
+        )
+    times_us = frame_times(folder, frames)
+    truth = read_upright_poses(folder / "poses.txt", frames, flu_body, required_up=False)
+    rough = read_upright_poses(folder / "rough_poses.txt", frames, flu_body, required_up=True)
+    units = [
+        SourceUnit(
+            source_frame=frame,
+            timestamp_us=times_us[i],
+            images={
+                name: SourceImage(file=files[frame], mask=masks[name].get(frame))
+                for name, files in images.items()
+                if frame in files
+            },
+            world_from_rig=None if truth is None else truth[i],
+            rough_world_from_rig=None if rough is None else rough[i],
+        )
+        for i, frame in enumerate(frames)
+    ]
+    gnss = folder / "gnss.csv"
+    return Recording(
+        layout="rig folder",
+        name=folder.resolve().name,
+        cameras=cameras,
+        units=units,
+        body_axes=rig.body_axes,
+        default_gnss=gnss if gnss.exists() else None,
+        label_map=LabelMap.cityscapes() if any(masks.values()) else None,
+    )
+
+
+def _camera(name: str, camera: _RigCamera, flu_body: Floats, rig_file: Path) -> Camera:
+    body_cam = proper_transform(np.array(camera.T_body_cam), what=f"{rig_file}: cameras.{name}.T_body_cam")
+    if camera.params is not None:  # COLMAP's parameters in COLMAP's convention
+        params = camera.params
+    else:
+        k = np.array(camera.K)
+        params = [float(v) for v in (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER_PX, k[1, 2] + PIXEL_CENTER_PX)]
+    return checked_camera(
+        name,
+        model=camera.model,
+        size=(camera.width, camera.height),
+        params=params,
+        rig_from_cam=flu_body @ body_cam,
+        source=f"{rig_file}: cameras.{name}",
+    )
+
+
+def checked_camera(
+    name: str, *, model: str, size: tuple[int, int], params: list[float], rig_from_cam: Floats, source: str
+) -> Camera:
+    """A manifest's camera, whose errors name where the calibration comes from.
+
+    Parameters
+    ----------
+    size
+        Width and height in pixels.
+    params
+        In COLMAP's order and convention.
+
+    Raises
+    ------
+    InputError
+        If the calibration is not plausible.
+    """
+    try:
+        return Camera(
+            name=name,
+            model=model,
+            width=size[0],
+            height=size[1],
+            params=params,
+            rig_from_cam=pose_from_matrix(rig_from_cam),
+        )
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in first["loc"])
+        what = str(first["msg"]).removeprefix("Value error, ")
+        raise InputError(
+            f"{source}: {field}: {what}", remedy="Correct the calibration.", code="bad-calibration"
+        ) from None
+
+
+def numbered_images(folder: Path) -> dict[int, Path]:
+    """Images of a folder by their frame number.
+
+    Raises
+    ------
+    InputError
+        If the folder is missing, or an image in it is not named by a number, or two have the same.
+    """
+    if not folder.is_dir():
+        raise InputError(f"camera folder {folder} does not exist", remedy="Give every camera's images, or take the "
+                         "camera out of the calibration.", code="missing-folder")  # fmt: skip
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
+            continue
+        if not re.fullmatch(r"[0-9]{1,9}", file.stem):
+            raise InputError(
+                f"image {file} is not named by its frame number", remedy="Name images as 000000.png.", code="bad-name"
+            )
+        frame = int(file.stem)
+        if frame in found:
+            raise InputError(
+                f"images {found[frame]} and {file} are both of frame {frame}",
+                remedy="Keep one of them.",
+                code="bad-name",
+            )
+        found[frame] = file
+    return found
+
+
+def _masks(folder: Path) -> dict[int, Path]:
+    return numbered_images(folder) if folder.is_dir() else {}
+
+
+def frame_times(folder: Path, frames: list[int]) -> list[int]:
+    """Microseconds of the frames from `times.txt`, or 10 Hz from frame 0 on where there is none."""
+    if (folder / "times.txt").exists():
+        return read_times(folder / "times.txt", frames=frames)
+    return [frame * DEFAULT_FRAME_INTERVAL_US for frame in frames]
+
+
+def read_upright_poses(path: Path, frames: list[int], flu_body: Floats, *, required_up: bool) -> Floats | None:
+    """`world_from_rig` (frames, 4, 4) in a world with z up, from `world_from_body`; None if the file is missing.
+
+    Raises
+    ------
+    InputError
+        If the file is malformed, or with `required_up`, if no axis of its world points up.
+    """
+    if not path.exists():
+        return None
+    world_from_rig: Floats = read_poses(path, what="poses", frames=frames) @ flu_body.T
+    upright = flu_world(world_from_rig)
+    if upright is None:
+        if required_up:
+            raise InputError(
+                f"poses {path}: no axis of their world points up along the vehicle's",
+                remedy="Give poses in a gravity aligned world, and the right body_axes in the calibration.",
+                code="world-not-upright",
+            )
+        return world_from_rig
+    result: Floats = upright @ world_from_rig
+    return result

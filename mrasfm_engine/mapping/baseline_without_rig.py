@@ -1,0 +1,74 @@
+"""Registration of images one by one, as without a camera set: for comparison (`camera_set_registration = false`).
+
+Every image has its pose by its own PnP. The unit's pose is that of its best supported image; images that agree with it
+belong to the set, one with another pose keeps that, and one whose PnP fails is missing. Everything else is as ever.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.per_camera_pnp import Vote, agree
+from mrasfm_engine.mapping.unit_registration import Registration, camera_votes, failed, points_seen
+from mrasfm_engine.types import Floats
+
+
+def register_images_singly(model: Model, unit: int) -> Registration:
+    """Find the pose of a unit from that of its best image, and the poses of its other images."""
+    seen = points_seen(model, unit)
+    votes = camera_votes(model, seen)
+    if not votes:
+        return failed(unit, seen, 0, "no image of it could be registered alone")
+    best = max(votes, key=lambda vote: vote.inliers)
+    own = _own_poses(votes, best.world_from_rig)
+    voters = {vote.camera for vote in votes}
+    return Registration(
+        unit=unit,
+        world_from_rig=best.world_from_rig,
+        correspondences=len(seen.camera),
+        inliers=sum(vote.inliers for vote in votes),
+        method="single images",
+        voted_out=tuple(model.drive.cameras[c].name for c in own),
+        own_poses=own,
+        missing=tuple(int(c) for i, c in _images_of(model, unit) if c not in voters),
+    )
+
+
+def take_over(model: Model, registration: Registration) -> None:
+    """Give the images of a registered unit the poses that are not the unit's."""
+    for image, camera in _images_of(model, registration.unit):
+        if camera in registration.own_poses:
+            model.set_image_pose(image, registration.own_poses[camera])
+        if camera in registration.missing:
+            model.missing[image] = True
+
+
+def retry_missing(model: Model) -> None:
+    """Try images that are missing once more, now that the scene has more points."""
+    for unit in np.unique(model.image_unit[model.missing]):
+        images = {camera: image for image, camera in _images_of(model, int(unit)) if model.missing[image]}
+        votes = [vote for vote in camera_votes(model, points_seen(model, int(unit))) if vote.camera in images]
+        own = _own_poses(votes, model.state.world_from_rig[unit])
+        for vote in votes:
+            model.missing[images[vote.camera]] = False
+            if vote.camera in own:
+                model.set_image_pose(images[vote.camera], own[vote.camera])
+        if votes:
+            model.extend(int(unit))
+
+
+def _own_poses(votes: list[Vote], world_from_rig: Floats) -> dict[int, Floats]:
+    """Poses relative to the unit's of the cameras that voted for another one."""
+    if not votes:
+        return {}
+    poses = np.stack([vote.world_from_rig for vote in votes])
+    relative = se3.inverse(world_from_rig) @ poses
+    same = agree(poses, world_from_rig)
+    return {vote.camera: relative[k] for k, vote in enumerate(votes) if not same[k]}
+
+
+def _images_of(model: Model, unit: int) -> list[tuple[int, int]]:
+    """Images of a unit and their cameras."""
+    return [(int(i), int(model.image_camera[i])) for i in np.flatnonzero(model.image_unit == unit)]

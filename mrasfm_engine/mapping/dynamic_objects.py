@@ -1,0 +1,193 @@
+"""Things that move along with the vehicle: a lorry in the next lane, the own bonnet, a car that is followed.
+
+They hardly move in the image, so they match best of all, and nothing in a pair of images contradicts them: what stands
+still in an image looks like something very far away, and in a curve like something at the curve's centre. The poses
+that the other cameras give tell the difference. A ray that points below the horizon meets the ground after some metres;
+what it shows must therefore move by so much between two units, and what moves by less is no part of the world.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.parallel import mapped
+from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.types import Bools, Floats, Ints
+
+NEAREST_M = 1.0  # nearer things than this are not expected
+FARTHEST_M = 1000.0
+MAX_CAMERA_HEIGHT_M = 4.0  # of any camera above the ground
+MAX_GRADE = 0.1  # by which the ground may fall away from the vehicle
+MIN_DEPTH_M = 1e-3
+DEPTHS = 24  # tried between nearest and farthest, evenly in inverse depth
+MIN_FLOW_PX = 6.0  # what the world must move by before standing still means something
+STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
+STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the world
+MIN_KEYPOINTS = 30  # that move along, before an image is called covered
+TELLING_SHARE = 0.5  # of the keypoints that tell, in a covered image
+COVERED_SHARE = 0.75  # of all matched ones
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingAlong:
+    """Which keypoints move along with the vehicle, and which images they cover."""
+
+    keypoint: Bools  # (keypoints,) no part of the world; set only where images are covered
+    share: Floats  # (images,) of an image's matched keypoints that do not move as the world does
+    covered: Bools  # (images,)
+
+    @property
+    def any(self) -> bool:
+        """Whether an image is covered."""
+        return bool(self.covered.any())
+
+
+def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong:
+    """Keypoints and images that contradict the motion of their units, from matches of one camera at two instants.
+
+    Parameters
+    ----------
+    model
+        With poses; units without one take no part. Where the vehicle hardly moves nothing is said.
+    pairs
+        Verified matches.
+    """
+    keypoints, images = model.keypoints, len(model.drive.images)
+    along = np.zeros(len(keypoints.image), dtype=np.int64)  # matches for and against
+    seen, moves = np.zeros((2, len(keypoints.image)), dtype=np.bool_)
+    for a, b, least_px, moved_px in _flows(model, pairs):
+        _vote(a, b, least_px, moved_px, along, seen, moves)
+    # What stands still may be far away where no ground tells: above the horizon of a straight street. It counts with
+    # what moves along only where most of the keypoints that do tell are such.
+    with_it, still = along > 0, seen & (along == 0) & ~moves
+    count, counter, total, quiet = (
+        np.bincount(keypoints.image[which], minlength=images) for which in (with_it, along < 0, seen, still)
+    )
+    share = (count + quiet) / np.maximum(total, 1)
+    covered = (count >= MIN_KEYPOINTS) & (count >= TELLING_SHARE * (count + counter)) & (share >= COVERED_SHARE)
+    no_world = (with_it | (covered[keypoints.image] & still)) if covered.any() else np.zeros_like(with_it)
+    return MovingAlong(keypoint=no_world, share=share, covered=covered)
+
+
+def units_to_doubt(model: Model, moving: MovingAlong, known: Bools) -> Ints:
+    """Units whose pose has to be found anew, as covered images may have outvoted the others.
+
+    Not those from whose covered images most of what moves along had been taken out before: `known` (keypoints,).
+    """
+    image, units = model.keypoints.image, len(model.registered)
+    missed = np.bincount(image[moving.keypoint & ~known], minlength=len(moving.covered))
+    found = np.bincount(image[moving.keypoint & known], minlength=len(moving.covered))
+    misled = moving.covered & (missed > found)
+    doubt = model.registered & (np.bincount(model.image_unit[misled], minlength=units) > 0)
+    # A scene of two units is the least to register others against.
+    return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
+
+
+def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools) -> list[PairMatches]:
+    """The pairs without the matches of some keypoints, and without pairs of which nothing is left.
+
+    `first` (images + 1,) is as in `Keypoints`.
+    """
+    result = []
+    for pair in pairs:
+        gone = removed[first[pair.image_a] + pair.matches[:, 0]] | removed[first[pair.image_b] + pair.matches[:, 1]]
+        left = pair.inliers & ~gone
+        if left.any():
+            result.append(replace(pair, inliers=left) if gone.any() else pair)
+    return result
+
+
+def _flows(model: Model, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
+    """Of every pair of one camera's images: keypoints of both, and by how much each must and does move, pixels."""
+    posed = model.registered[model.image_unit] & ~model.missing
+    world_from_cam = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
+    world_from_cam = world_from_cam @ model.state.rig_from_cam[model.image_camera]
+
+    def tells(pair: PairMatches) -> bool:
+        a, b = pair.image_a, pair.image_b
+        along = model.image_unit[a] != model.image_unit[b] and model.image_camera[a] == model.image_camera[b]
+        return bool(along and posed[a] and posed[b])
+
+    def flow(pair: PairMatches) -> tuple[Ints, Ints, Floats, Floats]:
+        keypoints, camera = model.keypoints, int(model.image_camera[pair.image_a])
+        a, b = model.matched_keypoints(pair, int(model.image_unit[pair.image_a]))
+        xy_px = keypoints.xy_px.take(a, axis=0)
+        least_px = _least_flow_px(
+            keypoints.rays.take(a, axis=0),
+            xy_px,
+            se3.inverse(world_from_cam[pair.image_b]) @ world_from_cam[pair.image_a],
+            up=model.state.rig_from_cam[camera, 2, :3],
+            kind=int(model.camera_kind[camera]),
+            params=model.state.camera_params[camera],
+        )
+        return a, b, least_px, np.hypot(*(keypoints.xy_px.take(b, axis=0) - xy_px).T)
+
+    yield from mapped(model.config.threads, flow, [pair for pair in pairs if tells(pair)])
+
+
+@njit(cache=True, nogil=True)
+def _vote(a: Any, b: Any, least_px: Any, moved_px: Any, along: Any, seen: Any, moves: Any) -> None:
+    """Count a pair's matches of keypoints a and b (n,) for and against moving along, for both."""
+    for n in range(len(a)):
+        vote = 0
+        if least_px[n] > MIN_FLOW_PX:
+            vote = 1 if moved_px[n] < STILL_SHARE * least_px[n] else -1
+        for k in (a[n], b[n]):
+            along[k] += vote
+            seen[k] = True
+            if moved_px[n] > STILL_PX:
+                moves[k] = True
+
+
+def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats, kind: int, params: Floats) -> Floats:
+    """By how much points (n,) of a standing world move at least from image a to image b, at whatever depth they are.
+
+    `up` (3,) is the rig's up direction in camera axes: it bounds the depth of rays that point down. Infinite where a
+    point of the world could not be in front of camera b.
+    """
+    falling = -(rays @ up) - MAX_GRADE
+    deepest = np.where(
+        falling * FARTHEST_M > MAX_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_M / np.maximum(falling, 1e-9), FARTHEST_M
+    )
+    turned = rays @ b_from_a[:3, :3].T
+    result = np.empty(len(rays))
+    _distances_to_paths(kind, params, turned, b_from_a[:3, 3], np.maximum(deepest, NEAREST_M), xy_px, result)
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any) -> None:
+    """Distances (n,) of pixels from where rays (n, 3) from an origin are seen, from their deepest point to the nearest.
+
+    The way is followed in straight steps between DEPTHS knots; those behind the camera are left out.
+    """
+    work, proj = np.empty(6), np.empty(8)
+    for i in range(len(rays)):
+        best, before = np.inf, False
+        u0, v0 = 0.0, 0.0
+        for s in range(DEPTHS):
+            part = s / (DEPTHS - 1)
+            inverse = (1.0 - part) / deepest[i] + part / NEAREST_M
+            z = rays[i, 2] / inverse + origin[2]
+            if z <= MIN_DEPTH_M:
+                before = False
+                continue
+            project(kind, params, rays[i, 0] / inverse + origin[0], rays[i, 1] / inverse + origin[1], z, work, proj)
+            u, v = proj[0] - xy_px[i, 0], proj[1] - xy_px[i, 1]
+            best = min(best, u * u + v * v)
+            if before:
+                du, dv = u - u0, v - v0
+                at = -(u0 * du + v0 * dv) / max(du * du + dv * dv, 1e-12)
+                if 0.0 < at < 1.0:
+                    best = min(best, (u0 + at * du) ** 2 + (v0 + at * dv) ** 2)
+            u0, v0, before = u, v, True
+        out[i] = math.sqrt(best)

@@ -1,0 +1,230 @@
+"""Putting the scene where it belongs: rigid alignment with the receiver's positions, gross errors rejected.
+
+Scale is not touched: it comes from the rig, and the receiver takes part in it only through the adjustment that follows.
+Positions along a straight line leave the rotation about that line free; the vehicle's own up direction decides it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import rotation_between
+from mrasfm_engine.types import Bools, Floats, Ints
+
+SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
+SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
+HYPOTHESES = 300
+SCALE_RANGE = (0.8, 1.25)  # of the receiver's way against the rig's; farther off, something is wrong
+MIN_CONSENSUS = 0.3  # of the positions
+LOSS_SCALE = 2.0
+MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssAlignment:
+    """The receiver's frame and the scene's.
+
+    Outliers and noise are judged after a similarity fit, as the scene's scale may be off by more than the receiver's
+    noise; the transform itself is rigid.
+    """
+
+    world_from_model: Floats  # (4, 4), rigid
+    inlier: Bools  # (n,)
+    residual_m: Floats  # (n,) distance after the similarity fit
+    scale: float  # by which the model would have to be multiplied to fit the receiver best: told, not applied
+    sigma_scale: float  # its standard deviation, from independent positions with the noise that was seen
+    noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
+
+
+def align_with_gnss(
+    antenna_m: Floats,
+    up: Floats,
+    forward: Floats,
+    measured_m: Floats,
+    sigma_m: Floats,
+    *,
+    outlier_sigmas: float,
+    rng: np.random.Generator,
+) -> GnssAlignment | str:
+    """Rigid transform from the model's frame to the receiver's.
+
+    Parameters
+    ----------
+    antenna_m
+        Positions (n, 3) of the antenna in the model, lever arm applied.
+    up, forward
+        The vehicle's up and forward directions (n, 3) in the model.
+    measured_m, sigma_m
+        Positions and sigmas (n, 3) of the receiver, x east, y north, z up.
+    outlier_sigmas
+        Residuals beyond so many sigmas are outliers.
+    rng
+        Draws the hypotheses.
+
+    Returns
+    -------
+    GnssAlignment or str
+        The reason, where it is not possible.
+    """
+    if len(antenna_m) < 3:
+        return f"only {len(antenna_m)} registered units have a position at their time, 3 are needed"
+    level = se3.transform(rotation_between(np.array([0.0, 0.0, 1.0]), _unit(up.sum(0))), np.zeros(3))
+    a = se3.apply(level, antenna_m)
+    spread = np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1)
+    if np.sqrt((spread**2).sum()) < MIN_EXTENT_SIGMAS * float(np.median(sigma_m[:, :2])):
+        return f"the car moved by {2 * spread.max():.1f} m, too little against the receiver's noise to tell directions"
+    start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, SCALE_RANGE)
+    if inlier.sum() < 3 or inlier.mean() < MIN_CONSENSUS:
+        return _why_not(a, measured_m, sigma_m, inlier, outlier_sigmas, rng)
+    similarity, factor = start @ level, 1.0
+    for _ in range(4):
+        similarity = _refine(similarity, antenna_m, up, forward, measured_m, sigma_m * factor, inlier)
+        off_m = _apply(similarity, antenna_m) - measured_m
+        whitened = np.linalg.norm(off_m / sigma_m, axis=1)
+        # 1.54 is the median length of a standard normal 3-vector.
+        factor = max(1.0, float(np.median(whitened[inlier])) / 1.54)
+        inlier = whitened < outlier_sigmas * factor
+        if inlier.sum() < 3:
+            return "no consistent set of positions was found"
+    scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+    rotation, weight = similarity[:3, :3] / scale, 1.0 / (sigma_m[inlier] ** 2).mean(1)
+    centre = np.average(antenna_m[inlier], axis=0, weights=weight)
+    spread = float(((antenna_m[inlier] - centre) ** 2 / (factor * sigma_m[inlier]) ** 2).sum())
+    sigma_scale = 1.0 / np.sqrt(max(spread, 1e-12)) / scale
+    if not SCALE_RANGE[0] - 3 * sigma_scale <= scale <= SCALE_RANGE[1] + 3 * sigma_scale:
+        return _scale_is_off(scale)
+    return GnssAlignment(
+        world_from_model=se3.transform(rotation, _apply(similarity, centre[None])[0] - rotation @ centre),
+        inlier=inlier,
+        residual_m=np.linalg.norm(off_m, axis=1),
+        scale=scale,
+        sigma_scale=float(sigma_scale),
+        noise_factor=factor,
+    )
+
+
+def _scale_is_off(scale: float) -> str:
+    return (
+        f"the receiver's way is {scale:.3g} times as long as the rig's (are latitude and longitude swapped, or are the "
+        "baselines not in metres?)"
+    )
+
+
+def _why_not(
+    a: Floats, measured: Floats, sigma: Floats, inlier: Bools, outlier_sigmas: float, rng: np.random.Generator
+) -> str:
+    """What is wrong with positions that do not fit: perhaps only the rig's units."""
+    wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, (1e-4, 1e4))
+    if fitting.mean() >= 2 * MIN_CONSENSUS:
+        return _scale_is_off(float(np.cbrt(np.linalg.det(wide[:3, :3]))))
+    return (
+        f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and longitude "
+        "swapped, or the receiver's clock off?)"
+    )
+
+
+def clock_offset(antenna_m: Floats, measured_m: Floats, sigma_m: Floats, times_us: Ints) -> tuple[float, float] | None:
+    """By how many seconds measured positions are ahead of aligned ones (n, 3), and the standard deviation of that.
+
+    A clock that is off moves every position along the track by speed times offset. Where the speed or the direction
+    changes, this cannot be mistaken for a shift or a turn of the whole track; else the standard deviation is large.
+    None with fewer than 5 positions.
+    """
+    if len(antenna_m) < 5:
+        return None
+    p = antenna_m
+    velocity = np.gradient(p, times_us / 1e6, axis=0)
+    centred = p - p.mean(0)
+    rows = np.zeros((len(p), 3, 5))
+    rows[:, :, 0] = velocity
+    rows[:, :, 1:4] = np.eye(3)
+    rows[:, :, 4] = np.cross([0.0, 0.0, 1.0], centred)
+    a = (rows / sigma_m[:, :, None]).reshape(-1, 5)
+    r = ((measured_m - p) / sigma_m).ravel()
+    solution, _, rank, _ = np.linalg.lstsq(a, r, rcond=None)
+    if rank < a.shape[1]:
+        return None
+    noise = max(1.0, float(np.mean((r - a @ solution) ** 2)))
+    return float(solution[0]), float(np.sqrt(noise * np.linalg.inv(a.T @ a)[0, 0]))
+
+
+def _unit(v: Floats) -> Floats:
+    result: Floats = v / max(float(np.linalg.norm(v)), 1e-12)
+    return result
+
+
+def _apply(similarity: Floats, points: Floats) -> Floats:
+    result: Floats = points @ similarity[:3, :3].T + similarity[:3, 3]
+    return result
+
+
+def _best_yaw(
+    a: Floats,
+    measured: Floats,
+    sigma: Floats,
+    outlier_sigmas: float,
+    rng: np.random.Generator,
+    scale_range: tuple[float, float],
+) -> tuple[Floats, Bools]:
+    """RANSAC over pairs of positions for the turn about the vertical, the scale and the shift: a similarity (4, 4)."""
+    best_score, best, best_inlier = -1.0, np.eye(4), np.zeros(len(a), dtype=np.bool_)
+    for _ in range(HYPOTHESES):
+        i, j = rng.choice(len(a), 2, replace=False)
+        da, dm = a[j] - a[i], measured[j] - measured[i]
+        length, slack = float(np.hypot(da[0], da[1])), 4.0 * float(sigma[i, 0] + sigma[j, 0])
+        way = float(np.hypot(dm[0], dm[1]))
+        if length < 1e-3 or not scale_range[0] * length - slack <= way <= scale_range[1] * length + slack:
+            continue
+        scale = float(np.clip(way / length, *scale_range))
+        yaw = np.arctan2(dm[1], dm[0]) - np.arctan2(da[1], da[0])
+        rotation = scale * se3.exp_so3([0.0, 0.0, yaw])
+        shift = np.median(measured - a @ rotation.T, axis=0)
+        for t in (shift, 0.5 * (measured[i] + measured[j] - (a[i] + a[j]) @ rotation.T)):
+            off = np.linalg.norm((a @ rotation.T + t - measured) / sigma, axis=1)
+            score = float(np.maximum(0.0, outlier_sigmas**2 - off**2).sum())
+            if score > best_score:
+                best_score, best, best_inlier = score, se3.transform(rotation, t), off < outlier_sigmas
+    return best, best_inlier
+
+
+def _refine(
+    similarity: Floats,
+    antenna: Floats,
+    up: Floats,
+    forward: Floats,
+    measured: Floats,
+    sigma: Floats,
+    inlier: Bools,
+) -> Floats:
+    """Gauss-Newton on rotation, translation and scale: positions with a Cauchy loss, and the vehicle near upright."""
+    left = np.cross(up, forward)
+    pose = similarity
+    for _ in range(15):
+        p = _apply(pose, antenna)[inlier]
+        centre = p.mean(0)
+        s = sigma[inlier]
+        r = (p - measured[inlier]) / s
+        w = 1.0 / (1.0 + (r**2).sum(1) / LOSS_SCALE**2)
+        arm = p - centre
+        j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(p), 3, 3)), arm[:, :, None]], axis=2)
+        j = j / s[..., None]
+        h = np.einsum("n,nij,nik->jk", w, j, j)
+        g = np.einsum("n,nij,ni->j", w, j, r)
+        turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
+        for direction, prior in ((left, SIGMA_ROLL_RAD), (forward, SIGMA_PITCH_RAD)):
+            d = direction @ turn.T
+            # d (R v)_z / d omega = (v x e_z)' in turned axes; averaged over units, as one error is common to all.
+            row = np.zeros((len(d), 7))
+            row[:, :3] = np.cross(d, [0.0, 0.0, 1.0])
+            weight = 1.0 / (prior**2 * len(d))
+            h += weight * row.T @ row
+            g += weight * row.T @ d[:, 2]
+        step = -np.linalg.solve(h + 1e-12 * np.eye(7), g)
+        change = np.exp(step[6]) * se3.exp_so3(step[:3])
+        pose = se3.transform(change @ pose[:3, :3], change @ (pose[:3, 3] - centre) + centre + step[3:6])
+        if np.abs(step).max() < 1e-9:
+            break
+    return pose

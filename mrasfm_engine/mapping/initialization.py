@@ -1,0 +1,258 @@
+"""The first two units: which ones, and their poses to one another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions
+from mrasfm_engine.errors import ReconstructionError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.unit_registration import Eyes, cameras_of, matrix_of, register_unit, rigid3d
+from mrasfm_engine.matching.verification import parallax_rad
+from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.types import Floats, Ints
+
+CANDIDATES = 4  # pairs of units that are tried
+MAX_RELATIVE_MATCHES = 1200
+RELATIVE_ERROR_PX = 4.0
+ROUGH_ERROR_PX = 12.0  # while the second unit's pose is a guess
+MOTION_ROUNDS = 3
+FULL_PARALLAX_RAD = np.radians(0.5)
+MAX_PARALLAX_MATCHES = 100  # looked at of a pair
+MIN_POINTS = 30
+GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
+INSIDE = "points inside the first unit"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Initialisation:
+    """Where the scene begins."""
+
+    units: tuple[int, int]
+    points: int
+    method: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitScores:
+    """How much pairs of units have in common.
+
+    Parallax takes its time to compute, and no pair of units has more matches that show motion than it has matches:
+    those that come into question are asked first.
+    """
+
+    model: Model
+    inside: Ints  # (units,) verified matches between the images of a unit
+    between: dict[tuple[int, int], list[PairMatches]]  # by unit and later unit
+
+    @staticmethod
+    def of(model: Model, pairs: Sequence[PairMatches]) -> UnitScores:
+        """Of a drive's keyframes."""
+        inside = np.zeros(len(model.registered), dtype=np.int64)
+        between: dict[tuple[int, int], list[PairMatches]] = {}
+        for pair in pairs:
+            u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
+            if not (model.keyframe[u] and model.keyframe[v]):
+                continue
+            if u == v:
+                inside[u] += np.count_nonzero(pair.inliers)
+            else:
+                between.setdefault((u, v), []).append(pair)
+        return UnitScores(model=model, inside=inside, between=between)
+
+    def moving(self, u: int, v: int) -> int:
+        """Verified matches between two units that show motion."""
+        return sum(
+            round(np.count_nonzero(pair.inliers) * _share_that_moves(self.model, pair)) for pair in self.between[u, v]
+        )
+
+    def best_of_gap(self, gap: int) -> tuple[int, int]:
+        """The units, so many apart, with most matches inside them and such between them."""
+        most = {
+            (u, v): int(self.inside[u] + self.inside[v]) + sum(np.count_nonzero(pair.inliers) for pair in between)
+            for (u, v), between in self.between.items()
+            if v - u == gap
+        }
+        best, best_score = (-1, -1), -1
+        for units in sorted(most, key=lambda units: -most[units]):
+            if most[units] <= best_score:
+                break
+            score = int(self.inside[list(units)].sum()) + self.moving(*units)
+            if score > best_score:
+                best, best_score = units, score
+        return best
+
+
+def _share_that_moves(model: Model, pair: PairMatches) -> float:
+    """How far the matches show motion, 0 to 1: units at which the car stands match best, but give no points."""
+    matches = pair.matches[pair.inliers]
+    matches = matches[:: 1 + len(matches) // MAX_PARALLAX_MATCHES]
+    a = model.keypoints.rays[model.keypoints.first[pair.image_a] + matches[:, 0]]
+    b = model.keypoints.rays[model.keypoints.first[pair.image_b] + matches[:, 1]]
+    return min(1.0, parallax_rad(a, b) / float(FULL_PARALLAX_RAD))
+
+
+def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig: Floats | None) -> Initialisation:
+    """Register the two best-connected units.
+
+    For each of the best pairs of units by verified matches inside and between them, every source of a relative pose is
+    tried: the prior poses, points triangulated inside the first unit, and the generalised relative pose. Each is
+    adjusted; the pair with the most points of good angle is kept.
+
+    Raises
+    ------
+    ReconstructionError
+        Where no pair of units gives points.
+    """
+    prior = prior_world_from_rig
+    known = np.isfinite(prior[:, 0, 3]) if prior is not None else np.zeros(len(model.registered), dtype=np.bool_)
+    scores = UnitScores.of(model, pairs)
+    best: tuple[int, Initialisation, Floats, Floats] | None = None
+    # Not the same gap over and over: with a longer step points get better angles.
+    for gap in sorted({v - u for u, v in scores.between})[:CANDIDATES]:
+        u, v = scores.best_of_gap(gap)
+        anchor = np.eye(4) if prior is None or not known[u] else prior[u]
+        for method, pose in _proposals(model, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
+            points = _evaluate(model, u, v, anchor, pose)
+            if best is None or points > best[0]:
+                best = (
+                    points,
+                    Initialisation(units=(u, v), points=points, method=method),
+                    model.state.world_from_rig[u],
+                    model.state.world_from_rig[v],
+                )
+            if method == INSIDE and points >= GOOD_START_POINTS:
+                break  # the relative pose from images alone costs most; it is for cameras that share no view
+    model.clear()
+    if best is None or best[0] < MIN_POINTS:
+        raise ReconstructionError(
+            f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the "
+            f"best two units share {0 if best is None else best[0]} points",
+            remedy="Check that the images show a textured scene while the car moves, that cameras and files are not "
+            "mixed up, and that intrinsics fit the images.",
+            code="nothing-matches",
+        )
+    _, result, pose_u, pose_v = best
+    model.set_pose(result.units[0], pose_u)
+    model.set_pose(result.units[1], pose_v)
+    model.renew_motion()
+    model.triangulate()
+    return result
+
+
+def _proposals(
+    model: Model,
+    pairs: Sequence[PairMatches],
+    u: int,
+    v: int,
+    anchor: Floats,
+    prior_world_from_rig: Floats | None,
+) -> Iterator[tuple[str, Floats]]:
+    """Poses of unit v, given that of u, and where they come from."""
+    if prior_world_from_rig is not None:
+        yield "prior poses", anchor @ se3.inverse(prior_world_from_rig[u]) @ prior_world_from_rig[v]
+    model.clear()
+    model.set_pose(u, anchor)
+    model.renew_motion()
+    if model.triangulate(model.tracks_of_units(np.array([u]))) >= MIN_POINTS:
+        model.motion.predict(model.state, model.registered, v)
+        registration = register_unit(model, v)
+        if registration.world_from_rig is not None:
+            yield INSIDE, registration.world_from_rig
+    relative = (
+        _single_camera_relative_pose(model, pairs, u, v, prior_world_from_rig)
+        if model.drive.has_single_camera
+        else _generalised_relative_pose(model, pairs, u, v)
+    )
+    if relative is not None:
+        yield "generalised relative pose", anchor @ relative
+
+
+def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> Floats | None:
+    """rig_u_from_rig_v from matches between all cameras of the two units."""
+    a, b = _matches_between(model, pairs, u, v)
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
+    options.min_num_trials, options.max_num_trials = 100, 2000
+    both, cameras = np.concatenate([a, b]), cameras_of(model)
+    eyes = Eyes.of(model, model.keypoints.camera[both], model.keypoints.shot[both])
+    result = pycolmap.estimate_generalized_relative_pose(
+        model.keypoints.xy_px[a],
+        model.keypoints.xy_px[b],
+        [int(i) for i in eyes.index[: len(a)]],
+        [int(i) for i in eyes.index[len(a) :]],
+        [rigid3d(m) for m in se3.inverse(eyes.rig_from_eye)],
+        [cameras[c] for c in eyes.camera],
+        estimation_options=options,
+    )
+    if result is None or "rig2_from_rig1" not in result:
+        return None
+    return se3.inverse(matrix_of(result["rig2_from_rig1"]))
+
+
+def _single_camera_relative_pose(
+    model: Model, pairs: Sequence[PairMatches], u: int, v: int, prior_world_from_rig: Floats | None
+) -> Floats | None:
+    """rig_u_from_rig_v of a rig with one camera: its length is the prior's, or one metre, as images do not tell it."""
+    a, b = _matches_between(model, pairs, u, v)
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
+    index = int(model.image_camera[0])
+    camera = cameras_of(model)[index]
+    result = pycolmap.estimate_essential_matrix(
+        model.keypoints.xy_px[a], model.keypoints.xy_px[b], camera, camera, estimation_options=options
+    )
+    if result is None:
+        return None
+    length_m = 1.0
+    if prior_world_from_rig is not None:
+        length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
+    u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))
+    u_from_v[:3, 3] *= length_m / max(float(np.linalg.norm(u_from_v[:3, 3])), 1e-9)
+    rig_from_eye = np.stack([model.motion.unit_from_image(model.state)[model.keypoints.image[k[0]]] for k in (a, b)])
+    rig_from_eye = rig_from_eye @ model.state.rig_from_cam[index]
+    result_pose: Floats = rig_from_eye[0] @ u_from_v @ se3.inverse(rig_from_eye[1])
+    return result_pose
+
+
+def _matches_between(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> tuple[Ints, Ints]:
+    """Keypoints of unit u and of unit v that match, over all cameras; a sample where there are many."""
+    rows_u, rows_v = [], []
+    for pair in pairs:
+        if {int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])} != {u, v}:
+            continue
+        a, b = model.matched_keypoints(pair, u)
+        rows_u.append(a)
+        rows_v.append(b)
+    a, b = np.concatenate(rows_u), np.concatenate(rows_v)
+    keep = np.unique(np.linspace(0, len(a) - 1, min(len(a), MAX_RELATIVE_MATCHES)).astype(np.int64))
+    return a[keep], b[keep]
+
+
+def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int:
+    """Points of the two units after adjusting the second; the model is left in that state."""
+    model.clear()
+    model.set_pose(u, anchor)
+    model.set_pose(v, pose)
+    model.renew_motion()
+    tracks = model.tracks_of_units(np.array([u, v]))
+    free = np.zeros(len(model.registered), dtype=np.bool_)
+    free[v] = True
+    options = SolverOptions(max_iterations=30, function_tolerance=1e-3, threads=model.config.threads)
+    threshold = model.triangulator.max_error_px
+    # Baselines between cameras that are not simultaneous follow from the pose that is sought: it takes some turns.
+    rough_rounds = 1 if model.state.simultaneous else MOTION_ROUNDS
+    try:
+        for error_px in (*([ROUGH_ERROR_PX] * rough_rounds), ROUGH_ERROR_PX / 2, threshold):
+            model.triangulator.max_error_px = max(error_px, threshold)
+            if model.triangulate(tracks) < MIN_POINTS:
+                return 0
+            model.adjust(free, options=options, an_image=model.config.mapping.pose_observations)
+    finally:
+        model.triangulator.max_error_px = threshold
+    return model.triangulate(tracks)

@@ -1,0 +1,84 @@
+"""A car that stands or creeps: units that show nothing new take no part in mapping, and get their poses afterwards.
+
+Whether the car moved is measured in the images: receivers jitter when they stand. A unit whose keypoints are where
+those of the last keyframe were adds no parallax, only more of the same equations. When the scene is finished, such
+units are registered against it one by one, its points held, so that a hundred of them neither drift nor bend anything.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.unit_registration import Registration, register_unit
+from mrasfm_engine.types import Bools, Ints
+
+MIN_COMMON = 40  # keypoints of a camera in common with the last keyframe; with fewer, nothing is known
+
+
+def select_keyframes(model: Model) -> Bools:
+    """Which units (u,) moved against the last keyframe before them, in the camera that moved most.
+
+    A camera's motion is its median, because others drive past a standing car. One camera is enough, because a lorry
+    that drives along stands still in all that it covers: a unit too many costs time, one too few loses points. Where
+    images are not simultaneous, the first and the last unit of a stop stay keyframes: they tell that the car stood. A
+    drive without motion has keyframes only.
+    """
+    units = len(model.registered)
+    keyframe = np.ones(units, dtype=np.bool_)
+    last = -1
+    for unit in range(units):
+        if last >= 0:
+            moved_px = _displacement_px(model, last, unit)
+            keyframe[unit] = not moved_px < model.config.mapping.keyframe_motion_px
+        if keyframe[unit] and len(model.rows_of_unit[unit]):
+            last = unit
+    if model.motion.needed:
+        stands = ~keyframe
+        keyframe |= stands & ~(np.append(False, stands[:-1]) & np.append(stands[1:], False))
+    return keyframe if keyframe.sum() > 1 else np.ones(units, dtype=np.bool_)
+
+
+def _displacement_px(model: Model, before: int, now: int) -> float:
+    """Way (px) of a camera's tracks that both units see: its median, in the camera where that is largest.
+
+    NaN where no camera has enough of them.
+    """
+    rows = [model.rows_of_unit[unit] for unit in (before, now)]
+    cameras = len(model.camera_kind)
+    keys = [model.tracks.of_keypoint[r] * cameras + model.keypoints.camera[r] for r in rows]
+    _, a, b = np.intersect1d(keys[0], keys[1], return_indices=True)
+    way_px = np.linalg.norm(model.keypoints.xy_px[rows[1][b]] - model.keypoints.xy_px[rows[0][a]], axis=1)
+    camera = model.keypoints.camera[rows[0][a]]
+    enough = np.flatnonzero(np.bincount(camera, minlength=cameras) >= MIN_COMMON)
+    return max((float(np.median(way_px[camera == c])) for c in enough), default=float("nan"))
+
+
+def register_between_keyframes(model: Model, *, max_error_px: float) -> list[Registration]:
+    """Give all units that are no keyframes their poses from the finished scene, whose points stay as they are.
+
+    They observe the points of their tracks that they see within `max_error_px`.
+    """
+    results = []
+    for unit in np.flatnonzero(~model.keyframe & ~model.registered).tolist():
+        model.motion.predict(model.state, model.registered, unit)
+        registration = register_unit(model, unit)
+        results.append(registration)
+        if registration.world_from_rig is not None:
+            model.set_pose(unit, registration.world_from_rig)
+            rows = model.rows_of_unit[unit]
+            rows = rows[model.solved[model.tracks.of_keypoint[rows]]]
+            tracks = model.tracks.of_keypoint[rows]
+            model.kept[rows] = (
+                model.triangulator.errors_px(model.state, rows, model.state.points_m, tracks) < max_error_px
+            )
+    return results
+
+
+def nearest_keyframes(model: Model) -> Ints:
+    """The registered keyframe (u,) nearest to each unit; itself, where it is one."""
+    known = np.flatnonzero(model.keyframe & model.registered)
+    units = np.arange(len(model.registered))
+    after = np.searchsorted(known, units)
+    low, high = known[np.maximum(after - 1, 0)], known[np.minimum(after, len(known) - 1)]
+    return np.where(units - low <= high - units, low, high)

@@ -1,0 +1,320 @@
+"""The scene while it grows: registered units, points of tracks, and the adjustments that act on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
+from mrasfm_engine.bundle_adjustment.priors import Term
+from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
+from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.mapping.free_image_adjustment import adjust_images
+from mrasfm_engine.mapping.rig_motion import RigMotion
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, kept_members
+from mrasfm_engine.triangulation.triangulate import Triangulator
+from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+
+
+class Model:
+    """Registered units, tracks and their points. A track has at most one point.
+
+    Attributes
+    ----------
+    state
+        Poses and calibration; `state.points_m` has a row for every track, valid where `solved`.
+    registered
+        (units,) which units have a pose.
+    keyframe
+        (units,) which units mapping uses, see `registration.keyframes`.
+    solved
+        (tracks,) which tracks have a point.
+    kept
+        (keypoints,) which keypoints are observations of their track's point.
+    missing
+        (images,) images without a pose although their unit has one: only where images are registered one by one.
+    motion
+        Where the rig is at the images' own times, and poses that images have apart from it.
+    barred
+        (tracks,) which tracks were dropped for what they show: they get no point until all are tried again.
+    track_class
+        (tracks,) the class of most keypoints of a track, as `semantics.CLASS_CODES` numbers them.
+    """
+
+    def __init__(self, drive: Drive, keypoints: Keypoints, tracks: Tracks, config: EngineConfig) -> None:
+        self.drive, self.keypoints, self.tracks, self.config = drive, keypoints, tracks, config
+        self.camera_kind, params = pack_cameras(drive.cameras)
+        self.image_size_px = np.array([[camera.width, camera.height] for camera in drive.cameras], dtype=np.float64)
+        units = len(drive.manifest.frames)
+        self.state = State(
+            unit_rotation=np.tile(np.eye(3), (units, 1, 1)),
+            unit_position_m=np.zeros((units, 3)),
+            camera_rotation=np.ascontiguousarray(drive.rig_from_cam[:, :3, :3]),
+            camera_position_m=np.ascontiguousarray(drive.rig_from_cam[:, :3, 3]),
+            camera_params=params,
+            points_m=np.zeros((len(tracks), 3)),
+        )
+        self.registered = np.zeros(units, dtype=np.bool_)
+        self.keyframe = np.ones(units, dtype=np.bool_)
+        self.solved = np.zeros(len(tracks), dtype=np.bool_)
+        self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
+        self.missing = np.zeros(len(drive.images), dtype=np.bool_)
+        self.barred = np.zeros(len(tracks), dtype=np.bool_)
+        self.track_class = tracks.classes(keypoints.classes)
+        self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+        self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
+        shots = Shots.of(drive, compensate=config.mapping.motion_compensation)
+        self.motion = RigMotion(shots, drive.timestamps_us)
+        if self.motion.needed:
+            self._place_shots()
+        self.triangulator = Triangulator(
+            keypoints,
+            shots.unit,
+            shots.camera,
+            self.camera_kind,
+            max_error_px=config.mapping.max_error_px,
+            min_angle_deg=config.mapping.min_angle_deg,
+            threads=config.threads,
+        )
+        # What registration asks for again and again: how many points every unit sees, as of which points; keypoints
+        # by unit, and the tracks they are in.
+        self._visible, self._visible_of = np.zeros(units, dtype=np.int64), np.zeros(len(tracks), dtype=np.bool_)
+        order = np.argsort(keypoints.unit, kind="stable")
+        bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
+        tracked = tracks.of_keypoint >= 0
+        self.rows_of_unit = [rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in pairwise(bounds))]
+
+    def set_pose(self, unit: int, world_from_rig: Floats) -> None:
+        """Give a unit a pose and count it as registered."""
+        self.state.unit_rotation[unit] = world_from_rig[:3, :3]
+        self.state.unit_position_m[unit] = world_from_rig[:3, 3]
+        self.registered[unit] = True
+
+    def set_image_pose(self, image: int, unit_from_image: Floats) -> None:
+        """Give an image a pose (4, 4) apart from the rig's: where the rig would stand for it, relative to its unit.
+
+        The image's camera then is at world_from_rig * unit_from_image * rig_from_cam, also after further adjustments.
+        """
+        self.set_image_poses(np.array([image]), unit_from_image[None])
+        self.renew_motion(np.array([self.image_unit[image]]))
+
+    def set_image_poses(self, images: Ints, unit_from_image: Floats) -> None:
+        """As `set_image_pose` for images (n,) and poses (n, 4, 4); they take effect when the motion is renewed."""
+        for image, pose in zip(images, unit_from_image, strict=True):
+            self.motion.set_image_pose(int(image), pose)
+        if self.state.simultaneous:
+            self._place_shots()
+
+    def _place_shots(self) -> None:
+        count = len(self.motion.shots)
+        self.state = replace(
+            self.state, shot_rotation=np.tile(np.eye(3), (count, 1, 1)), shot_position_m=np.zeros((count, 3))
+        )
+
+    def renew_motion(self, units: Ints | None = None) -> float:
+        """Let the images follow the units' present trajectory (around some units); by how much in metres at most."""
+        return self.motion.renew(self.state, self.registered, units)
+
+    def drop_unsupported(self, min_observations: int) -> Ints:
+        """Take the poses of units back that hardly observe a point any more; which ones."""
+        counts = np.bincount(self.keypoints.unit[self.kept], minlength=len(self.registered))
+        lost = np.flatnonzero(self.registered & (counts < min_observations))
+        self.forget(lost)
+        return lost
+
+    def forget(self, units: Ints) -> None:
+        """Take the poses of units back, and what their images observe."""
+        self.registered[units] = False
+        images = np.flatnonzero(np.isin(self.image_unit, units))
+        self.missing[images] = False
+        self.motion.forget_image_poses(images)
+        self.kept[np.isin(self.keypoints.unit, units)] = False
+
+    def clear(self) -> None:
+        """Forget all poses and points."""
+        self.forget(np.arange(len(self.registered)))
+        self.solved[:] = False
+
+    def tracks_of_units(self, units: Ints) -> Ints:
+        """Tracks seen by any of the units, ascending."""
+        seen = np.zeros(len(self.tracks), dtype=np.bool_)
+        for unit in units:
+            seen[self.tracks.of_keypoint[self.rows_of_unit[int(unit)]]] = True
+        return np.flatnonzero(seen)
+
+    def matched_keypoints(self, pair: PairMatches, unit: int) -> tuple[Ints, Ints]:
+        """Keypoints of a pair's verified matches: those in an image of `unit` first, then those of the other unit."""
+        a = self.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
+        b = self.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
+        return (a, b) if self.image_unit[pair.image_a] == unit else (b, a)
+
+    def visible_counts(self) -> Ints:
+        """How many keypoints with a point every unit has (units,); not to be written to."""
+        changed = np.flatnonzero(self.solved != self._visible_of)
+        count_members(self.tracks, changed, self.solved, self.keypoints.unit, self._visible)
+        self._visible_of[changed] = self.solved[changed]
+        return self._visible
+
+    def triangulate(self, which: Ints | None = None) -> int:
+        """Triangulate tracks (all by default) from registered units; how many of them have a point."""
+        if which is None:
+            which = np.arange(len(self.tracks), dtype=np.int64)
+        self.triangulator.triangulate(
+            self.state,
+            self.tracks,
+            (self.registered[self.image_unit] & ~self.missing)[self.motion.shots.image],
+            which=which,
+            points_m=self.state.points_m,
+            solved=self.solved,
+            kept=self.kept,
+        )
+        return int(self.solved[which].sum())
+
+    def extend(self, unit: int) -> None:
+        """Let a newly registered unit observe the points of its tracks, and give its other tracks points."""
+        rows = self.rows_of_unit[unit]
+        rows = rows[~self.missing[self.keypoints.image[rows]]]
+        tracks = self.tracks.of_keypoint[rows]
+        has_point = self.solved[tracks]
+        errors = self.triangulator.errors_px(self.state, rows[has_point], self.state.points_m, tracks[has_point])
+        fits = errors < self.triangulator.max_error_px
+        self.kept[rows[has_point]] = fits
+        # Also points that the new view contradicts: with it, another hypothesis may win.
+        again = np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]]))
+        self.triangulate(again[~self.barred[again]])
+
+    def complete(self) -> None:
+        """Let every point have the observations that now fit it, and try again for tracks without a point."""
+        of_keypoint = self.tracks.of_keypoint
+        rows = np.flatnonzero((of_keypoint >= 0) & self.registered[self.keypoints.unit])
+        rows = rows[~self.missing[self.keypoints.image[rows]]]
+        rows = rows[self.solved[of_keypoint[rows]]]
+        errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, of_keypoint[rows])
+        self.kept[:] = False
+        self.kept[rows] = errors < self.triangulator.max_error_px
+        self.barred[:] = False
+        self.triangulate(np.flatnonzero(~self.solved))
+        self.filter(self.triangulator.max_error_px)
+
+    def drop(self, tracks: Ints) -> None:
+        """Take the points of tracks away and bar them until `complete` or `readmit`."""
+        self.solved[tracks] = False
+        self.barred[tracks] = True
+        rows = np.flatnonzero(self.kept)
+        self.kept[rows[self.barred[self.tracks.of_keypoint[rows]]]] = False
+
+    def readmit(self) -> None:
+        """Triangulate barred tracks again: poses have changed since."""
+        tracks = np.flatnonzero(self.barred)
+        self.barred[:] = False
+        self.triangulate(tracks)
+
+    def filter(self, max_error_px: float) -> tuple[int, int]:
+        """Drop observations with larger errors, and points left with fewer than two or without an angle.
+
+        Returns how many of both.
+        """
+        rows = np.flatnonzero(self.kept)
+        tracks = self.tracks.of_keypoint[rows]
+        errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, tracks)
+        bad = errors > max_error_px
+        self.kept[rows[bad]] = False
+        left = np.bincount(tracks[~bad], minlength=len(self.tracks))
+        lost = self.solved & (left < 2)
+        reduced = np.unique(tracks[bad])
+        lost[reduced[~self.triangulator.has_angle(self.state, self.tracks, self.kept, reduced)]] = True
+        self.solved[lost] = False
+        alone = np.flatnonzero(self.kept)
+        self.kept[alone[lost[self.tracks.of_keypoint[alone]]]] = False
+        return int(bad.sum()), int(lost.sum())
+
+    def observation_rows(self, tracks: Ints | None = None) -> Ints:
+        """Keypoints that are observations (of the given solved tracks, ascending), sorted by track."""
+        if tracks is not None:
+            return kept_members(self.tracks, tracks, self.kept)
+        members = self.tracks.keypoints
+        return members[self.kept[members]]
+
+    def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
+        """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by
+        point, the points' tracks, and the keypoints' points as rows of these."""
+        everything = everything or bool((free_units | ~self.registered).all())
+        seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
+        rows = self.observation_rows(None if seen is None else seen[self.solved[seen]])
+        track = self.tracks.of_keypoint[rows]
+        begins = np.diff(track, prepend=-1) > 0
+        return rows, track[begins], np.cumsum(begins) - 1
+
+    def problem(
+        self,
+        free_units: Bools,
+        *,
+        free_cameras: Bools | None = None,
+        free_focal: bool = False,
+        terms: Sequence[Term] = (),
+        options: SolverOptions,
+    ) -> tuple[Problem, Ints]:
+        """The adjustment of some units (and cameras) with all points they see; also those points' tracks."""
+        rows, tracks, point = self.observed(free_units, everything=free_cameras is not None)
+        problem = Problem(
+            state=replace(self.state, points_m=self.state.points_m.take(tracks, axis=0)),
+            camera_kind=self.camera_kind,
+            observations=Observations(
+                unit=self.keypoints.unit.take(rows),
+                camera=self.keypoints.camera.take(rows),
+                point=point,
+                xy_px=self.keypoints.xy_px.take(rows, axis=0),
+                num_points=len(tracks),
+                shot=None if self.state.simultaneous else self.keypoints.shot[rows],
+            ),
+            layout=Layout.of(
+                free_units & self.registered,
+                np.zeros(len(self.camera_kind), dtype=np.bool_) if free_cameras is None else free_cameras,
+                free_focal=free_focal,
+            ),
+            terms=terms,
+            options=options,
+            motion=None
+            if self.state.simultaneous
+            else self.motion.in_adjustment(self.state, self.registered, free_units),
+        )
+        return problem, tracks
+
+    def adjust(
+        self,
+        free_units: Bools,
+        *,
+        free_cameras: Bools | None = None,
+        free_focal: bool = False,
+        terms: Sequence[Term] = (),
+        options: SolverOptions,
+        an_image: int = 0,
+        cancel: Cancel | None = None,
+    ) -> Report:
+        """Solve the adjustment and take over its result.
+
+        With `an_image` poses are estimated from about so many observations of an image; points follow all of theirs.
+        """
+        if not self.config.adjustment.camera_set_adjustment:
+            return adjust_images(self, free_units, terms=terms, options=options, an_image=an_image, cancel=cancel)
+        self.renew_motion(np.flatnonzero(free_units & self.registered))
+        problem, tracks = self.problem(
+            free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
+        )
+        solution, report = solve_with_chosen_points(problem, self.image_size_px, an_image=an_image, cancel=cancel)
+        if cancel is not None and cancel():
+            raise CancelledError  # else a half-solved model would pass for a finished one
+        points = self.state.points_m
+        points[tracks] = solution.points_m
+        self.state = replace(solution, points_m=points)
+        return report

@@ -1,0 +1,257 @@
+"""What the report says of mapping and refinement, in plain values."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.solver import Report
+from mrasfm_engine.findings import Finding
+from mrasfm_engine.mapping import rig_motion
+from mrasfm_engine.mapping.calibration import heading_change_deg
+from mrasfm_engine.mapping.incremental_mapping import MappingLog
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.miscalibration import voted_out
+from mrasfm_engine.mapping.refinement import Refinement
+from mrasfm_engine.mapping.road import RoadJudgement
+from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
+from mrasfm_engine.scene.road import RoadSource
+from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.types import Ints
+
+DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
+
+
+def describe(model: Model, log: MappingLog) -> dict[str, Any]:
+    """Counts of the incremental loop, and what was rejected and why."""
+    frames = model.drive.manifest.frames
+    covered, poor = _covered(model, log), _poorly_seen(model)
+    unclear = Counter(name for r in log.registrations for name in r.unclear)
+    start = log.initialisation
+    missing = [
+        {
+            "unit": int(u),
+            "source_frame": frames[u].source_frame,
+            "reason": log.failures[int(u)].reason if int(u) in log.failures else "it sees no point of the scene",
+        }
+        for u in np.flatnonzero(~model.registered & model.keyframe)
+    ]
+    return {
+        "initial_units": None if start is None else list(start.units),
+        "initial_pose_from": None if start is None else start.method,
+        "registered_units": int(model.registered.sum()),
+        "units_not_registered": missing,
+        "units_without_motion": int((~model.keyframe).sum()),
+        "registered_by": dict(Counter(r.method for r in log.registrations)),
+        "cameras_voted_out": voted_out(log.registrations, {image["unit"] for image in covered}),
+        "cameras_without_a_vote": dict(unclear),
+        "images_occluded": covered,
+        "images_posed_by_their_unit_alone": poor,
+        "images_dark_or_without_texture": [file for file in poor if file not in {image["file"] for image in covered}],
+        "tracks": len(model.tracks),
+        "points": int(model.solved.sum()),
+        "observations": int(model.kept.sum()),
+        "revisits": {
+            "unit_pairs_tried": log.revisits_tried,
+            "unit_pairs_believed": len(log.revisits),
+            "moved_at_most_m": log.loop_moved_m,
+        },
+        "local_adjustments": log.local_adjustments,
+        "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
+        "road_points_dropped": [0 if isinstance(j, str) else int((~j.kept).sum()) for j in log.roads],
+    }
+
+
+def _covered(model: Model, log: MappingLog) -> list[dict[str, Any]]:
+    """Images covered by something that moves along with the vehicle."""
+    images, cameras = model.drive.images, model.drive.cameras
+    return [
+        {
+            "file": images[i].file,
+            "camera": cameras[images[i].camera].name,
+            "unit": images[i].unit,
+            "share_of_keypoints_against_the_unit": round(share, 3),
+        }
+        for i, share in sorted(log.covered_images.items())
+    ]
+
+
+def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
+    """Alignment, adjustments and certainty of the last stage."""
+    placement, certainty = refinement.placement, refinement.certainty
+    alignment = None if placement is None else placement.alignment
+    result: dict[str, Any] = {
+        "points": int(model.solved.sum()),
+        "observations": int(model.kept.sum()),
+        "rejected": {
+            "observations": refinement.observations_dropped,
+            "points": refinement.points_dropped,
+            "units": refinement.units_dropped,
+        },
+        "sigma_observation_px": refinement.sigma_px,
+        "adjustments": [_adjustment(r) for r in refinement.adjustments],
+        "calibration": {
+            "adjusted": refinement.calibration.free,
+            "adjusted_cameras": [
+                c.name for c, a in zip(model.drive.cameras, refinement.recalibrated, strict=True) if a
+            ],
+            "reason": refinement.calibration.reason,
+            "heading_change_deg": heading_change_deg(model),
+            **_directions(model, refinement),
+        },
+        "georeferenced": refinement.georeferenced,
+        "road": _road(refinement.road),
+        "motion_within_units": _motion(model),
+    }
+    if certainty is not None and np.isfinite(certainty.sigma_scale):
+        result["scale"] = {
+            "sigma_relative": certainty.sigma_scale,
+            "from": _scale_source(model, refinement),
+        }
+    if placement is not None and alignment is not None:
+        times = model.drive.timestamps_us[placement.units[~alignment.inlier]]
+        result["gnss"] = {
+            "units_used": int(alignment.inlier.sum()),
+            "outliers_at_us": [int(t) for t in times],
+            "residual_rms_m": float(np.sqrt((alignment.residual_m[alignment.inlier] ** 2).mean())),
+            "noise_factor": alignment.noise_factor,
+            "scale_of_rig_against_gnss": alignment.scale,
+        }
+    elif placement is not None:
+        result["gnss"] = {"not_used": placement.reason}
+    return result
+
+
+def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
+    """What of the cameras' poses was observed, by name, and which of them were wrong."""
+    cameras, directions = model.drive.cameras, refinement.directions
+    if directions is None:
+        return {}
+    observed = directions.observed & refinement.recalibrated[:, None]
+    return {
+        "observed": {
+            camera.name: [d for d, seen in zip(DIRECTIONS, observed[c], strict=True) if seen]
+            for c, camera in enumerate(cameras)
+        },
+        "only_the_prior": {
+            camera.name: [d for d, seen in zip(DIRECTIONS, observed[c], strict=True) if not seen]
+            for c, camera in enumerate(cameras)
+        },
+        "held_for_all_cameras_together": [*DIRECTIONS],
+        "scale_of_the_rig": directions.scale_in_words,
+        "cameras_wrong": [
+            {
+                "camera": cameras[w.camera].name,
+                "rotation_deg": w.rotation_deg,
+                "translation_m": w.translation_m,
+                "sigmas_of_its_prior": w.prior_sigmas,
+                "others_rotation_deg": w.others_rotation_deg,
+                "others_translation_m": w.others_translation_m,
+            }
+            for w in refinement.wrong_cameras
+        ],
+    }
+
+
+def _road(judged: RoadJudgement | str) -> dict[str, Any]:
+    """Thicknesses are of all points that were taken for the road's, and of those that were kept: none else left out."""
+    if isinstance(judged, str):
+        return {"source": None, "reason": judged}
+    road, kept = judged.road, judged.kept
+    result = {
+        "source": str(road.source),
+        "patches": len(road.surface),
+        "points": len(kept),
+        "kept": int(kept.sum()),
+        "dropped": int((~kept).sum()),
+        "kept_where_no_surface_is": int((kept & np.isnan(judged.distance_m)).sum()),
+        "roughness_m": road.roughness_m,
+        "rig_height_above_road_m": road.rig_height_m,
+    }
+    for when, thickness in (("before", road.thickness_before), ("after", road.thickness_after)):
+        if np.isfinite(thickness.range90_m):
+            result[f"thickness_{when}_m"] = thickness.range90_m
+            result[f"spread_{when}_m"] = thickness.spread_m
+    if road.source is RoadSource.GEOMETRY:
+        result["confidence"] = (
+            "low: no mask says what is road. Points near the road's level in the vehicle's own lane were judged in the "
+            "finished scene, and dropped only where nothing can stand: below the road, or above it where it drove"
+        )
+    return result
+
+
+def describe_between(model: Model, registrations: Sequence[Registration]) -> dict[str, Any]:
+    """The units that are no keyframes, and those of them that the finished scene gave no pose."""
+    frames = model.drive.manifest.frames
+    return {
+        "between_keyframes": {
+            "units": int((~model.keyframe).sum()),
+            "registered": sum(r.world_from_rig is not None for r in registrations),
+            "units_not_registered": [
+                {"unit": r.unit, "source_frame": frames[r.unit].source_frame, "reason": r.reason}
+                for r in registrations
+                if r.world_from_rig is None
+            ],
+        }
+    }
+
+
+def _motion(model: Model) -> dict[str, Any]:
+    """How far images are from their unit in time and, where that was taken into account, in space."""
+    shots = Shots.of(model.drive)
+    if shots.simultaneous:
+        return {"simultaneous": True}
+    largest = model.motion.largest(model.state, model.registered)
+    result: dict[str, Any] = {
+        "simultaneous": False,
+        "largest_time_offset_s": float(np.abs(shots.time_offset_s).max()),
+        "compensated": not model.motion.shots.simultaneous,
+    }
+    if result["compensated"]:
+        result |= {
+            "largest_translation_m": largest.translation_m,
+            "largest_rotation_deg": largest.rotation_deg,
+            "units_not_compensated": len(_not_compensated(model)),
+        }
+    return result
+
+
+def _not_compensated(model: Model) -> Ints:
+    # The others did not move: that is why they are no keyframes.
+    return model.motion.not_compensated(model.state, model.registered & model.keyframe)
+
+
+def motion_findings(model: Model) -> list[Finding]:
+    """What a user is told of the motion within units."""
+    units = _not_compensated(model)
+    return [rig_motion.finding(len(units), int(model.registered.sum()))] if len(units) else []
+
+
+def _poorly_seen(model: Model) -> list[str]:
+    """Images that observe too little to be registered alone: dark, without texture, or occluded."""
+    images = model.drive.images
+    counts = np.bincount(model.keypoints.image[model.kept], minlength=len(images))
+    posed = model.registered[model.image_unit] & ~model.missing
+    poor = np.flatnonzero(posed & (counts < MIN_CAMERA_MATCHES))
+    return [images[i].file for i in poor]
+
+
+def _scale_source(model: Model, refinement: Refinement) -> str:
+    if model.drive.has_single_camera:
+        return "GNSS" if refinement.georeferenced else "rough poses"
+    return "baselines of the rig and GNSS" if refinement.georeferenced else "baselines of the rig"
+
+
+def _adjustment(report: Report) -> dict[str, Any]:
+    return {
+        "initial_cost": report.initial_cost,
+        "final_cost": report.final_cost,
+        "iterations": report.iterations,
+        "termination": str(report.termination),
+        "observations": report.observations,
+        "parameters": report.parameters,
+        "pose_parameters": report.pose_parameters,
+    }

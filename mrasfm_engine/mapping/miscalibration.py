@@ -1,0 +1,142 @@
+"""Cameras whose given place in the rig is wrong, told by their corrections and by the units' votes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
+from mrasfm_engine.findings import Finding, warning
+from mrasfm_engine.mapping.unit_registration import Registration
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Floats
+
+SIGNIFICANT_SIGMAS = 5.0  # of the posterior: less is no correction at all
+BEYOND_PRIOR_SIGMAS = 5.0  # of the prior: what was declared cannot be true
+UNUSUAL = 5.0  # times the other cameras' median correction, where that is more than
+MIN_UNUSUAL_DEG, MIN_UNUSUAL_M = 1.0, 0.1  # what mountings and calibrations are off by as a rule
+MIN_OTHERS = 2  # cameras that say what is usual
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrongCamera:
+    """A camera that stands or looks otherwise than given; lengths and angles of its correction."""
+
+    camera: int
+    rotation_deg: float
+    translation_m: float
+    prior_sigmas: float  # of the correction in the directions that the drive observes
+    others_rotation_deg: float  # median correction of the other cameras
+    others_translation_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrongPair:
+    """Two cameras that stand or look otherwise to each other than given: which of them is wrong, nothing tells."""
+
+    rotation_deg: float
+    translation_m: float
+
+
+def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observability) -> WrongPair | None:
+    """Of a rig of two cameras, whether they are off against each other by more than their prior can be."""
+    corrections = np.where(directions.observed, prior.corrections(state), 0.0)
+    if len(corrections) != 2:
+        return None
+    sigma, posterior = _sigmas(prior, directions)
+    if not any(
+        _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=np.inf)
+        for c in range(2)
+        for part in (slice(0, 3), slice(3, 6))
+    ):
+        return None
+    between = corrections[1] - corrections[0]
+    return WrongPair(
+        rotation_deg=float(np.degrees(np.linalg.norm(between[:3]))),
+        translation_m=float(np.linalg.norm(between[3:])),
+    )
+
+
+def find_wrong_cameras(prior: CalibrationPrior, state: State, directions: Observability) -> list[WrongCamera]:
+    """Cameras whose correction is certain, and far outside its prior or far from what the other cameras need.
+
+    Only directions count that the drive observes.
+    """
+    corrections = prior.corrections(state)
+    if len(corrections) == 2:
+        return []  # they share the correction of their pair: see `find_wrong_pair`
+    if len(corrections) > MIN_OTHERS:
+        # What all cameras share is held, not observed, and one that is wrong has its part in how it is held.
+        corrections = corrections - np.median(corrections, axis=0)
+    corrections = np.where(directions.observed, corrections, 0.0)
+    sigma, posterior = _sigmas(prior, directions)
+    found = []
+    for c in range(len(corrections)):
+        verdicts = [
+            _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=floor)
+            for part, floor in ((slice(0, 3), np.radians(MIN_UNUSUAL_DEG)), (slice(3, 6), MIN_UNUSUAL_M))
+        ]
+        if not any(verdicts):
+            continue
+        size = np.stack([np.linalg.norm(corrections[:, :3], axis=1), np.linalg.norm(corrections[:, 3:], axis=1)])
+        others = np.median(np.delete(size, c, axis=1), axis=1)
+        found.append(
+            WrongCamera(
+                camera=c,
+                rotation_deg=float(np.degrees(size[0, c])),
+                translation_m=float(size[1, c]),
+                prior_sigmas=float(np.abs(corrections[c] / sigma[c]).max()),
+                others_rotation_deg=float(np.degrees(others[0])),
+                others_translation_m=float(others[1]),
+            )
+        )
+    return found
+
+
+def _sigmas(prior: CalibrationPrior, directions: Observability) -> tuple[Floats, Floats]:
+    """Standard deviations (c, 6) of corrections before and after the drive."""
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    # The common scale may be off: it moves all cameras, and is no fault of one.
+    return sigma, np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+
+
+def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:
+    own = corrections[camera]
+    if (np.abs(own) / posterior).max() < SIGNIFICANT_SIGMAS:
+        return False
+    if (np.abs(own) / sigma).max() > BEYOND_PRIOR_SIGMAS:
+        return True
+    others = np.linalg.norm(np.delete(corrections, camera, axis=0), axis=1)
+    usual = max(floor, UNUSUAL * float(np.median(others))) if len(others) >= MIN_OTHERS else np.inf
+    return bool(np.linalg.norm(own) > usual)
+
+
+def voted_out(registrations: Sequence[Registration], covered_units: set[int]) -> dict[str, int]:
+    """How often cameras were voted out, by name; in a unit with a covered image that is no fault of a camera."""
+    return dict(Counter(name for r in registrations for name in r.voted_out if r.unit not in covered_units))
+
+
+def finding(name: str, wrong: WrongCamera) -> Finding:
+    """What a user is told of a wrong camera."""
+    return warning(
+        "camera-miscalibrated",
+        f"camera {name} is turned by {wrong.rotation_deg:.2f} deg and moved by {wrong.translation_m:.3f} m from where "
+        f"rig.cameras says; the other cameras by {wrong.others_rotation_deg:.2f} deg and "
+        f"{wrong.others_translation_m:.3f} m as a rule",
+        "It was recalibrated: take its pose from calibration.json, and check how it is mounted.",
+    )
+
+
+def pair_finding(names: Sequence[str], wrong: WrongPair) -> Finding:
+    """What a user is told of a wrong pair."""
+    return warning(
+        "camera-miscalibrated",
+        f"cameras {names[0]} and {names[1]} are turned by {wrong.rotation_deg:.2f} deg and moved by "
+        f"{wrong.translation_m:.3f} m against each other from where rig.cameras says; which of them is wrong, two "
+        "cameras do not tell",
+        "They were recalibrated: take their poses from calibration.json, and check how both are mounted.",
+    )

@@ -1,0 +1,161 @@
+"""Moving the model to where the receiver, or rough poses, say that it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.priors import PositionPrior
+from mrasfm_engine.findings import Finding, warning
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
+from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.types import Floats, Ints
+
+MIN_CLOCK_OFFSET_S = 0.05
+CLOCK_OFFSET_SIGMAS = 5.0
+MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receiver's scale:
+SCALE_DISAGREEMENT_SIGMAS = 3.0
+MIN_ROUGH_POSES = 2
+MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
+SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
+
+
+@dataclass(kw_only=True)
+class Placement:
+    """How the model fits the receiver's positions; without a prior it does not, and the reason says why."""
+
+    prior: PositionPrior | None = None
+    reason: str = ""
+    alignment: GnssAlignment | None = None
+    units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that took part in aligning
+    findings: list[Finding] = field(default_factory=list)  # what a user should look at
+
+
+def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Placement:
+    """Move the model into the receiver's frame, and make its positions a prior for the adjustment.
+
+    The model keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
+    """
+    settings, times = model.config.gnss, model.drive.timestamps_us
+    measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
+    units = np.flatnonzero(model.registered & np.isfinite(measured[:, 0]))
+    single = model.drive.has_single_camera
+    if single and len(units) > 1:
+        scale_with_baselines(model, _extent(measured[units]) / _extent(model.state.unit_position_m[units]))
+    alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
+    for _ in range(SCALE_ROUNDS if single else 0):
+        if isinstance(alignment, GnssAlignment):
+            scale_with_baselines(model, alignment.scale)
+            alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
+    if isinstance(alignment, str):
+        return Placement(reason=alignment)
+    _move(model, alignment.world_from_model)
+    good = units[alignment.inlier]
+    correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
+    findings = []
+    if not single:
+        findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
+    prior = PositionPrior(
+        unit=good,
+        position_m=measured[good],
+        sigma_m=sigma[good] * alignment.noise_factor * np.sqrt(correlated),
+        lever_arm_m=np.asarray(antenna_in_rig_m),
+    )
+    return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
+
+
+def _align(model: Model, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats) -> GnssAlignment | str:
+    rotation = model.state.unit_rotation[units]
+    return align_with_gnss(
+        model.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
+        rotation[:, :, 2],
+        rotation[:, :, 0],
+        measured[units],
+        sigma[units],
+        outlier_sigmas=model.config.gnss.outlier_sigmas,
+        rng=np.random.default_rng(model.config.seed),
+    )
+
+
+def place_by_rough_poses(model: Model, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
+    """Move the model into the frame of the rough poses (units, 4, 4; NaN where unknown), by the units' own rotations.
+
+    One camera also gets its scale there. Returns whether there were poses enough.
+    """
+    units = np.flatnonzero(model.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
+    if len(units) < MIN_ROUGH_POSES:
+        return False
+    rough = rough_world_from_rig[units]
+    if model.drive.has_single_camera:
+        if _extent(rough[:, :3, 3]) < MIN_EXTENT_SIGMAS * sigma_translation_m:
+            return False
+        scale_with_baselines(model, _extent(rough[:, :3, 3]) / _extent(model.state.unit_position_m[units]))
+    own = model.state.world_from_rig[units]
+    rotation = robust_mean_rotation(rough[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
+    _move(model, se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T)))
+    return True
+
+
+def _extent(position_m: Floats) -> float:
+    """Median distance of positions from their median: a size that single wrong ones do not change."""
+    return max(float(np.median(np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1))), 1e-9)
+
+
+def _move(model: Model, world_from_model: Floats) -> None:
+    state = model.state
+    state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
+    state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)
+    state.points_m[:] = se3.apply(world_from_model, state.points_m)
+
+
+def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> float:
+    """How many samples share one error, as errors of a receiver change slowly: their information counts once."""
+    if len(times_us) < 2:
+        return 1.0
+    return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
+
+
+def _findings(
+    model: Model,
+    alignment: GnssAlignment,
+    measured_m: Floats,
+    sigma_m: Floats,
+    units: Ints,
+    antenna_in_rig_m: Floats,
+    correlated: float,
+) -> list[Finding]:
+    """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
+    findings = []
+    antenna = model.state.unit_position_m[units] + model.state.unit_rotation[units] @ antenna_in_rig_m
+    centre = antenna.mean(0)
+    fitted = centre + alignment.scale * (antenna - centre)
+    times = model.drive.timestamps_us[units]
+    offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, times)
+    # The receiver's errors change slowly, so its samples know less of the clock than independent ones would.
+    inflation = float(np.sqrt(correlated))
+    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * inflation * offset[1]):
+        direction = "ahead of" if offset[0] > 0 else "behind"
+        findings.append(
+            warning(
+                "gnss-clock-offset",
+                f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
+                f"(sigma {inflation * offset[1]:.2f} s)",
+                "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
+            )
+        )
+    _, sigma_rig = scale_of_baselines(model)
+    sigma = float(np.hypot(sigma_rig, inflation * alignment.sigma_scale))
+    if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
+        findings.append(
+            warning(
+                "scale-disagreement",
+                f"GNSS makes the way {alignment.scale:.3f} times as long as the rig does",
+                "Check the baselines in rig.cameras (metres), and the receiver's positions.",
+            )
+        )
+    return findings

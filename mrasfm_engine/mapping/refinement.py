@@ -1,0 +1,328 @@
+"""From the grown model to the scene: georeferencing, the final camera set bundle adjustments, and their certainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, judge_directions
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions, solve
+from mrasfm_engine.errors import ReconstructionError
+from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.calibration import (
+    MAX_UNKNOWNS_FOR_COVARIANCE,
+    CalibrationDecision,
+    calibration_prior,
+    judge_calibration,
+    scale_of_baselines,
+    scale_with_baselines,
+    settle_scale,
+)
+from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.miscalibration import MIN_OTHERS, WrongCamera, WrongPair, find_wrong_cameras, find_wrong_pair
+from mrasfm_engine.mapping.placement import Placement, place_by_gnss, place_by_rough_poses
+from mrasfm_engine.mapping.road import RoadJudgement, drop_off_road
+from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
+
+ROUNDS = 2  # of adjusting, triangulating anew and filtering
+TOLERANCE = 1e-6
+DECREMENT_TOLERANCE = 3e-2  # of the last step of the last round: a quarter of a standard deviation
+ROUGH_DECREMENT_TOLERANCE = 0.5  # in those before, after which observations change anyway
+INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
+SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
+
+
+@dataclass(kw_only=True)
+class Refinement:
+    """What the last stage did."""
+
+    sigma_px: float = 1.0
+    placement: Placement | None = None  # by GNSS, where it was to be used
+    placed_by_rough_poses: bool = False
+    calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
+    focal_free: bool = False
+    recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
+    adjustments: list[Report] = field(default_factory=list)
+    observations_dropped: int = 0
+    points_dropped: int = 0
+    units_dropped: list[int] = field(default_factory=list)
+    certainty: Covariances | None = None
+    directions: Observability | None = None  # of the cameras' poses; None where it is not known
+    held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
+    wrong_cameras: list[WrongCamera] = field(default_factory=list)
+    wrong_pair: WrongPair | None = None  # of a rig of two cameras
+    road: RoadJudgement | str = "semantic_triangulation is switched off"  # the last one, or why there is none
+
+    @property
+    def georeferenced(self) -> bool:
+        """Whether the scene stands where the receiver says."""
+        return self.placement is not None and self.placement.prior is not None
+
+
+def refine(
+    model: Model,
+    *,
+    gnss: GnssTrack | None,
+    antenna_in_rig_m: Floats | None,
+    rough_world_from_rig: Floats | None,
+    progress: CountProgress | None = None,
+    cancel: Cancel | None = None,
+) -> Refinement:
+    """Georeference the model where positions allow, adjust everything with all priors, and tell how certain it is.
+
+    Parameters
+    ----------
+    gnss, antenna_in_rig_m
+        The receiver's track in the local frame and the lever arm (3,), or None.
+    rough_world_from_rig
+        Rough poses (units, 4, 4): without GNSS the scene is moved into their frame.
+    """
+    result = Refinement()
+    positions = None
+    if gnss is not None and antenna_in_rig_m is not None:
+        result.placement = place_by_gnss(model, gnss, antenna_in_rig_m)
+        positions = result.placement.prior
+    rough = model.drive.manifest.rough_poses
+    placed = positions is not None
+    if not placed and rough_world_from_rig is not None and rough is not None:
+        placed = place_by_rough_poses(model, rough_world_from_rig, rough.sigma_translation_m)
+        result.placed_by_rough_poses = placed
+    if not placed and model.drive.has_single_camera:
+        raise ReconstructionError(
+            "one camera tells no scale, and neither GNSS nor rough poses could: "
+            + (result.placement.reason if result.placement is not None else "the drive has none that are usable"),
+            remedy="Give a second camera with its baseline, or positions that follow the car's way.",
+            code="no-metric-scale",
+        )
+    free_units = _free_units(model, georeferenced=positions is not None and model.config.adjustment.priors)
+    result.sigma_px = _observation_sigma(model)
+    result.calibration = judge_calibration(
+        model,
+        free_units=free_units,
+        terms=_terms(model, positions, result),
+        georeferenced=positions is not None,
+        options=_options(model, result.sigma_px),
+    )
+    result.recalibrated = np.full(len(model.camera_kind), result.calibration.free)
+    if not result.calibration.free:
+        result.recalibrated = _wrong_although_held(model, free_units, positions, result, cancel)
+    result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
+    _settle(model, result, _terms(model, positions, result))
+    for done in range(ROUNDS):
+        is_last = done == ROUNDS - 1
+        result.sigma_px = _observation_sigma(model)
+        terms = _terms(model, positions, result)
+        result.adjustments.append(
+            model.adjust(
+                free_units & model.registered,
+                free_cameras=result.recalibrated,
+                free_focal=result.focal_free,
+                terms=terms,
+                options=_options(model, result.sigma_px, rough=not is_last),
+                cancel=cancel,
+            )
+        )
+        _settle(model, result, terms)
+        if is_last:
+            model.readmit()
+        else:
+            model.complete()
+        observations, points = model.filter(model.config.mapping.filter_error_px)
+        if model.config.mapping.semantic_triangulation:
+            result.road = drop_off_road(model, final=is_last)
+        result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
+        result.observations_dropped += observations
+        result.points_dropped += points
+        if progress is not None:
+            progress(done + 1, ROUNDS)
+    result.units_dropped = sorted(set(result.units_dropped))
+    result.certainty = _certainty(model, positions, result)
+    result.directions = _directions(model, result.certainty)
+    if result.recalibrated.any() and result.directions is not None:
+        if result.calibration.free and result.directions.to_hold.any():
+            _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
+        if result.georeferenced and result.directions.scale_only_prior:
+            scale_with_baselines(model, scale_of_baselines(model)[0])
+        known = calibration_prior(model), model.state, result.directions
+        result.wrong_cameras = find_wrong_cameras(*known)
+        result.wrong_pair = find_wrong_pair(*known)
+    return result
+
+
+def _wrong_although_held(
+    model: Model,
+    free_units: Bools,
+    positions: PositionPrior | None,
+    result: Refinement,
+    cancel: Cancel | None,
+) -> Bools:
+    """Cameras (c,) that are clearly wrong although the drive may not change the calibration as a whole.
+
+    A straight street leaves the scale to the calibration, but shows very well that one camera looks elsewhere than the
+    others say. It is tried with all cameras free; the result is used for nothing else.
+    """
+    cameras = len(model.camera_kind)
+    wrong = np.zeros(cameras, dtype=np.bool_)
+    if cameras <= MIN_OTHERS or not model.config.adjustment.refine_calibration or model.drive.has_single_camera:
+        return wrong
+    problem, _ = model.problem(
+        free_units,
+        free_cameras=np.ones(cameras, dtype=np.bool_),
+        terms=[calibration_prior(model), *_terms(model, positions, result)],
+        options=_options(model, result.sigma_px, rough=True),
+    )
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
+        return wrong
+    solution, _ = solve(problem, cancel=cancel)
+    directions = _directions(model, covariances(problem, solution))
+    if directions is not None:
+        for found in find_wrong_cameras(calibration_prior(model), solution, directions):
+            wrong[found.camera] = True
+    return wrong if (~wrong).sum() >= MIN_OTHERS else np.zeros_like(wrong)
+
+
+def _directions(model: Model, certainty: Covariances | None) -> Observability | None:
+    cameras = len(model.camera_kind)
+    if certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
+        return None
+    prior = calibration_prior(model)
+    return judge_directions(
+        certainty.calibration,
+        position_m=model.state.camera_position_m,
+        sigma_rotation_rad=prior.sigma_rotation_rad,
+        sigma_translation_m=prior.sigma_translation_m,
+    )
+
+
+def _hold_unobserved(
+    model: Model,
+    positions: PositionPrior | None,
+    result: Refinement,
+    free_units: Bools,
+    cancel: Cancel | None,
+) -> None:
+    """Adjust once more with what the drive does not observe held as given.
+
+    A direction of which the drive knows a little would else carry a correction that is mostly noise, and pass for a
+    finding.
+    """
+    assert result.directions is not None
+    result.held = result.directions.to_hold
+    terms = _terms(model, positions, result)
+    result.adjustments.append(
+        model.adjust(
+            free_units,
+            free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
+            free_focal=result.focal_free,
+            terms=terms,
+            options=_options(model, result.sigma_px),
+            cancel=cancel,
+        )
+    )
+    _settle(model, result, terms)
+
+
+def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
+    """Let the priors and the positions say the scale, where the calibration and with it the scale may vary."""
+    several = not model.drive.has_single_camera
+    if result.calibration.free and several and terms and model.config.adjustment.camera_set_adjustment:
+        settle_scale(model, terms)
+
+
+def _options(model: Model, sigma_px: float, *, rough: bool = False) -> SolverOptions:
+    return SolverOptions(
+        max_iterations=15 if rough else 40,
+        function_tolerance=TOLERANCE,
+        decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
+        initial_damping=INITIAL_DAMPING,
+        loss_scale=model.config.adjustment.loss_scale,
+        sigma_px=sigma_px,
+        threads=model.config.threads,
+    )
+
+
+def _free_units(model: Model, *, georeferenced: bool) -> Bools:
+    """All registered units; without positions the first one holds the frame."""
+    free = model.registered.copy()
+    if not georeferenced:
+        free[np.flatnonzero(free)[0]] = False
+    return free
+
+
+def _observation_sigma(model: Model) -> float:
+    """Standard deviation of an image coordinate, from the median error and the redundancy of the points."""
+    rows = np.flatnonzero(model.kept)
+    if not len(rows):
+        raise ReconstructionError(
+            "no point of the scene is left after filtering",
+            remedy="Check the cameras' intrinsics, and that the images belong to them.",
+            code="nothing-left",
+        )
+    tracks = model.tracks.of_keypoint[rows]
+    errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, tracks)
+    points = np.count_nonzero(np.bincount(tracks))
+    redundancy = max(0.1, 1.0 - 3.0 * points / (2.0 * len(rows)))
+    # The squared length of a 2D normal error has the median 2 ln 2 sigma^2.
+    sigma = float(np.sqrt(np.median(errors**2) / (2 * np.log(2)) / redundancy))
+    return float(np.clip(sigma, *SIGMA_PX_RANGE))
+
+
+def _terms(model: Model, positions: PositionPrior | None, result: Refinement) -> list[Term]:
+    terms: list[Term] = []
+    if not model.config.adjustment.priors:
+        return terms
+    if result.calibration.free:
+        terms.append(calibration_prior(model, result.held))
+    elif result.recalibrated.any():
+        # The cameras that stay hold the gauge.
+        terms.append(replace(calibration_prior(model), gauge_weights=(~result.recalibrated).astype(np.float64)))
+    if result.focal_free:
+        terms.append(_focal_prior(model))
+    if positions is not None:
+        terms += [
+            positions,
+            UprightPrior(
+                unit=np.flatnonzero(model.registered),
+                sigma_roll_rad=float(SIGMA_ROLL_RAD),
+                sigma_pitch_rad=float(SIGMA_PITCH_RAD),
+            ),
+        ]
+    return terms
+
+
+def _focal_prior(model: Model) -> FocalPrior:
+    given = np.array([camera.params[0] for camera in model.drive.cameras])
+    sigma = np.array([camera.sigma_focal_px or np.nan for camera in model.drive.cameras]) / given
+    return FocalPrior(focal_px=given, sigma=np.where(np.isfinite(sigma), sigma, model.config.adjustment.sigma_focal))
+
+
+def _certainty(model: Model, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
+    """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
+
+    None where they would not be those of what was adjusted, and where there is too much for an inverse.
+    """
+    if not (model.config.adjustment.priors and model.config.adjustment.camera_set_adjustment):
+        return None
+    several = not model.drive.has_single_camera
+    terms = [
+        term
+        for term in _terms(model, positions, result)
+        if result.calibration.free or not isinstance(term, CalibrationPrior)
+    ]
+    if several and not result.calibration.free:
+        terms.append(calibration_prior(model))
+    problem, _ = model.problem(
+        _free_units(model, georeferenced=positions is not None),
+        free_cameras=np.full(len(model.camera_kind), several),
+        free_focal=result.focal_free,
+        terms=terms,
+        options=_options(model, result.sigma_px),
+    )
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
+        return None
+    return covariances(problem, problem.state)

@@ -1,0 +1,1 @@
+"""Matching: image pairs are selected, matched, and verified geometrically."""

@@ -1,0 +1,145 @@
+"""Trained matchers, each behind the `Matcher` interface. They see where keypoints lie, not only what they look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.learned.network import Network
+from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.types import Floats32, Ints, Ints32
+
+LIGHTGLUE_MIN_SCORE = 0.1  # the published value
+SUPERGLUE_MIN_SCORE = 0.2
+LIGHTERGLUE_MIN_SCORE = 0.3  # half of the wrong matches that 0.1 lets through, four fifths of the right ones
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """One image's keypoints as a network takes them."""
+
+    xy: Floats32  # (1, n, 2)
+    descriptors: Floats32  # (1, n, D)
+    scores: Floats32  # (1, n)
+    size: Floats32  # (1, 2) width, height in pixels
+
+    @property
+    def count(self) -> int:
+        """n."""
+        return int(self.xy.shape[1])
+
+
+class LearnedMatcher:
+    """What all trained matchers share: the first keypoints of an image, in the network's own units."""
+
+    usual_min_score = LIGHTGLUE_MIN_SCORE
+
+    def __init__(self, network: Network, config: MatchConfig) -> None:
+        self.network = network
+        self._count = config.max_keypoints
+        self._min_score = self.usual_min_score if config.min_score is None else config.min_score
+
+    def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Prepared:
+        """See `Matcher`; of the image only its first keypoints, which are worth most, are matched."""
+        xy = np.ascontiguousarray(features.xy_px[: self._count], dtype=np.float32)
+        size = np.array([width, height], np.float32)
+        scores = np.ones(len(xy), np.float32) if features.scores is None else features.scores[: self._count]
+        return Prepared(
+            xy=self._units(xy, size)[None].astype(np.float32),
+            descriptors=np.ascontiguousarray(features.descriptors[: self._count], dtype=np.float32)[None],
+            scores=np.ascontiguousarray(scores, dtype=np.float32)[None],
+            size=size[None],
+        )
+
+    def match(self, a: Prepared, b: Prepared) -> Ints32:
+        """See `Matcher`."""
+        # Networks are exported with attention over at least one keypoint, some with the two best of them.
+        if a.count < 2 or b.count < 2:
+            return np.zeros((0, 2), np.int32)
+        pairs, scores = self._run(a, b)
+        self._check(pairs, scores, (a.count, b.count))
+        return np.ascontiguousarray(pairs[scores >= self._min_score], dtype=np.int32)
+
+    def _check(self, pairs: Ints, scores: Floats32, counts: tuple[int, int]) -> None:
+        """An index that is out of range would else be some other keypoint's, or an error without a name."""
+        fits = pairs.ndim == 2 and pairs.shape[1] == 2 and scores.shape == pairs.shape[:1]
+        if not fits or (len(pairs) and (pairs.min() < 0 or (pairs.max(axis=0) >= counts).any())):
+            raise InputError(
+                f"model {self.network.name} gives matches {list(pairs.shape)} with scores {list(scores.shape)} that "
+                f"are not between its {counts[0]} and {counts[1]} keypoints",
+                remedy="Export it so that it takes any number of keypoints and gives indices of both, without padding.",
+                code="bad-model",
+            )
+
+    def _units(self, xy_px: Floats32, size: Floats32) -> Floats32:
+        """Keypoints as LightGlue was trained: about the image's centre, half the longer side the unit."""
+        result: Floats32 = (xy_px - np.float32(0.5) - size / 2) / (size.max() / 2)
+        return result
+
+    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
+        """Pairs (m, 2) and their scores (m,)."""
+        raise NotImplementedError
+
+    def _feed(self, a: Prepared, b: Prepared) -> dict[str, Floats32]:
+        return {"kpts0": a.xy, "kpts1": b.xy, "desc0": a.descriptors, "desc1": b.descriptors}
+
+
+class LighterGlueMatcher(LearnedMatcher):
+    """LightGlue with three layers for XFeat's descriptors; with so few of them low scores are often wrong."""
+
+    usual_min_score = LIGHTERGLUE_MIN_SCORE
+
+    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
+        found = self.network.run(self._feed(a, b))
+        return found["matches"], found["scores"]
+
+
+class LightGlueMatcher(LearnedMatcher):
+    """LightGlue (Lindenberger et al., ICCV 2023) as fabio-sim/LightGlue-ONNX exports it."""
+
+    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
+        found = self.network.run(self._feed(a, b))
+        return found["matches0"], found["mscores0"]
+
+
+class ColmapLightGlueMatcher(LearnedMatcher):
+    """LightGlue as COLMAP publishes it, which brings keypoints into its units itself."""
+
+    def _units(self, xy_px: Floats32, size: Floats32) -> Floats32:
+        return xy_px - np.float32(0.5)
+
+    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
+        found = self.network.run({**self._feed(a, b), "image_size0": a.size, "image_size1": b.size})
+        partner = found["matches0"].astype(np.int64)
+        matched = np.flatnonzero(partner >= 0)
+        return np.stack([matched, partner[matched]], axis=1), found["mscores0"][matched]
+
+
+class SuperGlueMatcher(LearnedMatcher):
+    """SuperGlue (Sarlin et al., CVPR 2020): mutual maxima of its assignment."""
+
+    usual_min_score = SUPERGLUE_MIN_SCORE
+
+    def _units(self, xy_px: Floats32, size: Floats32) -> Floats32:
+        result: Floats32 = (xy_px - np.float32(0.5) - size / 2) / (np.float32(0.7) * size.max())
+        return result
+
+    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
+        found = self.network.run(
+            {
+                "keypoints_0": a.xy,
+                "scores_0": a.scores,
+                "descriptors_0": np.ascontiguousarray(a.descriptors.transpose(0, 2, 1)),
+                "keypoints_1": b.xy,
+                "scores_1": b.scores,
+                "descriptors_1": np.ascontiguousarray(b.descriptors.transpose(0, 2, 1)),
+            }
+        )
+        # The last row and column stand for "no partner"; as in the published code the threshold decides that.
+        assignment = found["scores"][0, :-1, :-1]
+        best = assignment.argmax(axis=1)
+        mutual = np.flatnonzero(assignment.argmax(axis=0)[best] == np.arange(len(best)))
+        return np.stack([mutual, best[mutual]], axis=1), np.exp(assignment[mutual, best[mutual]])

@@ -1,0 +1,1 @@
+"""Checks of a drive that take seconds, before hours of work."""

@@ -1,0 +1,186 @@
+"""Checks a drive's GNSS samples before hours of work rest on them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.findings import Finding, error, listed, warning
+from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
+from mrasfm_engine.io.heights import ellipsoidal_heights
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.types import Bools, Floats, Ints
+from schemas import Gnss
+
+# Between GPS time and UTC: 18 s since 2017; a neighbouring value betrays an old table of leap seconds.
+LEAP_SECONDS = (18, 17, 19)
+MAX_SPEED_MPS = 100.0
+JUMP_SIGMAS = 4.0
+# Positions this far beyond the first or last sample can be extrapolated: in samples, and at most in time.
+EXTRAPOLATED_SAMPLES = 1.5
+MAX_EXTRAPOLATION_US = 2_000_000
+
+
+def check_gnss(drive: Drive) -> list[Finding]:
+    """Findings about the manifest's GNSS samples; none if it has no `gnss`."""
+    gnss = drive.manifest.gnss
+    if gnss is None:
+        return []
+    if not gnss.samples:
+        return [
+            error("gnss-empty", "gnss.samples is empty", "Give samples, take gnss out of drive.json, or use --no-gnss.")
+        ]
+    times = np.array([sample.timestamp_us for sample in gnss.samples], dtype=np.int64)
+    findings = _check_order(times)
+    if findings:
+        return findings  # the rest assumes an order
+    try:
+        heights = ellipsoidal_heights(gnss)
+    except InputError as problem:
+        return [error(problem.code, problem.what, problem.remedy), *_check_cover(drive, times)]
+    positions = _positions(gnss, heights, swapped=False)
+    return [*_check_cover(drive, times), *_check_jumps(gnss, times, positions), *_check_swapped(drive, times, heights)]
+
+
+def _check_order(times: Ints) -> list[Finding]:
+    back = np.flatnonzero(np.diff(times) < 0) + 1
+    same = np.flatnonzero(np.diff(times) == 0) + 1
+    findings = []
+    if len(back):
+        i = int(back[0])
+        findings.append(
+            error(
+                "gnss-order",
+                f"gnss.samples.{i}.timestamp_us goes back from {times[i - 1]} to {times[i]} ({len(back)} such samples)",
+                "Sort the samples by time; a clock that was set back in between splits the drive in two.",
+            )
+        )
+    if len(same):
+        i = int(same[0])
+        findings.append(
+            error(
+                "gnss-repeats",
+                f"gnss.samples.{i}.timestamp_us repeats {times[i]} ({len(same)} such samples)",
+                "Keep one sample of every instant.",
+            )
+        )
+    return findings
+
+
+def _image_times(drive: Drive) -> Ints:
+    times = [image.timestamp_us for image in drive.images]
+    return np.array(times, dtype=np.int64) if times else drive.timestamps_us
+
+
+def _covered(images: Ints, samples: Ints) -> Bools:
+    spacing = float(np.median(np.diff(samples))) if len(samples) > 1 else 0.0
+    slack = min(EXTRAPOLATED_SAMPLES * spacing, MAX_EXTRAPOLATION_US)
+    covered: Bools = (images >= samples[0] - slack) & (images <= samples[-1] + slack)
+    return covered
+
+
+def _check_cover(drive: Drive, times: Ints) -> list[Finding]:
+    images = _image_times(drive)
+    covered = _covered(images, times)
+    if covered.all():
+        return []
+    span = (
+        f"the images span {_seconds(images.min())} to {_seconds(images.max())} s, the GNSS samples "
+        f"{_seconds(times[0])} to {_seconds(times[-1])} s"
+    )
+    for leap in LEAP_SECONDS:
+        for sign, direction in ((1, "early"), (-1, "late")):
+            if _covered(images, times + sign * leap * 1_000_000).all():
+                # A receiver that began late and ran on would look the same, unless just that time is missing.
+                edge = (images.max() - times[-1] if sign > 0 else times[0] - images.min()) / 1e6
+                certain = covered.mean() < 0.5 or abs(edge - leap) < 1.0
+                finding = error if certain else warning
+                return [
+                    finding(
+                        "gnss-leap-seconds",
+                        f"{span}; the samples {'are' if certain else 'may be'} {leap} s too {direction}, as when one "
+                        "clock counts GPS time and the other UTC",
+                        f"{'' if certain else 'If so: '}{'Add' if sign > 0 else 'Subtract'} {leap * 1_000_000} "
+                        f"{'to' if sign > 0 else 'from'} every gnss.samples timestamp_us, or convert both clocks to "
+                        "one.",
+                    )
+                ]
+    remedy = "Give samples of the drive's whole time on the clock of the images, or use --no-gnss."
+    if covered.mean() < 0.5:
+        return [
+            error("gnss-not-covering", f"{span}: {int((~covered).sum())} of {len(images)} images have none", remedy)
+        ]
+    what = f"{span}: {int((~covered).sum())} of {len(images)} images are without GNSS"
+    return [warning("gnss-partial", what, "Nothing needs to be done; positions there come from the images alone.")]
+
+
+def _seconds(time_us: np.int64) -> str:
+    return f"{int(time_us) / 1e6:.3f}"
+
+
+def _positions(gnss: Gnss, heights: Floats, *, swapped: bool) -> Floats:
+    """Local east, north, up (samples, 3) at the first sample, metres; `swapped` exchanges latitude and longitude."""
+    latitude = np.array([sample.latitude_deg for sample in gnss.samples])
+    longitude = np.array([sample.longitude_deg for sample in gnss.samples])
+    geodetic = np.stack([longitude, latitude, heights] if swapped else [latitude, longitude, heights], -1)
+    return local_from_geodetic(geodetic, ecef_from_local(geodetic[0]))
+
+
+def _check_jumps(gnss: Gnss, times: Ints, positions: Floats) -> list[Finding]:
+    sigma = np.array([sample.sigma_horizontal_m for sample in gnss.samples])
+    seconds = np.diff(times) / 1e6
+    distance = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    excess = distance - JUMP_SIGMAS * np.hypot(sigma[1:], sigma[:-1])
+    jumps = np.flatnonzero(excess > MAX_SPEED_MPS * seconds) + 1
+    if not len(jumps):
+        return []
+    i = int(jumps[0])
+    return [
+        warning(
+            "gnss-jump",
+            f"GNSS jumps at {listed([f'gnss.samples.{k}' for k in jumps])}: {distance[i - 1]:.0f} m in "
+            f"{seconds[i - 1]:g} s at the first",
+            "Nothing needs to be done for single outliers, which are rejected; for many, check the receiver's data or "
+            "give larger sigmas.",
+        )
+    ]
+
+
+def _check_swapped(drive: Drive, times: Ints, heights: Floats) -> list[Finding]:
+    """Compares the track with the rough poses: swapped latitude and longitude mirror and stretch it."""
+    gnss, rough = drive.manifest.gnss, drive.manifest.rough_poses
+    assert gnss is not None
+    if rough is None or max(abs(sample.longitude_deg) for sample in gnss.samples) > 90:
+        return []
+    rough_times = np.array([pose.timestamp_us for pose in rough.poses], dtype=np.int64)
+    inside = (rough_times >= times[0]) & (rough_times <= times[-1])
+    if inside.sum() < 3:
+        return []
+    track = np.array([pose.world_from_rig.translation_m[:2] for pose in rough.poses])[inside]
+    residual = {
+        swapped: _misfit(track, _at(rough_times[inside], times, _positions(gnss, heights, swapped=swapped)[:, :2]))
+        for swapped in (False, True)
+    }
+    noise = float(np.median([sample.sigma_horizontal_m for sample in gnss.samples])) + rough.sigma_translation_m
+    if residual[False] < 3 * noise or residual[True] > residual[False] / 3:
+        return []
+    return [
+        error(
+            "gnss-swapped",
+            f"the GNSS track differs from the rough poses by {residual[False]:.1f} m, and by {residual[True]:.1f} m "
+            "with latitude and longitude exchanged",
+            "Exchange latitude_deg and longitude_deg in gnss.samples.",
+        )
+    ]
+
+
+def _at(when: Ints, times: Ints, positions: Floats) -> Floats:
+    return np.stack([np.interp(when, times, positions[:, axis]) for axis in range(positions.shape[1])], -1)
+
+
+def _misfit(a: Floats, b: Floats) -> float:
+    """Root mean square distance (m) of two plane tracks (n, 2) after the best rotation and shift."""
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    rotation = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.sqrt(((a @ rotation - b) ** 2).sum(1).mean()))

@@ -1,0 +1,192 @@
+"""Checks a drive's image and mask files from their headers, and the ids of masks from their pixels."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.findings import Finding, Severity, error, listed, warning
+from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
+from mrasfm_engine.io.images import check_image_header, check_mask_header, read_mask
+from mrasfm_engine.scene.drive import Drive, DriveImage
+from mrasfm_engine.types import CountProgress
+
+MASK_THREADS = 4
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+# Per code: severity, what is wrong with "N images" (%s is the list of files), remedy.
+_GROUPED = {
+    "alpha-channel": ("have an alpha channel, which is ignored", "Nothing needs to be done."),
+    "16-bit-image": ("have 16 bits a channel and are read with 8", "Nothing needs to be done."),
+    "palette-image": ("have a palette: their colours are quantised", "Give the camera's own images if you can."),
+}
+
+
+def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Finding]:
+    """Findings about all files that the manifest lists, and about images that it does not.
+
+    Parameters
+    ----------
+    progress
+        Called with how many of how many images are checked.
+    """
+    findings: list[Finding] = []
+    paths = _PathCheck(drive.root)
+    oddities: dict[str, list[str]] = {code: [] for code in _GROUPED}
+    # One mask may serve many images, as that of the own car's body.
+    masks = list({(i.mask, i.camera): i for i in drive.images if i.mask is not None}.values())
+    total = len(drive.images) + len(masks)
+    with ThreadPoolExecutor(MASK_THREADS) as pool:
+        for done, (image, result) in enumerate(
+            zip(drive.images, pool.map(lambda i: _check_image(drive, i, paths), drive.images), strict=True), start=1
+        ):
+            findings += result[0]
+            for code in result[1]:
+                oddities[code].append(image.file)
+            if progress is not None:
+                progress(done, total)
+        for done, found in enumerate(pool.map(lambda i: _check_mask(drive, i, paths), masks), start=1):
+            findings += found
+            if progress is not None:
+                progress(len(drive.images) + done, total)
+    for code, (state, remedy) in _GROUPED.items():
+        if oddities[code]:
+            files = oddities[code]
+            findings.append(warning(code, f"{len(files)} images {state}: {listed(files)}", remedy))
+    return [*_gather(findings), *_unlisted(drive)]
+
+
+class _PathCheck:
+    """Refuses files that a symbolic link puts outside the drive; folders are resolved once."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root.resolve()
+        self._inside: dict[Path, bool] = {}
+
+    def check(self, path: Path, name: str) -> None:
+        folder = path.parent
+        if folder not in self._inside:
+            self._inside[folder] = self._is_inside(folder)
+        if not self._inside[folder] or (path.is_symlink() and not self._is_inside(path)):
+            raise InputError(
+                f"file {name} is a link to a place outside the drive",
+                remedy="Put the file itself into the drive's folder.",
+                code="path-escapes",
+            )
+
+    def _is_inside(self, path: Path) -> bool:
+        try:
+            return path.resolve().is_relative_to(self._root)
+        except (OSError, RuntimeError):  # links in a circle
+            return False
+
+
+def _check_image(drive: Drive, image: DriveImage, paths: _PathCheck) -> tuple[list[Finding], list[str]]:
+    """Findings, and codes of oddities that are reported once for all images."""
+    path, camera = drive.root / image.file, drive.cameras[image.camera]
+    try:
+        paths.check(path, image.file)
+        header = read_header(path)
+        check_image_header(header, path)
+    except InputError as problem:
+        return [_finding(problem, path, image.file)], []
+    findings = []
+    if (header.width, header.height) != (camera.width, camera.height):
+        findings.append(
+            error(
+                "image-size",
+                f"image {image.file} has {header.width}x{header.height} pixels, the calibration of camera "
+                f"{camera.name} is for {camera.width}x{camera.height}",
+                "Give the images that the calibration was made for, or scale its width, height and params to them.",
+            )
+        )
+    if header.orientation != 1:
+        findings.append(
+            error(
+                "exif-orientation",
+                f"image {image.file} is stored turned (EXIF orientation {header.orientation}), and images are read as "
+                "they are stored",
+                "Save it upright without the EXIF orientation, or remove the tag if the calibration is for the stored "
+                "pixels.",
+            )
+        )
+    return findings, _oddities(header)
+
+
+def _oddities(header: ImageHeader) -> list[str]:
+    codes = []
+    if header.kind in (ImageKind.RGBA, ImageKind.GRAY_ALPHA):
+        codes.append("alpha-channel")
+    if header.bits == 16:
+        codes.append("16-bit-image")
+    if header.kind is ImageKind.PALETTE:
+        codes.append("palette-image")
+    return codes
+
+
+def _check_mask(drive: Drive, image: DriveImage, paths: _PathCheck) -> list[Finding]:
+    assert image.mask is not None
+    path, camera = drive.root / image.mask, drive.cameras[image.camera]
+    try:
+        paths.check(path, image.mask)
+        header = read_header(path)
+        check_mask_header(header, path)
+        check_image_header(header, path)
+        if (header.width, header.height) != (camera.width, camera.height):
+            raise InputError(
+                f"mask {image.mask} has {header.width}x{header.height} pixels, its image has "
+                f"{camera.width}x{camera.height}",
+                remedy="Give masks of their images' size, without interpolating between ids.",
+                code="mask-size",
+            )
+        read_mask(path, drive.manifest.label_map)
+    except InputError as problem:
+        return [_finding(problem, path, image.mask)]
+    return []
+
+
+def _finding(problem: InputError, path: Path, name: str) -> Finding:
+    # By its name in the drive: where the drive lies on this machine is of no interest to who sent it.
+    return error(problem.code, problem.what.replace(str(path), name), problem.remedy)
+
+
+def _gather(findings: list[Finding], shown: int = 5) -> list[Finding]:
+    """The first few findings of each code, and one more that counts the rest: a drive has thousands of images."""
+    by_code: dict[str, list[Finding]] = {}
+    for finding in findings:
+        by_code.setdefault(finding.code, []).append(finding)
+    result = []
+    for code, group in by_code.items():
+        result += group[:shown]
+        if len(group) > shown:
+            last = group[-1]
+            result.append(
+                Finding(
+                    severity=Severity(last.severity),
+                    code=code,
+                    what=f"the same holds for {len(group) - shown} more files",
+                    remedy=last.remedy,
+                )
+            )
+    return result
+
+
+def _unlisted(drive: Drive) -> Iterator[Finding]:
+    known = {image.file for image in drive.images} | {image.mask for image in drive.images}
+    extra = []
+    for folder in sorted({Path(image.file).parent for image in drive.images}):
+        try:
+            names = sorted(entry.name for entry in os.scandir(drive.root / folder))
+        except OSError:
+            continue  # its images are reported as missing
+        files = [(folder / name).as_posix() for name in names if name.lower().endswith(IMAGE_SUFFIXES)]
+        extra += [file for file in files if file not in known]
+    if extra:
+        yield warning(
+            "unlisted-images",
+            f"{len(extra)} images in the drive's folders are not in drive.json and are ignored: {listed(extra)}",
+            "List them in drive.json if they belong to the drive.",
+        )

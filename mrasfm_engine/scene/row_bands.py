@@ -1,0 +1,86 @@
+"""The instants at which images were taken: cameras of a unit need not be simultaneous, nor rows of an image.
+
+A *shot* is a band of rows of one image: so short a time that the vehicle stands still in it. An image without a
+declared readout time is one shot, and then shots and images have the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.types import Floats, Ints
+
+MAX_BAND_S = 0.5e-3  # at 15 m/s a car goes 7 mm in that time
+MAX_BANDS = 65  # an image, which makes 33 ms of bands that short
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shots:
+    """All shots of a drive, by image and then from the first row to the last."""
+
+    image: Ints  # (s,) index into Drive.images
+    unit: Ints  # (s,)
+    camera: Ints  # (s,)
+    time_offset_s: Floats  # (s,) when the shot's middle row was taken, from its unit's timestamp on
+    first_of_image: Ints  # (images + 1,) shots of image i: first[i]:first[i + 1]
+    height_px: Ints  # (cameras,)
+
+    @staticmethod
+    def of(drive: Drive, *, compensate: bool = True) -> Shots:
+        """The shots of a drive. Without `compensate` all are taken as if at their unit's timestamp."""
+        bands = np.array([_bands(camera.readout_us) if compensate else 1 for camera in drive.cameras], dtype=np.int64)
+        readout_s = np.array([(camera.readout_us or 0) / 1e6 for camera in drive.cameras])
+        camera_of_image = np.array([image.camera for image in drive.images], dtype=np.int64)
+        unit_of_image = np.array([image.unit for image in drive.images], dtype=np.int64)
+        first = np.concatenate([[0], np.cumsum(bands[camera_of_image])]).astype(np.int64)
+        image = np.repeat(np.arange(len(drive.images), dtype=np.int64), bands[camera_of_image])
+        offset_s = np.zeros(len(image))
+        if compensate:
+            taken_us = np.array([i.timestamp_us for i in drive.images], dtype=np.int64)
+            of_image_s = (taken_us - drive.timestamps_us[unit_of_image]) / 1e6
+            camera = camera_of_image[image]
+            # An image's timestamp is that of its middle row; the number of bands is odd, so one of them is there.
+            place = (np.arange(len(image)) - first[image] + 0.5) / bands[camera] - 0.5
+            offset_s = of_image_s[image] + place * readout_s[camera]
+            if np.abs(offset_s).max(initial=0.0) <= MAX_BAND_S:
+                offset_s[:] = 0.0  # clocks that jitter are no motion
+        return Shots(
+            image=image,
+            unit=unit_of_image[image],
+            camera=camera_of_image[image],
+            time_offset_s=offset_s,
+            first_of_image=first,
+            height_px=np.array([camera.height for camera in drive.cameras], dtype=np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @property
+    def simultaneous(self) -> bool:
+        """Whether every shot is at its unit's timestamp."""
+        return not self.time_offset_s.any()
+
+    @property
+    def middle_of_image(self) -> Ints:
+        """The shot (images,) that is at its image's timestamp."""
+        result: Ints = (self.first_of_image[:-1] + self.first_of_image[1:]) // 2
+        return result
+
+    def of_rows(self, image: Ints, y_px: Floats) -> Ints:
+        """The shots (n,) that keypoints at heights y_px (n,) of images (n,) belong to."""
+        first, count = self.first_of_image[image], np.diff(self.first_of_image)[image]
+        camera = self.camera[first] if len(first) else first
+        band = np.floor(y_px / self.height_px[camera] * count).astype(np.int64)
+        result: Ints = first + np.clip(band, 0, count - 1)
+        return result
+
+
+def _bands(readout_us: int | None) -> int:
+    """An odd number of bands of at most MAX_BAND_S, as far as MAX_BANDS allows."""
+    needed = math.ceil((readout_us or 0) / 1e6 / MAX_BAND_S)
+    return min(MAX_BANDS, max(1, needed + 1 - needed % 2))

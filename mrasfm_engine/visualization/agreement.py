@@ -1,0 +1,157 @@
+"""How well the views of different cameras agree where they show the same ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mrasfm_engine.geometry.parabola import vertex
+from mrasfm_engine.types import Floats, Floats32
+from mrasfm_engine.visualization.mosaic import GIVEN, REFINED, Grid, Mosaic
+
+FINE_CELL_M = 0.05  # with larger cells, displacements of a few centimetres are not seen
+PLOT_SIDE_M = 9.6  # the roadside on both sides of the way, and where it is searched
+MAX_PLOTS = 40
+BLOCK_M = 0.8  # side of the pieces of ground that are compared
+ROADSIDE_M = 4.0  # farther from the way there are kerbs
+SEARCH_M = 0.4  # displacements up to this are found
+MIN_COVER = 0.96  # of the cells of a piece and of where it is searched
+MIN_CONTRAST = 3.0  # standard deviation of grey values: plain asphalt says nothing
+MAX_BLOCKS = 600  # those of most contrast
+SMOOTHING_M = 0.03  # against noise, and so that a sharper and a softer image compare
+MIN_PEAK = 0.6  # correlation at which a displacement counts as found
+MIN_BLOCKS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """Of two cameras' views of the same ground.
+
+    Attributes
+    ----------
+    blocks
+        How many pieces of ground were compared.
+    correlation
+        Median normalised cross-correlation of the two views where they lie, -1 to 1.
+    displaced_blocks
+        Pieces whose displacement could be found.
+    displacement_m
+        Their median displacement between the two views.
+    """
+
+    blocks: int
+    correlation: float
+    displaced_blocks: int
+    displacement_m: float
+
+
+def plots_along(way_m: Floats) -> list[Grid]:
+    """Squares of ground in the finest cells, spread evenly over a way (n, 2) that the cells of one picture are too
+    coarse for; at most `MAX_PLOTS`, and none where another one is."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way_m, axis=0), axis=1))])
+    even = np.linspace(0.0, travelled[-1], 2 * MAX_PLOTS + 1)[1::2]
+    chosen: list[Floats] = []
+    for place in way_m[np.searchsorted(travelled, even)]:
+        if all(np.abs(place - other).max() >= PLOT_SIDE_M for other in chosen):
+            chosen.append(place)
+    return [Grid.square(place, side_m=PLOT_SIDE_M) for place in chosen]
+
+
+def measure_agreement(mosaics: Sequence[Mosaic], way_m: Floats) -> tuple[Agreement, Agreement] | None:
+    """Agreement of the best with the second best camera under the given and under the refined calibration.
+
+    Both are measured on the same pieces within `ROADSIDE_M` of the way (n, 2), chosen by contrast alone; None where
+    there are too few. All mosaics, of different ground, have cells of one size, no larger than `FINE_CELL_M`.
+    """
+    if not mosaics:
+        return None
+    cell = mosaics[0].grid.cell_m
+    if any(mosaic.grid.cell_m != cell for mosaic in mosaics) or cell > FINE_CELL_M:
+        raise ValueError("the mosaics' cells differ, or are too coarse")
+    size, margin = round(BLOCK_M / cell), round(SEARCH_M / cell)
+    tree = cKDTree(way_m)
+    blocks: list[_Block] = []
+    for mosaic in mosaics:
+        blocks += _textured_blocks(mosaic, tree, size, margin)
+        blocks = sorted(blocks, key=lambda block: -block.contrast)[:MAX_BLOCKS]
+    if len(blocks) < MIN_BLOCKS:
+        return None
+    given, refined = (_compare(blocks, which, margin, cell) for which in (GIVEN, REFINED))
+    return given, refined
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Block:
+    """Grey values of a piece of ground in the best view (s, s), and of where it is searched in the second best one
+    (s + 2 margins, s + 2 margins), by calibration."""
+
+    contrast: float  # the smaller of the two views' standard deviations
+    template: Floats32  # (2, s, s)
+    window: Floats32  # (2, s + 2 margins, s + 2 margins)
+
+
+def _gray(mosaic: Mosaic) -> list[list[Floats32]]:
+    """By calibration and layer."""
+    sigma = SMOOTHING_M / mosaic.grid.cell_m
+    return [
+        [
+            np.asarray(cv2.GaussianBlur(cv2.cvtColor(layer, cv2.COLOR_RGB2GRAY), None, sigma), dtype=np.float32)
+            for layer in layers
+        ]
+        for layers in mosaic.color
+    ]
+
+
+def _textured_blocks(mosaic: Mosaic, way: cKDTree, size: int, margin: int) -> list[_Block]:
+    """Pieces that both layers cover with their surroundings, of most contrast in both under the refined calibration."""
+    seen = (mosaic.owner > 0).all(axis=0).astype(np.uint8)
+    covered = cv2.integral(seen)
+    rows = np.arange(margin, mosaic.grid.rows - size - margin, size)
+    columns = np.arange(margin, mosaic.grid.columns - size - margin, size)
+    if not len(rows) or not len(columns) or not seen.any():
+        return []
+    r, c = (a.ravel() for a in np.meshgrid(rows, columns, indexing="ij"))
+    r0, r1, c0, c1 = r - margin, r + size + margin, c - margin, c + size + margin
+    cover = covered[r1, c1] - covered[r0, c1] - covered[r1, c0] + covered[r0, c0]
+    grid = mosaic.grid
+    x, y = grid.left_m + (c + size / 2) * grid.cell_m, grid.top_m - (r + size / 2) * grid.cell_m
+    from_way_m, _ = way.query(np.column_stack([x, y]))
+    whole = (cover >= MIN_COVER * (size + 2 * margin) ** 2) & (from_way_m < ROADSIDE_M)
+    r, c = r[whole], c[whole]
+    gray = _gray(mosaic)
+    contrast = np.array(
+        [min(float(g[i : i + size, j : j + size].std()) for g in gray[REFINED]) for i, j in zip(r, c, strict=True)]
+    )
+    best = [k for k in np.argsort(-contrast, kind="stable")[:MAX_BLOCKS] if contrast[k] >= MIN_CONTRAST]
+    return [
+        _Block(
+            contrast=float(contrast[k]),
+            template=np.stack([g[0][r[k] : r[k] + size, c[k] : c[k] + size] for g in gray]),
+            window=np.stack(
+                [g[1][r[k] - margin : r[k] + size + margin, c[k] - margin : c[k] + size + margin] for g in gray]
+            ),
+        )
+        for k in best
+    ]
+
+
+def _compare(blocks: Sequence[_Block], which: int, margin: int, cell_m: float) -> Agreement:
+    correlations, displacements = [], []
+    for block in blocks:
+        score = np.nan_to_num(cv2.matchTemplate(block.window[which], block.template[which], cv2.TM_CCOEFF_NORMED))
+        correlations.append(float(score[margin, margin]))
+        i, j = np.unravel_index(int(score.argmax()), score.shape)
+        if score[i, j] >= MIN_PEAK and 0 < i < 2 * margin and 0 < j < 2 * margin:
+            di = vertex(score[i - 1, j], score[i, j], score[i + 1, j])
+            dj = vertex(score[i, j - 1], score[i, j], score[i, j + 1])
+            displacements.append(cell_m * float(np.hypot(i + di - margin, j + dj - margin)))
+    return Agreement(
+        blocks=len(blocks),
+        correlation=float(np.median(correlations)),
+        displaced_blocks=len(displacements),
+        displacement_m=float(np.median(displacements)) if displacements else float("nan"),
+    )

@@ -1,0 +1,73 @@
+"""By how much images and cameras are brighter than one another, from what they show of the same points and ground."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.types import Floats
+from mrasfm_engine.visualization.mosaic import REFINED, Mosaic
+
+ROUNDS = 6
+SHRINKAGE = 20.0  # observations that the guess "as bright as all others" counts for
+MAX_GAIN = 4.0
+MAX_CAMERA_GAIN = 1.4
+EVERY_CELL = 3  # of the mosaic, in rows and columns, is compared
+MIN_CELLS = 200
+DARK, SATURATED = 8, 247  # colours beyond tell nothing of the exposure
+
+
+def exposure_gains(scene: Scene) -> Floats:
+    """Factors (images, 3) on red, green and blue that make all images of the scene equally bright; 1 where unknown.
+
+    The logarithm of an observation's colour is that of its point plus that of its image's exposure: alternately the
+    mean over every point and the median over every image.
+    """
+    image, point = scene.observation_image, scene.observation_point
+    gains = np.ones((len(scene.drive.images), 3))
+    if not len(image):
+        return gains
+    first = np.concatenate([[0], np.cumsum([len(f.xy_px) for f in scene.features])])
+    colors = np.concatenate([f.colors for f in scene.features])[first[image] + scene.observation_keypoint]
+    order = np.argsort(image, kind="stable")
+    image, point = image[order], point[order]
+    log_color = np.log(np.maximum(colors[order].astype(np.float64), 2.0))
+    images, start = np.unique(image, return_index=True)
+    spans = list(zip(images, start, [*start[1:], len(image)], strict=True))
+    count = np.maximum(np.bincount(point), 1)
+    exposure = np.zeros_like(gains)
+    for _ in range(ROUNDS):
+        left = log_color - exposure[image]
+        mean = np.stack([np.bincount(point, left[:, k]) for k in range(3)], 1) / count[:, None]
+        for i, lo, hi in spans:
+            change = np.median(log_color[lo:hi] - mean[point[lo:hi]], axis=0)
+            exposure[i] = change * (hi - lo) / (hi - lo + SHRINKAGE)
+        exposure[images] -= exposure[images].mean(0)
+    gains[:] = np.clip(np.exp(-exposure), 1 / MAX_GAIN, MAX_GAIN)
+    return gains
+
+
+def camera_gains(mosaic: Mosaic) -> Floats:
+    """Factors (cameras,) that make the cameras equally bright where two of them show the same ground.
+
+    Cameras have few points in common, and much ground. One factor for all colours: what is saturated stays white.
+    """
+    owner = mosaic.owner[:, ::EVERY_CELL, ::EVERY_CELL]
+    color = mosaic.color[REFINED][:, ::EVERY_CELL, ::EVERY_CELL]
+    count = int(owner.max(initial=0))
+    clear = (owner > 0).all(axis=0) & ((color > DARK) & (color < SATURATED)).all(axis=(0, 3))
+    a, b = owner[0][clear].astype(np.int64) - 1, owner[1][clear].astype(np.int64) - 1
+    ratio = np.log(color[0][clear] / color[1][clear].astype(np.float64))
+    h, g = 1e-3 * np.eye(count), np.zeros(count)
+    pair = a * count + b
+    for key in np.unique(pair):
+        rows = pair == key
+        if rows.sum() < MIN_CELLS:
+            continue
+        i, j = int(key) // count, int(key) % count
+        row = np.zeros(count)
+        row[i], row[j] = 1.0, -1.0
+        h += np.outer(row, row)
+        g += row * np.median(ratio[rows])
+    gains: Floats = np.clip(np.exp(-np.linalg.solve(h, g)), 1 / MAX_CAMERA_GAIN, MAX_CAMERA_GAIN)
+    return gains

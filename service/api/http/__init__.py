@@ -1,0 +1,1 @@
+"""HTTP itself: request bodies, headers, ranges, digests, paging and the protocol of the server."""

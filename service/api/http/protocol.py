@@ -1,0 +1,152 @@
+"""uvicorn's HTTP protocol with bounds on what it leaves open: the time and the bytes of a request's head.
+
+A bound for headers is not among the settings that uvicorn gives its fast parser, and without one anybody, with no key,
+could fill the memory of the process. Nor does it end connections that never make a request.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, cast
+
+from starlette.responses import Response
+from uvicorn.config import Config
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from service.api.http.problem_response import problem_response
+from service.api.middleware.security_headers import add_security_headers
+from service.errors import ServiceError, too_slow
+
+if TYPE_CHECKING:
+    from uvicorn._types import ASGI3Application
+
+MAX_HEAD_BYTES = 64_000
+HEAD_WITHIN_S = 30.0
+# Chunks of a body come with their lengths, and may come with signatures.
+_FRAME_BYTES = 256
+
+
+class BoundedHttpProtocol(HttpToolsProtocol):
+    """One connection. What surrounds bodies is counted: request line, headers, frames of chunks and trailers."""
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, object],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._around_bytes = 0
+        self._waiting: asyncio.TimerHandle | None = None
+        self._in_body = False  # between a request's head and its end
+        self._refused = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """As uvicorn's."""
+        super().connection_made(transport)
+        self._wait_for_head()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """As uvicorn's."""
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """As uvicorn's; a request whose head has no end is refused."""
+        if self._refused or self.transport.is_closing():
+            return  # it goes on sending
+        self._around_bytes += len(data)
+        super().data_received(data)
+        if self._around_bytes > MAX_HEAD_BYTES and not (self._refused or self.transport.is_closing()):
+            self._refuse(
+                ServiceError(
+                    431,
+                    "head-too-large",
+                    "The request's head is too large",
+                    f"request line, headers and trailers have over {MAX_HEAD_BYTES} bytes",
+                    remedy="Send fewer and shorter headers.",
+                )
+            )
+
+    def on_message_begin(self) -> None:
+        """As uvicorn's."""
+        super().on_message_begin()
+        if self._waiting is None:
+            self._wait_for_head()
+
+    def on_headers_complete(self) -> None:
+        """As uvicorn's."""
+        self._stop_waiting()
+        super().on_headers_complete()
+        self._in_body = True
+
+    def on_body(self, body: bytes) -> None:
+        """As uvicorn's."""
+        self._around_bytes = max(0, self._around_bytes - len(body) - _FRAME_BYTES)
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """As uvicorn's."""
+        self._around_bytes = 0
+        self._in_body = False
+        super().on_message_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """As uvicorn's, as a problem."""
+        self._refuse(
+            ServiceError(
+                400, "malformed-request", "Malformed request", "this is not HTTP/1.1", remedy="Use an HTTP client."
+            )
+        )
+
+    def _wait_for_head(self) -> None:
+        self._waiting = self.loop.call_later(HEAD_WITHIN_S, self._too_slow)
+
+    def _stop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
+
+    def _too_slow(self) -> None:
+        self._waiting = None
+        if self.transport.is_closing():
+            return
+        if self._around_bytes == 0:  # it never said anything
+            self.transport.close()
+            return
+        self._refuse(too_slow(f"its head was not here within {HEAD_WITHIN_S:g} s", remedy="Send it again."))
+
+    def _refuse(self, error: ServiceError) -> None:
+        """Answer the request that is at fault and hang up; complete requests before it are answered first."""
+        self._refused = True
+        self._stop_waiting()
+        answer = problem_response(error)
+        answer.headers["Connection"] = "close"
+        add_security_headers(answer.headers)
+        if self._in_body:
+            self._refuse_body(answer)
+        elif self.cycle is None or self.cycle.response_complete:
+            self._write(answer)
+            self.transport.close()
+        else:
+            self.cycle.keep_alive = False  # the request is complete; uvicorn hangs up behind its answer
+
+    def _refuse_body(self, answer: Response) -> None:
+        """Answer the request whose body is at fault; where its answer has begun, that is broken off."""
+        if self.pipeline:
+            cycle, _ = self.pipeline[0]  # the latest, which waits for those before it
+            cycle.keep_alive = False
+            self.pipeline[0] = (cycle, cast("ASGI3Application", answer))
+            return
+        if not self.cycle.response_started:
+            self._write(answer)
+            # What closing tells the application comes only once the client has taken the answer.
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        self.transport.close()
+
+    def _write(self, answer: Response) -> None:
+        lines = [STATUS_LINE[answer.status_code], *(b"%b: %b\r\n" % header for header in answer.raw_headers), b"\r\n"]
+        self.transport.write(b"".join(lines) + bytes(answer.body))

@@ -1,0 +1,1 @@
+"""Drive manifests from outside: read within bounds of memory, and checked before a drive is committed."""

@@ -1,0 +1,141 @@
+"""The check of a manifest before its drive is frozen.
+
+It is the engine's own check, in the engine's own words, and runs in a process of its own: the API never imports the
+engine.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from schemas.api.resource import Finding
+from service.api.context import Context
+from service.api.manifests.bounded_process import TooCostlyError, end_of_log, run_on_document
+from service.errors import ServiceError, store_unavailable
+
+log = logging.getLogger("mrasfm.api")
+
+Result = TypeVar("Result")
+
+# -P: the working directory holds files from outside and is no place to import from.
+_COMMAND = (sys.executable, "-P", "-m", "mrasfm_engine.commands.preflight", "--manifest-only", "--accepted", "--json")
+_MEMORY_MB = 800  # 100,000 frames of 6 cameras take 700; hostile JSON unpacks to a hundred times its bytes
+_TIMEOUT_S = 120
+
+
+def stored_manifest(context: Context, key: str) -> bytes:
+    """The manifest that is stored under `key`.
+
+    Raises
+    ------
+    ServiceError
+        503 where the store misses it.
+    """
+    try:
+        return context.artifacts.read(key)
+    except FileNotFoundError:
+        raise store_unavailable() from None
+
+
+def checked_manifest(context: Context, key: str) -> list[Finding]:
+    """Findings about the manifest that is stored under `key`.
+
+    Raises
+    ------
+    ServiceError
+        422 where the check takes too much memory or time, 503 where it cannot run or the store misses the manifest.
+    """
+    folder = context.settings.spool_dir
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path = folder / f"{secrets.token_hex(16)}.part"
+    try:
+        raw = stored_manifest(context, key)
+        path.write_bytes(raw)
+        return _findings(path, len(raw))
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _findings(path: Path, size_bytes: int) -> list[Finding]:
+    command = [*_COMMAND, "--max-memory-mb", str(_MEMORY_MB), str(path)]
+    bounds = Bounds(memory_mb=_MEMORY_MB, timeout_s=_TIMEOUT_S)
+    findings = result_of(command, _told, bounds, size_bytes=size_bytes, folder=path.parent)
+    if any(finding.code == "bad-size" for finding in findings):
+        raise _too_large(bounds)
+    return findings
+
+
+def _told(output: bytes) -> list[Finding]:
+    return [Finding.model_validate(finding) for finding in json.loads(output)["findings"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounds:
+    """What a program may take for a manifest. Its time is bounded here, its memory by itself."""
+
+    memory_mb: float
+    timeout_s: float
+
+
+def result_of(
+    command: Sequence[str],
+    read: Callable[[bytes], Result],
+    bounds: Bounds,
+    *,
+    size_bytes: int,
+    folder: Path,
+    given: bytes = b"",
+) -> Result:
+    """What a program finds in a manifest, read from its output; other parameters are those of `run_on_document`.
+
+    Parameters
+    ----------
+    read
+        Raises ValueError or LookupError where the program came to no end.
+
+    Raises
+    ------
+    ServiceError
+        422 where it takes too much memory or time, 503 where it cannot run, and what `read` raises.
+    """
+    try:
+        done = run_on_document(command, size_bytes=size_bytes, folder=folder, timeout_s=bounds.timeout_s, given=given)
+    except TooCostlyError:
+        raise _too_large(bounds) from None
+    except OSError as error:
+        log.error("a program that reads manifests cannot be started", exc_info=error)
+        raise _check_failed() from error
+    try:
+        return read(done.stdout)
+    except (ValueError, LookupError) as error:
+        fields = {"exit": done.returncode, "log": end_of_log(done)}
+        log.error("a program that reads manifests failed", extra={"fields": fields})
+        raise _check_failed() from error
+
+
+def _too_large(bounds: Bounds) -> ServiceError:
+    return ServiceError(
+        422,
+        "manifest-too-large",
+        "The manifest is too large to be checked",
+        f"the check of the manifest needs over {bounds.memory_mb} MB of memory or {bounds.timeout_s} s",
+        remedy="Split the drive in several.",
+    )
+
+
+def _check_failed() -> ServiceError:
+    return ServiceError(
+        503,
+        "check-failed",
+        "The check of the manifest did not answer",
+        "the check of the manifest could not be run; why is in the service's log",
+        remedy="Repeat the request in a minute; if it fails again, tell the operator.",
+        headers={"Retry-After": "60"},
+    )

@@ -1,0 +1,116 @@
+"""How a job looks from outside."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from schemas.api.jobs import JobAttempt as AttemptResource
+from schemas.api.jobs import JobKind, JobProgress, JobResource
+from schemas.api.jobs import JobMember as MemberResource
+from schemas.api.jobs import JobState as ShownState
+from service.api.dependencies import moment
+from service.database.tables import Job, JobAttempt, JobMember, JobState, now_us
+from service.domain import jobs
+from service.settings import Settings
+
+RETRY_AFTER_S = 2
+
+
+def shown_state(job: Job, settings: Settings) -> ShownState:
+    """The job's state; STALLED where it runs and has not been heard of for a while."""
+    silent_us = now_us() - (job.heartbeat_us or 0)
+    if job.state == JobState.RUNNING and silent_us > settings.stalled_seconds * 1e6:
+        return ShownState.STALLED
+    return ShownState(job.state)
+
+
+def etag_of(job: Job, shown: JobResource) -> str:
+    """Changes with everything that a reader can see; also with members, which go on after an aggregation has ended."""
+    members = "".join(member.model_dump_json() for member in shown.members)
+    of_members = f"-{hashlib.sha256(members.encode()).hexdigest()[:16]}" if members else ""
+    return f'"{job.revision}-{shown.state.lower()}{of_members}"'
+
+
+def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list[JobResource]:
+    """Jobs as the API shows them."""
+    attempts: dict[str, list[JobAttempt]] = {}
+    ids = [job.id for job in found]
+    for attempt in session.scalars(select(JobAttempt).where(JobAttempt.job_id.in_(ids)).order_by(JobAttempt.fence)):
+        attempts.setdefault(attempt.job_id, []).append(attempt)
+    trees = [job.id for job in found if job.kind == JobKind.AGGREGATION]
+    members = jobs.members_of(session, trees) if trees else {}
+    return [_shown(job, attempts.get(job.id, ()), members.get(job.id, ()), settings) for job in found]
+
+
+def view_of(session: Session, job: Job, settings: Settings) -> JobResource:
+    """One job as the API shows it."""
+    return views_of(session, [job], settings)[0]
+
+
+def _shown(
+    job: Job, attempts: Sequence[JobAttempt], members: Sequence[tuple[JobMember, Job | None]], settings: Settings
+) -> JobResource:
+    return JobResource.model_validate(
+        {
+            "id": job.id,
+            "kind": job.kind,
+            "drive_id": job.drive_id,
+            "state": shown_state(job, settings),
+            "settings": job.settings,
+            "progress": JobProgress(
+                stage=job.stage,
+                done=job.done,
+                total=job.total,
+                unit=job.unit,
+                percent=job.percent,
+                eta_low_s=job.eta_low_s,
+                eta_high_s=job.eta_high_s,
+                reused_stages=job.reused,
+            ),
+            "attempts": [_shown_attempt(attempt) for attempt in attempts],
+            "cancel_requested": job.cancel_requested_us is not None,
+            "heartbeat_at": moment(job.heartbeat_us),
+            "problem": job.problem,
+            "scene_id": job.scene_id,
+            "map_id": job.map_id,
+            "map_version": job.map_version,
+            "members": [_shown_member(member, child, settings) for member, child in members],
+            "retry_of": job.retry_of,
+            "created_at": moment(job.created_us),
+            "started_at": moment(job.started_us),
+            "finished_at": moment(job.finished_us),
+            "expires_at": moment(job.expires_us),
+        }
+    )
+
+
+def _shown_attempt(attempt: JobAttempt) -> AttemptResource:
+    return AttemptResource.model_validate(
+        {
+            "attempt": attempt.attempt,
+            "worker": attempt.owner,
+            "started_at": moment(attempt.started_us),
+            "finished_at": moment(attempt.finished_us),
+            "outcome": attempt.outcome,
+            "problem": attempt.problem,
+        }
+    )
+
+
+def _shown_member(member: JobMember, child: Job | None, settings: Settings) -> MemberResource:
+    is_there = member.scene_id is not None
+    return MemberResource.model_validate(
+        {
+            "name": member.name,
+            "drive_id": member.drive_id,
+            "job_id": member.child_id,
+            "state": None if child is None else shown_state(child, settings),
+            "percent": 100.0 if is_there or child is None else child.percent,
+            "scene_id": member.scene_id,
+            "problem": member.problem,
+        }
+    )

@@ -1,0 +1,211 @@
+"""The database: SQLite (embedded) or PostgreSQL, through one small interface."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sqlalchemy import Engine, create_engine, event, inspect, text
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session, sessionmaker
+
+from service.database.tables import now_us
+from service.settings import Settings
+
+Result = TypeVar("Result")
+
+MIGRATIONS = Path(__file__).parent / "migrations"
+# PostgreSQL ended this transaction for another one's sake: a serialization failure, a deadlock.
+_TRY_AGAIN = frozenset({"40001", "40P01"})
+# An error tells its statement, and not what was given to it: that is the users', and may be a hundred thousand names.
+_ENGINE: dict[str, Any] = {"pool_size": 10, "max_overflow": 30, "hide_parameters": True}
+
+
+class Database:
+    """Sessions for reading and for writing.
+
+    Sessions block: call them from threads, never from an event loop.
+
+    Parameters
+    ----------
+    url
+        SQLAlchemy's.
+    patience_s
+        How long to wait for a lock of SQLite's, or for a server to answer; a statement gets four times as long.
+    """
+
+    def __init__(self, url: str, *, patience_s: float = 30.0) -> None:
+        embedded = make_url(url).get_backend_name() == "sqlite"
+        self.engine = _sqlite(url, patience_s) if embedded else _server(url, patience_s)
+        self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+
+    @classmethod
+    def of(cls, settings: Settings) -> Database:
+        """The database that the settings name."""
+        return cls(settings.resolved_database_url)
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A session that sees one state of the database and writes nothing."""
+        with self._sessions() as session:
+            if self.engine.dialect.name == "postgresql":
+                # Else each statement sees a state of its own. The pool gives connections out without it.
+                session.connection(execution_options={"isolation_level": "REPEATABLE READ"})
+            yield session
+
+    @contextmanager
+    def write(self, *, durable: bool = True) -> Iterator[Session]:
+        """One transaction: committed where the block ends, rolled back where it raises.
+
+        Parameters
+        ----------
+        durable
+            Whether SQLite waits for the disk. If not, the transaction survives a crash of any process, but a power
+            cut only once the next durable one has been committed. PostgreSQL always waits: when its server crashes,
+            it loses what it did not wait for.
+
+        In SQLite writers take turns from the start: a transaction that reads first and wants to write later would
+        otherwise fail, at once, when another has written in between.
+        """
+        with self._sessions.begin() as session:
+            if self.engine.dialect.name == "sqlite":
+                session.connection(execution_options={"mrasfm_begin": "IMMEDIATE", "mrasfm_durable": durable})
+            yield session
+
+    def transact(self, work: Callable[[Session], Result], *, durable: bool = True) -> Result:
+        """The result of `work` in a transaction of its own: see `write`.
+
+        Where the database ends the transaction for another one's sake, it is done once more: nothing of it was kept,
+        and the other one is done.
+        """
+        try:
+            with self.write(durable=durable) as session:
+                return work(session)
+        except OperationalError as error:
+            if getattr(error.orig, "sqlstate", None) not in _TRY_AGAIN:
+                raise
+        with self.write(durable=durable) as session:
+            return work(session)
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self.engine.dispose()
+
+
+def clock_us(session: Session) -> int:
+    """Microseconds since 1970, on the one clock that all users of a database share.
+
+    What one machine notes and another compares, as the end of a lease, is taken from here: their own clocks differ.
+    SQLite's users share a machine.
+    """
+    if session.get_bind().dialect.name == "sqlite":
+        return now_us()
+    return int(session.scalars(text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")).one())
+
+
+def _server(url: str, patience_s: float) -> Engine:
+    chosen = make_url(url).query.get("options", "")  # the operator's come last: they win
+    options = {
+        "connect_timeout": max(2, min(10, round(patience_s))),
+        # A server that has vanished without a word is noticed within half a minute; else a thread waits for ever.
+        "keepalives": 1,
+        "keepalives_idle": 10,
+        "keepalives_interval": 5,
+        "keepalives_count": 3,
+        "tcp_user_timeout": 20_000,
+        "options": f"-c statement_timeout={round(4000 * patience_s)} {chosen}".rstrip(),
+    }
+    return create_engine(url, pool_pre_ping=True, connect_args=options, **_ENGINE)
+
+
+def _sqlite(url: str, patience_s: float) -> Engine:
+    path = make_url(url).database
+    if path:
+        Path(path).parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    engine = create_engine(url, **_ENGINE)
+
+    @event.listens_for(engine, "connect")
+    def _prepare(connection: sqlite3.Connection, record: Any) -> None:
+        connection.isolation_level = None  # transactions begin where we say, not where the driver guesses
+        connection.execute(f"PRAGMA busy_timeout={round(1000 * patience_s)}")
+        _write_ahead(connection, patience_s)
+        connection.execute("PRAGMA foreign_keys=ON")
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Any) -> None:
+        options = connection.get_execution_options()
+        # FULL waits for the disk at every commit, NORMAL leaves that to the next FULL one.
+        level = "FULL" if options.get("mrasfm_durable", True) else "NORMAL"
+        if connection.info.get("synchronous") != level:
+            connection.exec_driver_sql(f"PRAGMA synchronous={level}")
+            connection.info["synchronous"] = level
+        connection.exec_driver_sql(f"BEGIN {options.get('mrasfm_begin', 'DEFERRED')}")
+
+    return engine
+
+
+def _write_ahead(connection: sqlite3.Connection, patience_s: float) -> None:
+    """Make readers not wait for the writer.
+
+    While one process changes a new database to this mode, SQLite refuses the others at once, whatever its timeout is.
+    """
+    end_s = time.monotonic() + patience_s
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+            return
+        except sqlite3.OperationalError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(0.02)
+
+
+def migrate(settings: Settings) -> None:
+    """Bring the database to the newest schema; safe to run by several processes at once and again."""
+    from alembic import command
+    from alembic.config import Config
+
+    database = Database.of(settings)
+    if database.engine.dialect.name == "sqlite":
+        event.listen(database.engine, "connect", _ignore_references)
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
+    options = {"mrasfm_begin": "IMMEDIATE"}  # the second process waits here until the first is done
+    try:
+        with database.engine.connect().execution_options(**options) as connection, connection.begin():
+            if connection.dialect.name == "postgresql":
+                connection.execute(text("SET LOCAL statement_timeout TO 0"))  # large tables take their time
+                connection.execute(text("SELECT pg_advisory_xact_lock(5240017)"))
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+    finally:
+        database.close()
+
+
+def _ignore_references(connection: sqlite3.Connection, record: Any) -> None:
+    """SQLite changes a table by copying it; dropping the old one would else delete all that refers to it."""
+    connection.execute("PRAGMA foreign_keys=OFF")
+
+
+@cache
+def newest_schema() -> str:
+    """The revision that this code expects: migrations are named after theirs."""
+    return max(path.name.partition("_")[0] for path in (MIGRATIONS / "versions").glob("[0-9]*.py"))
+
+
+def is_current(database: Database) -> bool:
+    """Whether the schema is the one that this code expects.
+
+    Asked without Alembic, which takes 10 MB that a process that does not migrate can do without.
+    """
+    with database.engine.connect() as connection:
+        if not inspect(connection).has_table("alembic_version"):
+            return False
+        found = connection.scalars(text("SELECT version_num FROM alembic_version")).all()
+    return found == [newest_schema()]

@@ -1,0 +1,193 @@
+"""Finished stages, so that another attempt or another job does not repeat them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import delete, func, select
+from sqlalchemy.orm import Session
+
+from service.database.connections import Database
+from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
+from service.domain import jobs
+from service.storage import blobs
+from service.storage.artifacts import Fetch
+from service.storage.blob_writer import StoredFile
+
+log = logging.getLogger("mrasfm.worker")
+
+
+def settings_sha256(settings: Mapping[str, Any]) -> str:
+    """Tells apart the settings under which stages were finished, and scenes made."""
+    return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class DriveShelf:
+    """Stages of one drive under certain settings."""
+
+    drive_id: str
+    settings_sha256: str
+
+
+@dataclass(frozen=True)
+class MapShelf:
+    """Stages of an aggregation: each of a pair of scenes, wherever in the project the two were put together before.
+
+    Attributes
+    ----------
+    slots
+        By the name of a stage's file, the digest of all that it is made of.
+    """
+
+    map_id: str
+    project_id: str
+    slots: Mapping[str, str]
+
+    @staticmethod
+    def of(map_id: str, project_id: str, *, scenes: Mapping[str, str], settings: Mapping[str, Any]) -> MapShelf:
+        """Of the scenes of a map, ids by name, under some settings."""
+        under = settings_sha256(settings)
+        slots = {
+            f"seam-{a}~{b}.npz": hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
+            for a, first in scenes.items()
+            for b, second in scenes.items()
+            if a != b
+        }
+        return MapShelf(map_id, project_id, slots)
+
+
+Shelf = DriveShelf | MapShelf
+_SEAM = "seam"
+_SHELVES_A_DRIVE = 3
+_KEPT = (Blob.id, Blob.key, Blob.sha256)
+
+
+def restore(database: Database, shelf: Shelf, folder: Path, *, fetch: Fetch) -> list[str]:
+    """Bring finished stages into a folder; the names of the files brought.
+
+    They save time and nothing else: one whose bytes are lost is forgotten, and the stage is done again.
+    """
+    with database.read() as session:
+        found = _shelved(session, shelf)
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    brought = []
+    for name, kept in found.items():
+        try:
+            fetch(kept.key, folder / name, kept.sha256)
+        except FileNotFoundError:
+            log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
+            with database.write() as session:
+                _forget(session, kept.id)
+        else:
+            brought.append(name)
+    return brought
+
+
+def _forget(session: Session, blob_id: str) -> None:
+    """Drop what refers to lost bytes, and their record: the same bytes are to be stored anew, not found in it."""
+    for table in (Checkpoint, MapCheckpoint):
+        session.execute(delete(table).where(table.blob_id == blob_id))
+    blobs.lose(session, blob_id)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Where a finished stage's bytes are."""
+
+    id: str
+    key: str
+    sha256: str
+
+
+def _shelved(session: Session, shelf: Shelf) -> dict[str, _Kept]:
+    """The finished stages, by name."""
+    if isinstance(shelf, DriveShelf):
+        mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
+        of_drive = select(Checkpoint.name, *_KEPT).join(Blob, Checkpoint.blob_id == Blob.id)
+        return {name: _Kept(*kept) for name, *kept in session.execute(of_drive.where(mine))}
+    of_maps = select(MapCheckpoint.inputs_sha256, *_KEPT).join(Blob, MapCheckpoint.blob_id == Blob.id)
+    rows = session.execute(
+        of_maps.where(MapCheckpoint.project_id == shelf.project_id).order_by(MapCheckpoint.created_us)
+    )
+    known = {inputs: _Kept(*kept) for inputs, *kept in rows}  # the newest
+    return {name: known[inputs] for name, inputs in shelf.slots.items() if inputs in known}
+
+
+def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> bool:
+    """Note checkpoints, by name, that were put into the artifact store; older ones of the same names are replaced.
+
+    Nothing is kept where the drive or the map has been deleted.
+
+    Returns
+    -------
+    bool
+        Whether a later attempt will find any of them.
+    """
+    owner: Drive | Map | None
+    match shelf:
+        case DriveShelf():
+            owner = session.get(Drive, shelf.drive_id)
+        case MapShelf():
+            owner = session.get(Map, shelf.map_id)
+    if owner is None:
+        return False
+    kept = False
+    for name, file in stored.items():
+        if isinstance(shelf, MapShelf) and name not in shelf.slots:
+            continue
+        blob = blobs.record(session, project_id=owner.project_id, within_quota=False, **file.identity)
+        checkpoint = _find(session, shelf, name)
+        if checkpoint is None:
+            session.add(_new(shelf, name, blob.id))
+        else:
+            checkpoint.blob_id = blob.id
+            checkpoint.created_us = now_us()
+        kept = True
+    if isinstance(shelf, DriveShelf):
+        _clear_old_shelves(session, shelf)
+    return kept
+
+
+def _clear_old_shelves(session: Session, shelf: DriveShelf) -> None:
+    """Drop a drive's stages under settings other than the last few, but for those that a job may still need."""
+    session.flush()
+    newest = func.max(Checkpoint.created_us).desc()
+    mine = select(Checkpoint.settings_sha256).where(Checkpoint.drive_id == shelf.drive_id)
+    shelves = session.scalars(mine.group_by(Checkpoint.settings_sha256).order_by(newest)).all()
+    old = set(shelves[_SHELVES_A_DRIVE:]) - {shelf.settings_sha256}
+    if not old:
+        return
+    old -= {settings_sha256(job.settings) for job in session.scalars(jobs.active_of_drive(shelf.drive_id))}
+    dropped = delete(Checkpoint).where(Checkpoint.drive_id == shelf.drive_id, Checkpoint.settings_sha256.in_(old))
+    session.execute(dropped.execution_options(synchronize_session=False))
+
+
+def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoint | None:
+    match shelf:
+        case DriveShelf():
+            return session.get(Checkpoint, (shelf.drive_id, shelf.settings_sha256, name))
+        case MapShelf():
+            return session.get(MapCheckpoint, (shelf.map_id, shelf.slots[name], _SEAM))
+
+
+def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
+    match shelf:
+        case DriveShelf():
+            return Checkpoint(
+                drive_id=shelf.drive_id, settings_sha256=shelf.settings_sha256, name=name, blob_id=blob_id
+            )
+        case MapShelf():
+            return MapCheckpoint(
+                map_id=shelf.map_id,
+                project_id=shelf.project_id,
+                inputs_sha256=shelf.slots[name],
+                name=_SEAM,
+                blob_id=blob_id,
+            )

@@ -1,0 +1,79 @@
+"""Jobs: the only statements that change a job's state.
+
+    QUEUED -> RUNNING -> SUCCEEDED | FAILED | CANCELLED
+
+and back from RUNNING to QUEUED when an attempt failed in a way that may pass, when its worker died, or when its worker
+was told to stop. How often that happens is bounded, see `_blame`. A worker holds a job by a lease that it renews with
+every heartbeat, and by a fencing number that rises with every claim. All that it writes is conditional on that number:
+a worker that was believed dead and comes back writes nothing.
+"""
+
+from __future__ import annotations
+
+from service.domain.jobs._blame import FULL_BLAME, HALF_BLAME, LESS_MEMORY, NO_BLAME, RetryLimits, blame_of_loss
+from service.domain.jobs._completion import cancelled, fail, record_findings, release, succeed
+from service.domain.jobs._dependencies import MIN_SCENES, look_at, members_of, orphans, tend
+from service.domain.jobs._leases import (
+    ProgressNote,
+    bound_times,
+    cancel_requested,
+    claim,
+    end_lease,
+    expire_leases,
+    has_succeeded,
+    heartbeat,
+    note_finished_stage,
+)
+from service.domain.jobs._queries import Claim, FencedError, active_of_drive, events_after
+from service.domain.jobs._queue import all_due, due, mark_enqueued
+from service.domain.jobs._requests import (
+    OfTree,
+    cancel_orphan,
+    create,
+    request_cancel,
+    require_failed,
+    require_places,
+    retry,
+)
+
+__all__ = [
+    "FULL_BLAME",
+    "HALF_BLAME",
+    "LESS_MEMORY",
+    "MIN_SCENES",
+    "NO_BLAME",
+    "Claim",
+    "FencedError",
+    "OfTree",
+    "ProgressNote",
+    "RetryLimits",
+    "active_of_drive",
+    "all_due",
+    "blame_of_loss",
+    "bound_times",
+    "cancel_orphan",
+    "cancel_requested",
+    "cancelled",
+    "claim",
+    "create",
+    "due",
+    "end_lease",
+    "events_after",
+    "expire_leases",
+    "fail",
+    "has_succeeded",
+    "heartbeat",
+    "look_at",
+    "mark_enqueued",
+    "members_of",
+    "note_finished_stage",
+    "orphans",
+    "record_findings",
+    "release",
+    "request_cancel",
+    "require_failed",
+    "require_places",
+    "retry",
+    "succeed",
+    "tend",
+]

@@ -1,0 +1,89 @@
+"""What an aggregation works on: files of scenes, and of the version that it goes on from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.database.tables import Blob, Job, MapFile, SceneFile
+from service.domain import jobs, maps
+
+# For people and other programs; no stage reads them.
+_FOR_OTHERS = ("pictures/", "model/text/")
+# All that a version is made anew from.
+_OF_VERSION = ("map.json", "report.json", "scenes/", "seams/")
+
+
+@dataclass(frozen=True)
+class StoredArtifact:
+    """A file of a scene or map and where its bytes are."""
+
+    path: str
+    key: str
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapInputs:
+    """Of one aggregation.
+
+    Attributes
+    ----------
+    scenes
+        Files of the scenes that come, by name.
+    base
+        Files of the version that they are added to; empty for a new map.
+    remove
+        Names of scenes that are taken out.
+    scene_ids
+        Of all scenes of the new version, by name.
+    failed
+        Drives that have no scene, as the report names them.
+    members
+        What it calls those that have one, by name.
+    require_all
+        Whether a scene that fits into no map takes the others with it.
+    """
+
+    scenes: Mapping[str, Sequence[StoredArtifact]]
+    base: Sequence[StoredArtifact]
+    remove: Sequence[str]
+    scene_ids: Mapping[str, str]
+    failed: Sequence[Mapping[str, Any]]
+    members: Mapping[str, Mapping[str, Any]]
+    require_all: bool
+
+
+def inputs_of(session: Session, job_id: str) -> MapInputs:
+    """The inputs of an aggregation whose children have ended."""
+    job = session.get_one(Job, job_id)
+    members = [member for member, _ in jobs.members_of(session, [job_id]).get(job_id, [])]
+    coming = {member.name: member.scene_id for member in members if member.scene_id is not None}
+    kept = {scene.name: scene.scene_id for scene in maps.kept_scenes(session, job)}
+    request = job.request or {}
+    return MapInputs(
+        scenes={name: _files_of_scene(session, scene_id) for name, scene_id in coming.items()},
+        base=_files_of_version(session, job.map_id, request.get("base_version")),
+        remove=list(request.get("remove", ())),
+        scene_ids={**kept, **coming},
+        failed=[{**maps.named(member), "problem": member.problem} for member in members if member.problem is not None],
+        members={member.name: maps.named(member) for member in members if member.scene_id is not None},
+        require_all=bool(request.get("require_all")),
+    )
+
+
+def _files_of_scene(session: Session, scene_id: str) -> list[StoredArtifact]:
+    statement = select(SceneFile.path, Blob.key, Blob.sha256).join(Blob, SceneFile.blob_id == Blob.id)
+    rows = session.execute(statement.where(SceneFile.scene_id == scene_id).order_by(SceneFile.path))
+    return [StoredArtifact(*row) for row in rows if not row.path.startswith(_FOR_OTHERS)]
+
+
+def _files_of_version(session: Session, map_id: str | None, number: int | None) -> list[StoredArtifact]:
+    statement = select(MapFile.path, Blob.key, Blob.sha256).join(Blob, MapFile.blob_id == Blob.id)
+    mine = (MapFile.map_id == map_id) & (MapFile.number == (number or 0))
+    rows = session.execute(statement.where(mine).order_by(MapFile.path))
+    return [StoredArtifact(*row) for row in rows if row.path.startswith(_OF_VERSION)]

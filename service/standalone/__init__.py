@@ -1,0 +1,1 @@
+"""API, broker, workers and reconciler as one program on one machine."""

@@ -1,0 +1,150 @@
+"""Names of archive entries: which are safe, which are ignored, and which file of the drive each one is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+
+from schemas.file_names import MANIFEST_NAME, composed, portable_key
+from service.errors import ServiceError
+from service.storage.uploads.archive_errors import Refusal, shown
+
+_MAX_NAME_BYTES = 1024  # the manifest's paths have up to 512 characters, and a top folder may come before them
+_SHOWN_NAMES = 5
+_DRIVE_LETTER = re.compile(r"[A-Za-z]:")
+_IGNORED_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+_IGNORED_FOLDER = "__MACOSX"
+
+
+def safe_name(raw: bytes, *, is_folder: bool = False) -> str:
+    """An entry's path, without './' before and '/' behind it; empty for the archive's own top folder.
+
+    Raises
+    ------
+    ServiceError
+        422 `unsafe-archive`, if the name could mean a place outside the drive, or not the same on every system.
+    """
+    if not raw:
+        raise Refusal.UNSAFE("an entry of the archive has an empty name", "Make the archive again with another tool.")
+    if len(raw) > _MAX_NAME_BYTES:
+        raise _unsafe(raw, f"has a name of {len(raw)} bytes, the bound is {_MAX_NAME_BYTES}", "Give it a shorter name.")
+    try:
+        name = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        remedy = "Make the archive with UTF-8 names (7-Zip: -mcu=on), or rename the file."
+        raise _unsafe(raw, "has a name that is not UTF-8", remedy) from None
+    problem = _problem(name)
+    if problem is not None:
+        raise _unsafe(raw, problem, "Make the archive from inside the drive's folder, with relative names.")
+    name = name.removeprefix("./") if name != "." else ""
+    if is_folder:
+        name = name.removesuffix("/")
+    parts = name.split("/")
+    if (name or not is_folder) and not all(part not in ("", ".") for part in parts):
+        raise _unsafe(raw, "has an empty part or '.' in its path", "Make the archive again with plain relative names.")
+    return name
+
+
+def is_ignored(name: str) -> bool:
+    """Whether an operating system put the file there, and nobody misses it."""
+    parts = name.split("/")
+    return _IGNORED_FOLDER in parts[:-1] or parts[-1] in _IGNORED_FILES or parts[-1].startswith("._")
+
+
+class EntryNames:
+    """Collects the names of an archive's files and finds which file of the drive each one is.
+
+    Parameters
+    ----------
+    expected
+        The files of the manifest.
+    """
+
+    def __init__(self, expected: Collection[str]) -> None:
+        self._exact = frozenset(expected)
+        # macOS stores 'ü' as two characters: the name in the manifest is found all the same.
+        self._composed = {composed(name): name for name in expected if not name.isascii()}
+        self._names: list[str] = []
+        self._keys: dict[str, str] = {}
+
+    def add(self, name: str) -> bool:
+        """Note one more file; whether it may be one of the drive's, so that unpacking it makes sense.
+
+        Raises
+        ------
+        ServiceError
+            422 `unsafe-archive`, if there is such a name already.
+        """
+        key = portable_key(name)
+        first = self._keys.setdefault(key, name)
+        if len(self._keys) == len(self._names):
+            how = "twice" if first == name else f"beside {shown(first)}, which many systems take for the same file"
+            remedy = "Make the archive again with each file once, under names that differ in more than case."
+            raise Refusal.UNSAFE(f"entry {shown(name)} is in the archive {how}", remedy)
+        self._names.append(name)
+        return self._file(name) is not None or self._file(_without_top(name)) is not None
+
+    def settle(self) -> dict[str, str]:
+        """For each name that was added, the file of the drive: one common top folder does not count.
+
+        Raises
+        ------
+        ServiceError
+            422 `empty-archive` if no name was added, 422 `unexpected-file` if one is no file of the drive.
+        """
+        if not self._names:
+            raise Refusal.EMPTY("the archive holds no file", "Put the drive's images into it.")
+        found = {name: self._file(name) for name in self._names}
+        if None in found.values() and self._has_common_top():
+            stripped = {name: self._file(_without_top(name)) for name in self._names}
+            if any(stripped.values()):
+                found = stripped
+        files = {name: file for name, file in found.items() if file is not None}
+        if len(files) < len(found):
+            raise _unexpected([name for name, file in found.items() if file is None], len(self._exact))
+        return files
+
+    def _file(self, name: str) -> str | None:
+        if name in self._exact or name == MANIFEST_NAME:
+            return name
+        return None if name.isascii() else self._composed.get(composed(name))
+
+    def _has_common_top(self) -> bool:
+        tops = {name.partition("/")[0] for name in self._names}
+        return len(tops) == 1 and all("/" in name for name in self._names)
+
+
+def may_be_manifest(name: str) -> bool:
+    """Whether the entry can be the drive's manifest, at the root or in one top folder."""
+    return MANIFEST_NAME in (name, _without_top(name))
+
+
+def _without_top(name: str) -> str:
+    return name.partition("/")[2]
+
+
+def _problem(name: str) -> str | None:
+    if not name.isprintable():
+        return "has control or invisible characters in its name"
+    if "\\" in name:
+        return "has a backslash in its name"
+    if name.startswith("/"):
+        return "has an absolute name"
+    if _DRIVE_LETTER.match(name):
+        return "has a drive letter in its name"
+    if ".." in name.split("/"):
+        return "leaves the drive's folder with '..'"
+    return None
+
+
+def _unsafe(name: bytes, problem: str, remedy: str) -> ServiceError:
+    return Refusal.UNSAFE(f"entry {shown(name)} of the archive {problem}", remedy)
+
+
+def _unexpected(names: list[str], expected: int) -> ServiceError:
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    listed = ", ".join(shown(name) for name in names[:_SHOWN_NAMES])
+    return Refusal.UNEXPECTED(
+        f"{len(names)} files of the archive are none of the {expected} files of the drive's manifest: {listed}{more}",
+        "Leave them out, or name them as the manifest does; one top folder around all files is fine.",
+    )

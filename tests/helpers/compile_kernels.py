@@ -1,0 +1,33 @@
+"""Compiles the engine's kernels once for all test processes: `python -m tests.helpers.compile_kernels`.
+
+numba compiles a function in each process that calls it before another has left the result on the disk. Two drives are
+rendered, reconstructed and aggregated here; that calls nearly all of them.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from mrasfm_engine.cli import main
+
+
+def compile_kernels(folder: Path) -> None:
+    """Run the commands on drives that are as small as they may be."""
+    options = ("--cameras", "3", "--units", "8", "--width", "320", "--height", "180")
+    drives, scenes = folder / "drives", [folder / "a", folder / "b"]
+    _run("synth", "--out", drives, "--drives", "2", *options)
+    for drive, scene in zip(sorted(path.parent for path in drives.glob("*/drive.json")), scenes, strict=True):
+        _run("reconstruct", drive, "--out", scene)
+    _run("aggregate", *scenes, "--out", folder / "map")
+
+
+def _run(*arguments: object) -> None:
+    if main([str(argument) for argument in arguments]) != 0:
+        sys.exit(f"mrasfm {arguments[0]} failed")
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory(prefix="kernels") as made:
+        compile_kernels(Path(made))

@@ -1,0 +1,101 @@
+"""Images cut to a third with an end marker after them take no part, and are named; the rest of the drive is used."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.export.feature_database import pycolmap
+from mrasfm_engine.visualization import birds_eye
+from tests.helpers.damaged_images import cut
+from tests.integration.conftest import Document, Ran, Variant, read_report
+
+Run = Callable[..., Ran]
+CAMERAS = ["front", "left"]
+
+
+def truncate(variant: Variant, files: list[str]) -> None:
+    for file in files:
+        variant.write(file, cut((variant.root / file).read_bytes()))
+
+
+def images_of(variant: Variant) -> list[str]:
+    return [image["file"] for frame in variant.document["frames"] for image in frame["images"].values()]
+
+
+def findings_of(report: Document) -> list[Document]:
+    return [finding for finding in report["findings"] if finding["code"] == "truncated-images"]
+
+
+def test_some_truncated(variant: Variant, mrasfm: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in the first units, by which the calibration's direction is checked, and a whole unit."""
+    variant.keep(cameras=CAMERAS, units=6).save()
+    units = [frame["images"] for frame in variant.document["frames"]]
+    damaged = [units[1]["left"]["file"], units[2]["front"]["file"], units[4]["front"]["file"]]
+    truncate(variant, damaged)
+    shown: list[str] = []
+    read_view = birds_eye.read_view
+
+    def noted(scene: birds_eye.Scene, index: int) -> object:
+        shown.append(scene.drive.images[index].file)
+        return read_view(scene, index)
+
+    monkeypatch.setattr(birds_eye, "read_view", noted)
+    result = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    assert result.code == 0, result.err
+    assert "units registered: 6 of 6" in result.out
+    assert f"warning: 3 of 12 images are truncated and left out: {', '.join(damaged)}" in result.out
+    report = read_report(variant.scene)
+    (finding,) = findings_of(report)
+    assert finding["severity"] == "warning"
+    assert "reconstruct again" in finding["remedy"]
+    features = report["by_stage"]["features"]
+    assert features["images_left_out"] == [{"file": file, "reason": "truncated"} for file in damaged]
+    assert not set(damaged) & set(features["images_with_under_100_keypoints"])
+    assert not set(damaged) & set(report["by_stage"]["mapping"]["images_dark_or_without_texture"])
+    assert report["summary"]["registered_images"] == 9
+    poses = json.loads((variant.scene / "poses.json").read_text(encoding="utf-8"))
+    assert sorted(image["file"] for image in poses["images"] if not image["registered"]) == sorted(damaged)
+    model = pycolmap.Reconstruction(variant.scene / "model")
+    assert not set(damaged) & {image.name for image in model.images.values()}
+    assert shown
+    assert not set(damaged) & set(shown)
+    again = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    assert again.code == 0
+    repeated = read_report(variant.scene)
+    assert repeated["by_stage"]["features"]["reused"]
+    assert findings_of(repeated) == [finding]
+
+
+def test_all_truncated(variant: Variant, mrasfm: Run) -> None:
+    variant.keep(cameras=CAMERAS, units=4).save()
+    truncate(variant, images_of(variant))
+    result = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    assert result.code == 2
+    assert f"8 of 8 images looked at are truncated: {images_of(variant)[0]}" in result.err
+    assert "Copy the drive's images again" in result.err
+    assert not variant.scene.exists()
+
+
+def test_nothing_of_the_grey_rest_is_in_the_scene(variant: Variant, mrasfm: Run, tmp_path: Path) -> None:
+    """A truncated image counts as one that was never recorded."""
+    variant.keep(cameras=CAMERAS, units=5)
+    file = variant.document["frames"][2]["images"]["left"]["file"]
+    without = json.loads(json.dumps(variant.document))
+    del without["frames"][2]["images"]["left"]
+    variant.save()
+    shutil.copytree(variant.root, tmp_path / "without")
+    (tmp_path / "without" / "drive.json").write_text(json.dumps(without), encoding="utf-8")
+    truncate(variant, [file])
+    poses = []
+    for root in (variant.root, tmp_path / "without"):
+        scene = tmp_path / f"scene-{root.name}"
+        assert mrasfm("reconstruct", root, "--out", scene).code == 0
+        document = json.loads((scene / "poses.json").read_text(encoding="utf-8"))
+        poses.append(np.array([unit["world_from_rig"]["translation_m"] for unit in document["units"]]))
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-6)

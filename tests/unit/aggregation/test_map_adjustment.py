@@ -1,0 +1,343 @@
+"""The map's last adjustment: which units vary, what becomes of their errors, and what becomes of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mrasfm_engine.aggregation import calibrations
+from mrasfm_engine.aggregation.assembly import Assembly
+from mrasfm_engine.aggregation.association import coarse_transform
+from mrasfm_engine.aggregation.calibrations import calibration_priors
+from mrasfm_engine.aggregation.map_adjustment import FinalResult, MapModel, adjust_map, all_points
+from mrasfm_engine.aggregation.positions import drive_positions
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.synthetic.rigs import true_cameras
+from tests.helpers.small_scenes import (
+    CONFIG,
+    PLACE,
+    SIZE_PX,
+    Driven,
+    Street,
+    configured,
+    drive_along,
+    in_assembly,
+    make_street,
+    shared_points,
+)
+
+BEND_M = 0.08
+BIAS_M = ((0.5, -0.3, 0.2), (-0.4, 0.6, -0.3))
+WAYS = np.arange(0.0, 14.0, 2.0), np.arange(5.0, 19.0, 2.0)  # they overlap by half
+
+
+@pytest.fixture(scope="module")
+def street() -> Street:
+    return make_street(length_m=20.0, points=700)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("final")
+
+
+@pytest.fixture(scope="module")
+def two(street: Street, folder: Path) -> list[Driven]:
+    """One is bent to one side, the other to the other."""
+    return [
+        drive_along(street, folder / str(k), WAYS[k], bend_m=(1 - 2 * k) * BEND_M, bias_m=BIAS_M[k], seed=k)
+        for k in range(2)
+    ]
+
+
+def owner_of(drives: Sequence[Driven]) -> np.ndarray:
+    """The joined point of all points of two scenes, as the street's tell it."""
+    a, b = drives
+    pairs = shared_points(a, b)
+    owner = np.full(len(a.point_of_street) + len(b.point_of_street), -1)
+    owner[pairs[:, 0]] = owner[pairs[:, 1] + len(a.point_of_street)] = np.arange(len(pairs))
+    return owner
+
+
+def adjusted(
+    drives: Sequence[Driven], which: str, *, positions: bool = True, owner: np.ndarray | None = None
+) -> FinalResult:
+    """From where scenes truly lie; each as bent as it is."""
+    config = configured(final_adjustment=which)
+    assembly = Assembly(scenes=[d.source for d in drives])
+    known = {}
+    for k, driven in enumerate(drives):
+        believed = se3.transform(np.eye(3), BIAS_M[k]) @ driven.street_from_scene
+        if positions:
+            found = drive_positions(driven.source, believed, int(assembly.first_unit[k]), config.gnss)
+            assert found is not None
+            known[k] = found
+    poses = np.stack([d.street_from_scene for d in drives])
+    return adjust_map(
+        assembly, poses, owner_of(drives) if owner is None else owner, known, config, cancel=lambda: False
+    )
+
+
+def errors_m(result: FinalResult, drives: Sequence[Driven]) -> list[np.ndarray]:
+    """Distances between units and where they were, by drive, the whole map where it fits best.
+
+    How the whole lies only receivers tell, to centimetres, before and after.
+    """
+    first = np.cumsum([0] + [len(d.street_from_rig) for d in drives])
+    at, truth = result.model.state.unit_position_m, np.concatenate([d.street_from_rig[:, :3, 3] for d in drives])
+    turn = Rotation.align_vectors(truth - truth.mean(0), at - at.mean(0))[0].as_matrix()
+    at = (at - at.mean(0)) @ turn.T + truth.mean(0)
+    return [
+        np.linalg.norm(at[first[k] : first[k + 1]] - d.street_from_rig[:, :3, 3], axis=1) for k, d in enumerate(drives)
+    ]
+
+
+def mean_error_m(result: FinalResult, drives: Sequence[Driven]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(errors_m(result, drives)) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def untouched(two: list[Driven]) -> FinalResult:
+    return adjusted(two, "none")
+
+
+def test_none_leaves_everything_where_it_is(two: list[Driven], untouched: FinalResult) -> None:
+    assert untouched.free_units == 0
+    assert untouched.reports == ()
+    expected = np.concatenate([d.street_from_scene @ d.source.world_from_rig for d in two])
+    np.testing.assert_allclose(untouched.model.state.world_from_rig, expected, atol=1e-12)
+    assert BEND_M * 0.4 < max(e.max() for e in errors_m(untouched, two)) < BEND_M * 1.3
+
+
+@pytest.mark.parametrize("which", ["overlap", "all"])
+def test_bent_scenes_settle_nearer_to_the_truth(two: list[Driven], untouched: FinalResult, which: str) -> None:
+    result = adjusted(two, which)
+    before, after = mean_error_m(untouched, two), mean_error_m(result, two)
+    assert 0.0005 < after < 0.7 * before
+    moved = result.model.state.unit_position_m - untouched.model.state.unit_position_m
+    assert 0 < np.linalg.norm(moved.mean(0)) < 0.05
+    assert len(result.reports) == 2
+    # And so do the points of both scenes.
+    assert np.median(result.model.errors_px) < np.median(untouched.model.errors_px)
+    units = sum(len(d.street_from_rig) for d in two)
+    assert result.free_units == units if which == "all" else 8 <= result.free_units <= units
+    # Receivers' constant errors are told apart, but for what they have in common.
+    told = result.positions[0].bias_m - result.positions[1].bias_m
+    assert 0 < np.abs(told - (np.array(BIAS_M[0]) - BIAS_M[1])).max() < 0.2
+
+
+def test_units_out_of_the_overlap_stay_with_overlap_only(street: Street, folder: Path) -> None:
+    """The second drive sees nothing of what the first units of the first one see."""
+    long = make_street(length_m=120.0, points=2500, seed=3)
+    drives = [
+        drive_along(long, folder / f"long{k}", np.arange(s, s + 48.0, 4.0), bend_m=0.05 * k, bias_m=BIAS_M[k], seed=k)
+        for k, s in enumerate((0.0, 76.0))
+    ]
+    result = adjusted(drives, "overlap")
+    assembly = Assembly(scenes=[d.source for d in drives])
+    before = assembly.state(np.stack([d.street_from_scene for d in drives])).unit_position_m
+    moved = np.linalg.norm(result.model.state.unit_position_m - before, axis=1)
+    assert 0 < result.free_units == (moved > 0).sum() < len(moved)
+    assert moved[0] == 0
+    assert moved.max() < 0.2
+    everything = adjusted(drives, "all")
+    moved = np.linalg.norm(everything.model.state.unit_position_m - before, axis=1)
+    assert (moved > 0).all()
+    assert moved.max() < 0.5
+
+
+def test_all_without_any_positions(two: list[Driven], untouched: FinalResult) -> None:
+    """Nothing holds the whole then, and it stays about where it is."""
+    result = adjusted(two, "all", positions=False)
+    assert result.positions == {}
+    assert np.isfinite(result.model.state.unit_position_m).all()
+    assert 0 < mean_error_m(result, two) < 1.5 * mean_error_m(untouched, two)
+
+
+@pytest.mark.parametrize("which", ["none", "overlap", "all"])
+def test_every_drive_has_its_calibration_and_points_that_are_one_become_one(
+    two: list[Driven], untouched: FinalResult, which: str
+) -> None:
+    result = untouched if which == "none" else adjusted(two, which)
+    state, model = result.model.state, result.model
+    rigs = [d.source.drive.rig_from_cam for d in two]
+    assert np.abs(rigs[0] - rigs[1]).max() > 1e-3
+    np.testing.assert_array_equal(state.rig_from_cam, np.concatenate(rigs))
+    a, b = two
+    pairs = in_assembly(shared_points(a, b), a)
+    one = model.owner[pairs]
+    kept = (one >= 0).all(1)
+    assert kept.mean() > 0.9
+    np.testing.assert_array_equal(one[kept, 0], one[kept, 1])
+    assert len(np.unique(one[kept, 0])) == kept.sum()
+    # What a point's observations are of, and how far they are off, is said of the very point.
+    source = Assembly(scenes=[a.source, b.source]).keypoint_point
+    np.testing.assert_array_equal(model.owner[source[model.rows]], model.point)
+    assert (np.diff(model.point) >= 0).all()
+    assert np.bincount(model.point).min() >= 2
+    assert 0 < model.errors_px.max() < CONFIG.mapping.filter_error_px
+    truth = np.concatenate([d.point_of_street for d in two])
+    where = np.full(len(state.points_m), -1)
+    where[model.owner[model.owner >= 0]] = truth[model.owner >= 0]
+    assert (where >= 0).all()
+
+
+def test_a_point_whose_other_scene_does_not_fit_is_no_joined_one(two: list[Driven]) -> None:
+    """Joined are points that two scenes see in the map, not those that were meant to be."""
+    a, b = two
+    pairs = shared_points(a, b)
+    wrong = pairs[:30, 1]
+    xy = b.source.keypoint_xy_px.copy()
+    xy[np.isin(b.source.keypoint_point, wrong)] += np.float32(60.0)
+    result = adjusted([a, replace(b, source=replace(b.source, keypoint_xy_px=xy))], "none", owner=owner_of(two))
+    scene = (result.model.rows >= len(a.source.keypoint_point)).astype(int)
+    count = len(result.model.state.points_m)
+    seen = np.stack([np.bincount(result.model.point[scene == s], minlength=count) for s in (0, 1)])
+    np.testing.assert_array_equal(result.model.joined, (seen > 0).all(0))
+    left = result.model.owner[pairs[:30, 0]]
+    assert not result.model.joined[left[left >= 0]].any()
+    assert result.dropped_observations >= 60
+
+
+def test_images_that_are_not_simultaneous_stay_where_they_are_in_their_units(
+    street: Street, folder: Path, untouched: FinalResult, two: list[Driven]
+) -> None:
+    moving = drive_along(
+        street, folder / "moving", WAYS[1], bend_m=-BEND_M, bias_m=BIAS_M[1], offset_ms=[0, 12, -15, 30], seed=7
+    )
+    drives = [two[0], moving]
+    assert len(moving.source.unit_from_image) == len(moving.source.image_unit)
+    before = mean_error_m(adjusted(drives, "none"), drives)
+    for which in ("overlap", "all"):
+        result = adjusted(drives, which)
+        assert 0.0005 < mean_error_m(result, drives) < 0.8 * before
+        shots = result.model.state.unit_from_shot
+        np.testing.assert_allclose(shots[: len(two[0].source.image_unit)], np.tile(np.eye(4), (28, 1, 1)), atol=1e-12)
+        np.testing.assert_allclose(shots[28:], moving.source.unit_from_image, atol=1e-12)
+
+
+def camera_errors_deg(result: FinalResult, drives: Sequence[Driven]) -> np.ndarray:
+    """How far every camera is turned from its true pose, all of a drive together where they fit best."""
+    found, errors = result.model.state.camera_rotation.reshape(len(drives), -1, 3, 3), []
+    for k in range(len(drives)):
+        rig = true_cameras(4, width=SIZE_PX[0], height=SIZE_PX[1], rng=np.random.default_rng(1000 + drives[k].seed))
+        truth = np.stack([camera.rig_from_cam[:3, :3] for camera in rig])
+        turn = se3.log_so3(found[k] @ np.swapaxes(truth, 1, 2))
+        errors.append(np.degrees(np.linalg.norm(turn - turn.mean(0), axis=1)))
+    return np.concatenate(errors)
+
+
+@pytest.mark.parametrize("which", ["overlap", "all"])
+def test_calibrations_settle_as_far_as_scenes_left_them_uncertain(street: Street, folder: Path, which: str) -> None:
+    """What short drives say of their cameras is wrong in each its own way; held, it would bend and scale the map."""
+    drives = [
+        drive_along(street, folder / f"{which}{k}", WAYS[k], cameras_off_deg=0.15, bias_m=BIAS_M[k], seed=20 + k)
+        for k in range(2)
+    ]
+    before, after = adjusted(drives, "none"), adjusted(drives, which)
+    assert (before.free_cameras, after.free_cameras) == (0, 8)
+    assert np.median(camera_errors_deg(before, drives)) > 0.1
+    assert 0 < np.median(camera_errors_deg(after, drives)) < 0.4 * np.median(camera_errors_deg(before, drives))
+    moved = after.model.state.camera_position_m - before.model.state.camera_position_m
+    assert 0 < np.abs(moved).max() < 0.003  # nothing was observed of where cameras sit
+    certain = [
+        replace(d, source=replace(d.source, calibration=d.source.calibration | {"adjusted": False})) for d in drives
+    ]
+    held = adjusted(certain, which)
+    np.testing.assert_array_equal(held.model.state.rig_from_cam, before.model.state.rig_from_cam)
+    assert 0 < mean_error_m(after, drives) < 0.7 * mean_error_m(held, drives)
+    assert np.median(after.model.errors_px) < np.median(held.model.errors_px)
+
+
+def test_points_that_only_fixed_units_see_follow_their_calibration(folder: Path) -> None:
+    """Only the first drive's calibration was refined: points of the second one stay where none of its units vary."""
+    long = make_street(length_m=260.0, points=4000, seed=4)
+    drives = [
+        drive_along(long, folder / f"ends{k}", np.arange(s, s + 100.0, 4.0), bias_m=BIAS_M[k], seed=40 + k, **extra)
+        for k, (s, extra) in enumerate(((0.0, {"cameras_off_deg": 0.15}), (120.0, {})))
+    ]
+    assembly = Assembly(scenes=[d.source for d in drives])
+    before, after = adjusted(drives, "none").model, adjusted(drives, "overlap").model
+    fixed = (before.state.unit_position_m == after.state.unit_position_m).all(1)
+    assert fixed[[0, -1]].all()
+    assert 4 < fixed.sum() < len(fixed) - 4
+    unit = assembly.image_unit[assembly.keypoint_image]
+
+    def seen_by_fixed(model: MapModel, scene: int) -> np.ndarray:
+        """Points (of all scenes') of a scene in the model that no unit sees that varies."""
+        varied = np.unique(model.point[~fixed[unit[model.rows]]])
+        mine = np.flatnonzero((assembly.scene_of_point == scene) & (model.owner >= 0))
+        return mine[~np.isin(model.owner[mine], varied)]
+
+    for scene in range(2):
+        points = np.intersect1d(seen_by_fixed(before, scene), seen_by_fixed(after, scene))
+        assert len(points) > 50
+        moved = [model.state.points_m[model.owner[points]] for model in (before, after)]
+        assert (np.abs(moved[1] - moved[0]).max(1) > 0).mean() == (1.0 if scene == 0 else 0.0)
+        rows = [np.isin(model.point, model.owner[points]) for model in (before, after)]
+        errors = [np.median(model.errors_px[row]) for model, row in zip((before, after), rows, strict=True)]
+        assert errors[1] < 0.9 * errors[0] if scene == 0 else errors[1] == pytest.approx(errors[0], abs=0.01)
+
+
+def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
+    street: Street, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drives = [drive_along(street, folder / f"said{k}", WAYS[k], cameras_off_deg=0.1, seed=30 + k) for k in range(2)]
+    assembly = Assembly(scenes=[d.source for d in drives])
+    state = assembly.state(np.stack([d.street_from_scene for d in drives]))
+    first = np.arange(len(assembly.registered)) < 3  # of the first drive's 7 units
+
+    def sigmas(free: np.ndarray) -> list[np.ndarray]:
+        found = calibration_priors(assembly, state, free, CONFIG.adjustment)
+        assert [prior.camera.tolist() for prior in found] == [[0, 1, 2, 3], [4, 5, 6, 7]][: len(found)]
+        assert all((prior.held == np.repeat([False, True], 3)).all() for prior in found)
+        return [prior.sigma for prior in found]
+
+    (some,), every = sigmas(first), sigmas(assembly.registered)
+    np.testing.assert_allclose(some[:, :3], np.radians(0.1) * np.sqrt(7 / 4), rtol=1e-6)
+    for sigma in every:
+        np.testing.assert_allclose(sigma[:, :3], np.radians(CONFIG.adjustment.sigma_rotation_deg))
+        np.testing.assert_allclose(sigma[:, 3:], CONFIG.adjustment.sigma_translation_m)
+    assert len(every) == 2
+    assert sigmas(~assembly.registered) == []
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8))
+    assert len(sigmas(assembly.registered)) == 2
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8) - 1)
+    assert sigmas(assembly.registered) == []
+    held = CONFIG.adjustment.model_copy(update={"refine_calibration": False})
+    monkeypatch.undo()
+    assert calibration_priors(assembly, state, assembly.registered, held) == []
+
+
+def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:
+    """Up is elsewhere at the other end of a degree: 110 km north, vehicles stand 1 deg inclined to the map's frame."""
+    north = make_street(length_m=20.0, points=700, place=(PLACE[0] + 1.0, *PLACE[1:]), seed=5)
+    far = drive_along(north, folder / "far", WAYS[0], seed=8)
+    scenes = [two[0].source, far.source]
+    map_from_scene = np.stack([np.eye(4), coarse_transform(*scenes)])
+    config = configured(final_adjustment="all")
+    assembly = Assembly(scenes=scenes)
+    known = {
+        k: found
+        for k, scene in enumerate(scenes)
+        if (found := drive_positions(scene, map_from_scene[k], int(assembly.first_unit[k]), config.gnss)) is not None
+    }
+    assert len(known) == 2
+    owner = np.full(int(assembly.first_point[-1]), -1)
+    result = adjust_map(assembly, map_from_scene, owner, known, config, cancel=lambda: False)
+    poses = result.model.state.world_from_rig[int(assembly.first_unit[1]) :]
+    turned = se3.inverse(map_from_scene[1] @ far.source.world_from_rig) @ poses
+    assert 0.9 < se3.rotation_angle_deg(map_from_scene[1][:3, :3]) < 1.1
+    # About the way, where nothing but the prior holds it; how it is turned otherwise, receivers say within their noise.
+    assert 0 < np.degrees(np.abs(se3.log_so3(turned[:, :3, :3])[:, 0]).max()) < 0.2
+
+
+def test_points_of_their_own_are_numbered_after_joined_ones() -> None:
+    np.testing.assert_array_equal(all_points(np.array([-1, 1, 0, -1, 1])), [2, 1, 0, 3, 1])
+    np.testing.assert_array_equal(all_points(np.array([-1, -1])), [0, 1])
+    assert len(all_points(np.zeros(0, dtype=np.int64))) == 0

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.observability_analysis import judge_directions
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
+from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.scene.state import State
+from tests.helpers.small_problems import Case, dense_normal_equations, make_case, perturbed
+
+
+def prior_of(state: State, *, rotation_deg: float = 0.5, translation_m: float = 0.01) -> CalibrationPrior:
+    cameras = len(state.camera_rotation)
+    return CalibrationPrior(
+        rotation=state.camera_rotation,
+        position_m=state.camera_position_m,
+        sigma_rotation_rad=np.full(cameras, np.radians(rotation_deg)),
+        sigma_translation_m=np.full(cameras, translation_m),
+    )
+
+
+def stereo(seed: int, *, units: int = 5, points: int = 200) -> Case:
+    return make_case(
+        units=units,
+        cameras=2,
+        points=points,
+        noise_px=0.5,
+        free_units=[False] + [True] * (units - 1),
+        free_cameras=[True, True],
+        seed=seed,
+        options=SolverOptions(sigma_px=0.5),
+    )
+
+
+@pytest.mark.parametrize("free_focal", [False, True])
+def test_covariances_are_the_inverse_of_the_full_hessian(free_focal: bool) -> None:
+    case = stereo(0, units=3, points=120)
+    problem = replace(
+        case.problem,
+        layout=replace(case.problem.layout, free_focal=free_focal),
+        terms=[
+            prior_of(case.truth),
+            FocalPrior(focal_px=case.truth.camera_params[:, 0], sigma=np.full(2, 0.002)),
+        ],
+    )
+    found = covariances(problem, case.truth)
+    h, _ = dense_normal_equations(problem, case.truth)
+    free = np.setdiff1d(np.arange(len(h)), problem.layout.held())
+    scale = 1 / np.sqrt(np.diagonal(h)[free])
+    covariance = np.zeros_like(h)
+    covariance[np.ix_(free, free)] = np.linalg.inv(h[np.ix_(free, free)] * np.outer(scale, scale)) * np.outer(
+        scale, scale
+    )
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0))
+    np.testing.assert_allclose(found.sigma_unit_position_m[1:], sigma[:12].reshape(2, 6)[:, 3:], rtol=1e-3)
+    np.testing.assert_allclose(found.sigma_camera, sigma[12:26].reshape(2, 7), rtol=1e-3, atol=1e-12)
+    assert np.isnan(found.sigma_unit_position_m[0]).all()
+    assert (found.sigma_camera[:, 6] > 0).all() == free_focal
+    centred = case.truth.unit_position_m[1:] - case.truth.unit_position_m[1:].mean(0)
+    functional = np.zeros(12)
+    functional.reshape(2, 6)[:, 3:] = centred / (centred**2).sum()
+    assert found.sigma_scale == pytest.approx(np.sqrt(functional @ covariance[:12, :12] @ functional), rel=1e-3)
+
+
+def test_pitfall_9_the_sigma_of_scale_is_that_of_the_baseline() -> None:
+    found = covariances(replace(stereo(1).problem, terms=[prior_of(stereo(1).truth)]), stereo(1).truth)
+    # The baseline of 0.5 m is the difference of two positions with 0.01 m each: 2.8 %, and the images add little.
+    assert 0.02 < found.sigma_scale < 0.04
+    looser = covariances(
+        replace(stereo(1).problem, terms=[prior_of(stereo(1).truth, translation_m=0.02)]), stereo(1).truth
+    )
+    assert 1.7 < looser.sigma_scale / found.sigma_scale < 2.1
+
+
+def test_pitfall_9_the_sigma_of_scale_is_honest() -> None:
+    normalised = []
+    for seed in range(20):
+        case = stereo(seed)
+        rng = np.random.default_rng(100 + seed)
+        given = perturbed(case.truth, rng, cameras=[0, 1], camera_deg=0.5, camera_m=0.01, point_m=0.02)
+        problem = replace(case.problem, state=given, terms=[prior_of(given)])
+        solution, _ = solve(problem)
+        scale = align_similarity(solution.unit_position_m[1:], case.truth.unit_position_m[1:]).scale
+        normalised.append(np.log(scale) / covariances(problem, solution).sigma_scale)
+    assert 0.5 < np.std(normalised) < 2.0
+    assert abs(np.mean(normalised)) < 1.0
+
+
+def test_positions_are_as_uncertain_as_said_where_calibration_is_held() -> None:
+    normalised = []
+    for seed in range(15):
+        case = make_case(units=4, cameras=3, points=250, noise_px=0.5, seed=seed, options=SolverOptions(sigma_px=0.5))
+        solution, _ = solve(case.problem)
+        sigma = covariances(case.problem, solution).sigma_unit_position_m[1:]
+        normalised.append((solution.unit_position_m - case.truth.unit_position_m)[1:] / sigma)
+    assert 0.6 < np.std(normalised) < 1.6
+
+
+def test_held_calibration_leaves_nothing_to_say_of_cameras() -> None:
+    case = make_case(units=4, cameras=2, points=200)
+    found = covariances(case.problem, case.truth)
+    assert np.isnan(found.sigma_camera).all()
+    assert (found.sigma_unit_position_m[1:] > 0).all()
+
+
+def test_one_free_unit_has_no_scale() -> None:
+    case = make_case(units=2, cameras=2, points=200)
+    assert np.isnan(covariances(case.problem, case.truth).sigma_scale)
+
+
+def test_pitfall_9_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> None:
+    """On a straight flat drive the images tell the cameras from one another, and neither their mean nor their scale."""
+    case = make_case(
+        units=8,
+        cameras=4,
+        points=700,
+        straight=True,
+        free_units=[False] + [True] * 7,
+        free_cameras=[True] * 4,
+        options=SolverOptions(sigma_px=0.5),
+    )
+    prior = prior_of(case.truth, rotation_deg=2.0, translation_m=0.05)
+    found = covariances(replace(case.problem, terms=[prior]), case.truth)
+    assert found.calibration.shape == (24, 24)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.calibration)).reshape(4, 6), found.sigma_camera[:, :6])
+    verdict = judge_directions(
+        found.calibration,
+        position_m=case.truth.camera_position_m,
+        sigma_rotation_rad=prior.sigma_rotation_rad,
+        sigma_translation_m=prior.sigma_translation_m,
+    )
+    assert verdict.observed[:, :3].all()
+    assert not verdict.scale_observed
+    assert verdict.sigma_scale == pytest.approx(verdict.prior_sigma_scale, rel=0.05)
+    mean = np.kron(np.ones((1, 4)) / 4, np.eye(6))
+    assert np.sqrt(np.diagonal(mean @ found.calibration @ mean.T))[3:].max() < 1e-3 * 0.05  # it is held

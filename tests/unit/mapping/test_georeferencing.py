@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset
+from mrasfm_engine.synthetic.simulate import simulate_trajectory
+
+ARM_M = np.array([-0.5, 0.2, 1.8])
+
+
+@dataclass
+class Track:
+    """A trajectory in the model's frame, and what the receiver says of it."""
+
+    model_from_rig: np.ndarray
+    measured_m: np.ndarray
+    sigma_m: np.ndarray
+    world_from_model: np.ndarray
+
+    def align(self) -> GnssAlignment | str:
+        rotation = self.model_from_rig[:, :3, :3]
+        return align_with_gnss(
+            self.model_from_rig[:, :3, 3] + rotation @ ARM_M,
+            rotation[:, :, 2],
+            rotation[:, :, 0],
+            self.measured_m,
+            self.sigma_m,
+            outlier_sigmas=4.0,
+            rng=np.random.default_rng(0),
+        )
+
+
+def track(
+    *,
+    units: int = 60,
+    spacing_m: float = 1.5,
+    straight: bool = False,
+    sigma_m: float = 0.05,
+    seed: int = 0,
+    tilt: bool = True,
+) -> Track:
+    rng = np.random.default_rng(seed)
+    world_from_rig = simulate_trajectory(units, spacing_m=spacing_m, straight=straight)
+    antenna = world_from_rig[:, :3, 3] + world_from_rig[:, :3, :3] @ ARM_M
+    # The model's frame is that of its first vehicle pose in any orientation, as a reconstruction begins.
+    turn = se3.exp_so3(rng.normal(size=3)) if tilt else np.eye(3)
+    model_from_world = se3.transform(turn, rng.normal(size=3) * 50)
+    return Track(
+        model_from_rig=model_from_world @ world_from_rig,
+        measured_m=antenna + rng.normal(size=antenna.shape) * sigma_m,
+        sigma_m=np.full(antenna.shape, max(sigma_m, 1e-3)),
+        world_from_model=se3.inverse(model_from_world),
+    )
+
+
+def errors(found: GnssAlignment, expected: Track) -> tuple[float, float]:
+    """Largest distance of a vehicle position from where it is (m), rotation error (deg)."""
+    a, b = (m @ expected.model_from_rig for m in (found.world_from_model, expected.world_from_model))
+    turn = found.world_from_model[:3, :3] @ expected.world_from_model[:3, :3].T
+    return float(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1).max()), float(se3.rotation_angle_deg(turn))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_known_transform_is_recovered(seed: int) -> None:
+    t = track(seed=seed)
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    position_m, rotation_deg = errors(found, t)
+    assert 1e-4 < position_m < 0.1
+    assert 1e-4 < rotation_deg < 1.0
+    assert found.inlier.all()
+    assert 0.03 < np.sqrt((found.residual_m**2).mean()) < 0.15
+    assert found.scale == pytest.approx(1.0, abs=0.005)
+    assert 1.0 <= found.noise_factor < 1.4
+
+
+def test_pitfall_2_the_transform_is_rigid_and_scale_only_told() -> None:
+    t = track(sigma_m=0.3)
+    t.model_from_rig[:, :3, 3] /= 1.02
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    rotation = found.world_from_model[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert found.scale == pytest.approx(1.02, abs=0.006)
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "way_m", "scale"), [(0.02, 300.0, 1.005), (0.05, 300.0, 1.007), (0.3, 1000.0, 1.01)]
+)
+def test_pitfall_4_a_rig_that_is_off_in_scale_is_aligned_all_the_same(
+    sigma_m: float, way_m: float, scale: float
+) -> None:
+    t = track(units=200, spacing_m=way_m / 200, sigma_m=sigma_m)
+    t.model_from_rig[:, :3, 3] /= scale
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    assert found.scale == pytest.approx(scale, abs=0.002)
+    assert found.inlier.mean() > 0.9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pitfall_3_on_a_straight_line_up_decides_the_roll(seed: int) -> None:
+    t = track(straight=True, seed=seed)
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    up = found.world_from_model[:3, :3] @ t.model_from_rig[:, :3, 2].mean(0)
+    assert 1e-4 < np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 1.0
+    position_m, rotation_deg = errors(found, t)
+    assert 1e-4 < position_m < 0.15
+    assert 1e-3 < rotation_deg < 1.5
+
+
+@pytest.mark.parametrize("straight", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_pitfall_4_a_fifth_of_gross_errors_is_rejected(seed: int, straight: bool) -> None:
+    t = track(straight=straight, seed=seed)
+    rng = np.random.default_rng(seed)
+    wrong = rng.choice(60, 12, replace=False)
+    t.measured_m[wrong] += rng.choice([-1.0, 1.0], (12, 3)) * rng.uniform(2, 100, (12, 3))
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    assert not found.inlier[wrong].any()
+    assert found.inlier.sum() >= 46
+    assert 1e-4 < errors(found, t)[0] < 0.15
+
+
+def test_pitfall_4_a_jump_that_stays_is_not_averaged_in() -> None:
+    t = track()
+    t.measured_m[45:] += [4.0, -3.0, 2.0]
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    assert found.inlier[:45].all()
+    assert not found.inlier[45:].any()
+    assert errors(found, t)[0] < 0.2
+
+
+def test_sigmas_that_promise_too_much_are_found_out() -> None:
+    t = track(sigma_m=0.3, units=150)
+    t.sigma_m[:] = 0.1
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    assert 2.0 < found.noise_factor < 4.0
+    assert found.inlier.mean() > 0.95
+
+
+def test_pitfall_6_a_standing_car_gets_a_reason() -> None:
+    t = track(spacing_m=1e-4)
+    t.model_from_rig[:, :3, 3] += np.random.default_rng(0).normal(size=(60, 3)) * 0.002
+    found = t.align()
+    assert isinstance(found, str)
+    assert "moved by" in found
+
+
+@pytest.mark.parametrize("flip", ["swapped", "mirrored"])
+def test_a_track_of_another_shape_gets_a_reason(flip: str) -> None:
+    t = track(units=120, spacing_m=2.0)
+    # A long bend: a mirrored one cannot be turned onto it.
+    t.measured_m = t.measured_m[:, [1, 0, 2]] if flip == "swapped" else t.measured_m * [-1.0, 1.0, 1.0]
+    found = t.align()
+    assert isinstance(found, str)
+    assert "swapped" in found
+
+
+@pytest.mark.parametrize("units", [0, 1, 2])
+def test_too_few_positions_are_a_reason(units: int) -> None:
+    t = track(units=max(units, 1))
+    cut = Track(t.model_from_rig[:units], t.measured_m[:units], t.sigma_m[:units], t.world_from_model)
+    found = cut.align()
+    assert isinstance(found, str)
+    assert f"only {units} registered" in found
+
+
+def driven(times_s: np.ndarray) -> np.ndarray:
+    """A bend at changing speed."""
+    way = 8.0 * times_s + 10.0 * np.sin(0.5 * times_s)
+    return np.stack([60 * np.sin(way / 60), 60 * (1 - np.cos(way / 60)), 0 * way], 1)
+
+
+@pytest.mark.parametrize("offset_s", [-0.4, 0.0, 0.15])
+def test_pitfall_4_a_clock_that_is_off_is_told_with_its_sign(offset_s: float) -> None:
+    times_s = np.arange(80) * 0.2
+    noise = np.random.default_rng(0).normal(size=(80, 3)) * 0.05
+    found = clock_offset(
+        driven(times_s),
+        driven(times_s + offset_s) + noise,
+        np.full((80, 3), 0.05),
+        np.round(times_s * 1e6).astype(np.int64),
+    )
+    assert found is not None
+    assert found[0] == pytest.approx(offset_s, abs=max(0.02, 0.1 * abs(offset_s)))
+    assert 1e-4 < found[1] < 0.05
+
+
+def test_a_clock_cannot_be_told_on_a_straight_way_at_one_speed() -> None:
+    times_s = np.arange(40) * 0.2
+    way = times_s[:, None] * np.array([10.0, 0.0, 0.0])
+    noise = np.random.default_rng(0).normal(size=(40, 3)) * 0.05
+    found = clock_offset(way, way + noise, np.full((40, 3), 0.05), np.round(times_s * 1e6).astype(np.int64))
+    assert found is None or found[1] > 1.0
+    assert clock_offset(way[:4], way[:4], np.ones((4, 3)), np.arange(4)) is None

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.mapping.incremental_mapping import grow
+from mrasfm_engine.mapping.keyframes import nearest_keyframes, register_between_keyframes, select_keyframes
+from mrasfm_engine.mapping.mapper import Model
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    metric_errors_m,
+    rmse,
+    true_matches,
+)
+
+STEP_M = 1.1
+HELD = EngineConfig(threads=1).model_copy(
+    update={"adjustment": EngineConfig().adjustment.model_copy(update={"refine_calibration": False})}
+)
+# Steps before every unit: units of a stop are where the one before the stop is.
+STOPS = {
+    "in the middle": [0] + [STEP_M] * 4 + [0.0] * 12 + [STEP_M] * 4,
+    "at the beginning": [0] + [0.0] * 12 + [STEP_M] * 7,
+    "at the end": [0] + [STEP_M] * 7 + [0.0] * 12,
+}
+
+
+def drive(steps_m: list[float], **options: object) -> SimulatedDrive:
+    way = np.cumsum(steps_m)
+    values = {"units": len(way), "cameras": 4, "points": 900, "way_m": way, "noise_px": 0.3}
+    return make_simulated_drive(**{**values, **options})  # type: ignore[arg-type]
+
+
+def model_of(simulated: SimulatedDrive) -> Model:
+    model = make_model(simulated, config=HELD)
+    model.keyframe = select_keyframes(model)
+    return model
+
+
+def reconstruct(simulated: SimulatedDrive) -> Model:
+    pairs = true_matches(simulated)
+    model = make_model(simulated, pairs, HELD)
+    model.keyframe = select_keyframes(model)
+    grow(model, pairs, None)
+    assert (model.registered == model.keyframe).all()
+    results = register_between_keyframes(model, max_error_px=3.0)
+    assert len(results) == (~model.keyframe).sum()
+    return model
+
+
+@pytest.mark.parametrize("where", STOPS)
+def test_pitfall_6_a_stop_has_one_keyframe_and_all_its_units_have_poses(where: str) -> None:
+    simulated = drive(STOPS[where])
+    model = reconstruct(simulated)
+    stands = np.diff(np.cumsum(STOPS[where]), prepend=-1.0) == 0
+    np.testing.assert_array_equal(model.keyframe, ~stands)
+    assert model.registered.all()
+    errors = metric_errors_m(model, simulated)
+    assert 1e-4 < rmse(errors) < 0.02
+    # None of them drifts from where the car stood.
+    place = model.state.unit_position_m[stands]
+    assert 0 < np.linalg.norm(place - place.mean(0), axis=1).max() < 0.02
+    own = model.keypoints.unit[model.kept]
+    assert np.bincount(own, minlength=len(stands))[stands].min() > 100
+
+
+def test_standing_units_do_not_bend_the_scene() -> None:
+    steps = STOPS["in the middle"]
+    with_stop, without = drive(steps), drive([s for k, s in enumerate(steps) if k == 0 or s > 0])
+    errors = [rmse(metric_errors_m(reconstruct(s), s)) for s in (with_stop, without)]
+    assert 1e-4 < errors[0] < 2 * max(errors[1], 0.003)
+
+
+def test_a_moving_drive_has_keyframes_only() -> None:
+    model = model_of(drive([0.0] + [STEP_M] * 8))
+    assert model.keyframe.all()
+    assert register_between_keyframes(model, max_error_px=3.0) == []
+    np.testing.assert_array_equal(nearest_keyframes_of_all(model), np.arange(9))
+
+
+def nearest_keyframes_of_all(model: Model) -> np.ndarray:
+    model.registered[:] = True
+    return nearest_keyframes(model)
+
+
+def test_a_creeping_car_has_a_keyframe_now_and_then() -> None:
+    """Steps of 2 cm: it is measured against the last keyframe, so they add up."""
+    model = model_of(drive([0.0] + [0.02] * 39))
+    gaps = np.diff(np.flatnonzero(model.keyframe))
+    assert gaps.min() >= 2
+    assert gaps.max() < 20
+
+
+def test_others_that_drive_past_do_not_make_a_standing_car_move() -> None:
+    steps = STOPS["in the middle"]
+    simulated = drive(steps)
+    rng = np.random.default_rng(0)
+    on_cars = rng.random(len(simulated.truth.points_m)) < 0.35
+    for image, features, point in zip(
+        simulated.drive.images, simulated.features, simulated.point_of_keypoint, strict=True
+    ):
+        rows = (point >= 0) & on_cars[np.maximum(point, 0)]
+        features.xy_px[rows] += [12.0 * image.unit, 1.0]
+    model = model_of(simulated)
+    stands = np.diff(np.cumsum(steps), prepend=-1.0) == 0
+    np.testing.assert_array_equal(model.keyframe, ~stands)
+
+
+def test_a_drive_that_only_stands_keeps_all_its_units() -> None:
+    assert model_of(drive([0.0] * 6)).keyframe.all()
+
+
+def test_zero_makes_every_unit_a_keyframe() -> None:
+    off = HELD.model_copy(update={"mapping": HELD.mapping.model_copy(update={"keyframe_motion_px": 0.0})})
+    model = make_model(drive(STOPS["at the end"]), config=off)
+    assert select_keyframes(model).all()
+
+
+def test_where_cameras_are_apart_the_ends_of_a_stop_tell_that_the_car_stood() -> None:
+    steps = STOPS["in the middle"]
+    model = model_of(drive(steps, time_offset_ms=[0, 0, 0, 45]))
+    # The late camera sees the car start at unit 16 already, so unit 15 is the last one that stands.
+    assert np.flatnonzero(~model.keyframe).tolist() == list(range(6, 15))
+    stands = np.diff(np.cumsum(steps), prepend=-1.0) == 0
+    assert np.flatnonzero(stands).tolist() == list(range(5, 17))

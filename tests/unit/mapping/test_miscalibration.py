@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.miscalibration import (
+    WrongCamera,
+    find_wrong_cameras,
+    find_wrong_pair,
+    finding,
+    pair_finding,
+    voted_out,
+)
+from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.unit_registration import Registration
+from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+
+TURNING, STRAIGHT = 24, 8  # units
+
+
+def turned(camera: int | None, *, deg: float = 3.0, others_deg: float = 0.0, seed: int = 0):  # type: ignore[no-untyped-def]
+    """What the manifest says of the cameras: one by `deg`, the others by `others_deg` off, in random directions."""
+
+    def given(rig_from_cam: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        for c in range(len(rig_from_cam)):
+            direction = rng.normal(size=3)
+            size = np.radians(deg if c == camera else others_deg)
+            rig_from_cam[c, :3, :3] = rig_from_cam[c, :3, :3] @ se3.exp_so3(
+                size * direction / np.linalg.norm(direction)
+            )
+        return rig_from_cam
+
+    return given
+
+
+def refined(simulated: SimulatedDrive) -> tuple[Model, Refinement]:
+    """From true poses of the units, and the calibration as given."""
+    model = with_true_poses(make_model(simulated), simulated, range(len(simulated.world_from_rig)))
+    return model, refine(model, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+
+
+def drive(given, *, straight: bool = False) -> SimulatedDrive:  # type: ignore[no-untyped-def]
+    return make_simulated_drive(units=STRAIGHT if straight else TURNING, points=900, straight=straight, given=given)
+
+
+def relative_errors_deg(model: Model, simulated: SimulatedDrive) -> np.ndarray:
+    """Rotation errors (c,) of the cameras against the median of all."""
+    errors = se3.log_so3(model.state.camera_rotation @ np.swapaxes(simulated.truth.rig_from_cam[:, :3, :3], 1, 2))
+    return np.degrees(np.linalg.norm(errors - np.median(errors, axis=0), axis=1))
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_pitfall_5_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
+    """Also on a straight street without positions, where the calibration as a whole is held."""
+    simulated = drive(turned(2), straight=straight)
+    model, result = refined(simulated)
+    assert result.calibration.free is not straight
+    assert [w.camera for w in result.wrong_cameras] == [2]
+    wrong = result.wrong_cameras[0]
+    assert 2.9 < wrong.rotation_deg < 3.1
+    assert 0 <= wrong.others_rotation_deg < 0.05
+    errors = relative_errors_deg(model, simulated)
+    assert 0 < errors[2] < 0.1
+    assert errors.max() < 0.1
+    if straight:
+        np.testing.assert_array_equal(result.recalibrated, np.arange(6) == 2)
+        np.testing.assert_array_equal(model.state.camera_rotation[0], simulated.drive.rig_from_cam[0, :3, :3])
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_usual_calibration_names_nobody(straight: bool) -> None:
+    """Cameras that are off by 0.3 deg under a prior of 2 deg are what recalibration is for."""
+    _, result = refined(drive(turned(None, others_deg=0.3), straight=straight))
+    assert result.wrong_cameras == []
+    assert result.recalibrated.all() != straight
+
+
+def test_a_finding_says_which_camera_and_by_how_much() -> None:
+    wrong = WrongCamera(
+        camera=4,
+        rotation_deg=2.96,
+        translation_m=0.012,
+        prior_sigmas=1.4,
+        others_rotation_deg=0.02,
+        others_translation_m=0.003,
+    )
+    said = finding("back_right", wrong)
+    assert said.code == "camera-miscalibrated"
+    assert "camera back_right is turned by 2.96 deg and moved by 0.012 m" in said.what
+    assert "calibration.json" in said.remedy
+
+
+def test_votes_in_units_with_covered_images_blame_no_camera() -> None:
+    registrations = [
+        Registration(unit=u, world_from_rig=np.eye(4), correspondences=9, inliers=9, method="vote", voted_out=names)
+        for u, names in enumerate([("left",), ("left", "back"), ("back",), ()])
+    ]
+    assert voted_out(registrations, set()) == {"left": 2, "back": 2}
+    assert voted_out(registrations, {1, 2}) == {"left": 1}
+
+
+def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
+    model = make_model(make_simulated_drive(units=4, cameras=2, points=200))
+    prior = replace(calibration_prior(model), sigma_rotation_rad=np.radians([0.2, 0.2]))
+    off = se3.exp_so3([0.0, 0.0, np.radians(1.5)])
+    state = replace(
+        model.state,
+        camera_rotation=np.stack([off @ prior.rotation[0], off.T @ prior.rotation[1]]),
+        camera_position_m=prior.position_m,
+    )
+    sees_rotations = np.tile([True, True, True, False, False, False], (2, 1))
+    directions = Observability(
+        observed=sees_rotations,
+        ratio=np.where(sees_rotations, 0.01, np.nan),
+        scale_observed=False,
+        scale_only_prior=False,
+        sigma_scale=0.01,
+        prior_sigma_scale=0.01,
+    )
+    assert find_wrong_cameras(prior, state, directions) == []
+    pair = find_wrong_pair(prior, state, directions)
+    assert pair is not None
+    assert pair.rotation_deg == pytest.approx(3.0)
+    said = pair_finding(["left", "right"], pair)
+    assert "cameras left and right are turned by 3.00 deg" in said.what
+    at_rest = replace(state, camera_rotation=prior.rotation)
+    assert find_wrong_pair(prior, at_rest, directions) is None

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.calibration_check import require_calibration_direction
+from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
+from mrasfm_engine.scene.scene import ImageFeatures
+from tests.helpers.simulated_drive import SimulatedDrive, inverted, make_drive, make_simulated_drive, random_descriptors
+
+UNITS = 4
+# KITTI's arrangement: two forward cameras that are parallel to the last bit, 0.5 m apart.
+RECTIFIED = se3.transform(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), [[1.7, 0.25, 1.5], [1.7, -0.25, 1.5]])
+
+
+def check(simulated: SimulatedDrive) -> None:
+    config = MatchConfig()
+    require_calibration_direction(
+        simulated.drive,
+        range(len(simulated.drive.images)),
+        simulated.features,
+        NearestNeighbourMatcher(config),
+        config,
+    )
+
+
+@pytest.mark.parametrize("straight", [True, False])
+@pytest.mark.parametrize("cameras", [2, 4, 6])
+def test_the_right_calibration_passes(cameras: int, straight: bool) -> None:
+    check(make_simulated_drive(units=UNITS, cameras=cameras, points=2500, straight=straight))
+
+
+@pytest.mark.parametrize("cameras", [2, 4, 6])
+def test_an_inverted_calibration_is_refused(cameras: int) -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=cameras, points=2500, given=inverted)
+    with pytest.raises(InputError, match="inverse") as caught:
+        check(simulated)
+    assert caught.value.code == "calibration-inverted"
+    assert "translation" in caught.value.remedy
+
+
+def rectified_stereo(rig_from_cam_given: np.ndarray) -> SimulatedDrive:
+    """Features of the rectified pair under any calibration in the manifest."""
+    rng = np.random.default_rng(0)
+    params = np.array([[700.0, 700.0, 480.0, 270.0]] * 2)
+    drive = make_drive(rig_from_cam_given, params, units=UNITS)
+    points = np.stack([rng.uniform(8, 45, 900), rng.uniform(-12, 12, 900), rng.uniform(-1, 8, 900)], 1)
+    descriptors, features = random_descriptors(900, rng), []
+    for image in drive.images:
+        vehicle = se3.transform(np.eye(3), [1.1 * image.unit, 0.0, 0.0])
+        in_camera = se3.apply(se3.inverse(vehicle @ RECTIFIED[image.camera]), points)
+        xy = 700.0 * in_camera[:, :2] / in_camera[:, 2:] + [480.0, 270.0] + rng.normal(size=(900, 2)) * 0.3
+        seen = (in_camera[:, 2] > 1) & (xy > 0).all(1) & (xy < [960, 540]).all(1)
+        features.append(
+            ImageFeatures(
+                xy_px=xy[seen].astype(np.float32),
+                descriptors=descriptors[seen],
+                colors=np.zeros((int(seen.sum()), 3), np.uint8),
+            )
+        )
+    truth = make_simulated_drive(units=1, cameras=1, points=50).truth  # not looked at
+    return SimulatedDrive(truth=truth, drive=drive, features=features, point_of_keypoint=[])
+
+
+def test_a_rectified_stereo_pair_passes_and_its_inverse_does_not() -> None:
+    check(rectified_stereo(RECTIFIED))
+    with pytest.raises(InputError, match="inverse"):
+        check(rectified_stereo(se3.inverse(RECTIFIED)))
+
+
+def test_an_inverted_rectified_stereo_pair_in_kittis_axes_is_refused() -> None:
+    flu_from_rdf = se3.transform(RECTIFIED[0, :3, :3], np.zeros(3))
+    given = flu_from_rdf @ se3.inverse(se3.inverse(flu_from_rdf) @ RECTIFIED)
+    with pytest.raises(InputError, match="inverse"):
+        check(rectified_stereo(given))
+
+
+def test_pitfall_5_one_camera_off_by_3_degrees_is_not_called_inverted() -> None:
+    def given(rig_from_cam: np.ndarray) -> np.ndarray:
+        rig_from_cam[1, :3, :3] = se3.exp_so3(np.radians([0, 0, 3.0])) @ rig_from_cam[1, :3, :3]
+        return rig_from_cam
+
+    check(make_simulated_drive(units=UNITS, cameras=6, points=2500, given=given))
+
+
+def test_pitfall_6_a_standing_car_is_no_reason_to_refuse() -> None:
+    check(make_simulated_drive(units=UNITS, cameras=6, points=2500, spacing_m=1e-4))
+
+
+def test_images_without_features_give_no_verdict() -> None:
+    check(make_simulated_drive(units=UNITS, cameras=2, points=400, hidden=lambda unit, camera: True, given=inverted))
+
+
+def test_a_single_camera_gives_no_verdict() -> None:
+    check(make_simulated_drive(units=UNITS, cameras=1, points=800, given=inverted))

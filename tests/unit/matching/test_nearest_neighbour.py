@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, _mutual_ratio
+from mrasfm_engine.scene.scene import ImageFeatures
+from tests.helpers.simulated_drive import random_descriptors
+
+
+def features(descriptors: np.ndarray) -> ImageFeatures:
+    n = len(descriptors)
+    return ImageFeatures(xy_px=np.zeros((n, 2), np.float32), descriptors=descriptors, colors=np.zeros((n, 3), np.uint8))
+
+
+def brute_force(similarity: np.ndarray, ratio: float) -> list[tuple[int, int]]:
+    distance2 = 2 - 2 * similarity.astype(np.float64)
+    result = []
+    for i in range(len(distance2)):
+        nearest = np.argsort(distance2[i], kind="stable")
+        j = int(nearest[0])
+        if int(np.argmin(distance2[:, j])) == i and distance2[i, j] < ratio**2 * distance2[i, nearest[1]]:
+            result.append((i, j))
+    return result
+
+
+@pytest.mark.parametrize("ratio", [0.6, 0.8, 0.95])
+@pytest.mark.parametrize("seed", range(3))
+def test_mutual_ratio_agrees_with_brute_force(seed: int, ratio: float) -> None:
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(60, 16))
+    b = np.concatenate([a[rng.permutation(60)[:40]] + rng.normal(size=(40, 16)) * 0.5, rng.normal(size=(15, 16))])
+    a, b = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b))
+    similarity = (a @ b.T).astype(np.float32)
+    found = [tuple(pair) for pair in _mutual_ratio(similarity, ratio**2).tolist()]
+    assert found == brute_force(similarity, ratio)
+    assert 5 < len(found) < 55
+
+
+def test_planted_matches_are_found_and_nothing_else() -> None:
+    rng = np.random.default_rng(1)
+    a, order = random_descriptors(200, rng), rng.permutation(200)[:120]
+    b = np.concatenate([a[order], random_descriptors(80, rng)])
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    matches = matcher.match(matcher.prepare(features(a)), matcher.prepare(features(b)))
+    assert matches.dtype == np.int32
+    assert sorted(map(tuple, matches.tolist())) == sorted(zip(order.tolist(), range(120), strict=True))
+
+
+def test_pitfall_7_what_repeats_does_not_match() -> None:
+    rng = np.random.default_rng(2)
+    d = random_descriptors(30, rng)
+    alike = [np.clip(d.astype(int) + rng.integers(-6, 7, d.shape), 0, 255).astype(np.uint8) for _ in range(2)]
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    twice, once = (matcher.prepare(features(np.concatenate(f))) for f in (alike, alike[:1]))
+    prepared = matcher.prepare(features(d))
+    assert len(matcher.match(prepared, twice)) < 3
+    assert len(matcher.match(prepared, once)) == 30
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 50), (50, 0), (1, 50), (50, 1), (2, 2)])
+def test_hardly_any_keypoints(n: int, m: int) -> None:
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    a, b = (matcher.prepare(features(random_descriptors(k, np.random.default_rng(k)))) for k in (n, m))
+    matches = matcher.match(a, b)
+    assert matches.shape[1] == 2
+    assert len(matches) <= min(n, m)
+
+
+def test_an_empty_descriptor_is_no_nan() -> None:
+    d = random_descriptors(5, np.random.default_rng(3))
+    d[2] = 0
+    prepared = NearestNeighbourMatcher(MatchConfig()).prepare(features(d))
+    assert np.isfinite(prepared).all()
+    np.testing.assert_allclose(np.linalg.norm(prepared, axis=1), [1, 1, 0, 1, 1], atol=1e-6)
+
+
+def test_float_descriptors_of_any_length_match_too() -> None:
+    rng = np.random.default_rng(4)
+    a, order = rng.normal(size=(80, 64)).astype(np.float32), rng.permutation(80)[:50]
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    matches = matcher.match(matcher.prepare(features(a)), matcher.prepare(features(3 * a[order])))
+    assert sorted(map(tuple, matches.tolist())) == sorted(zip(order.tolist(), range(50), strict=True))

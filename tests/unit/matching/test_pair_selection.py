@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import PairConfig
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.pair_selection import pairs_from_poses, pairs_from_window, pairs_without_selection
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.synthetic.rigs import true_cameras
+from tests.helpers.simulated_drive import make_drive
+
+
+def drive_of(cameras: int, units: int, **kwargs: object) -> Drive:
+    rig = true_cameras(cameras, width=960, height=540, rng=np.random.default_rng(0))
+    return make_drive(
+        np.stack([c.rig_from_cam for c in rig]),
+        np.array([c.params for c in rig]),
+        units=units,
+        names=[c.name for c in rig],
+        **kwargs,  # type: ignore[arg-type]
+    )
+
+
+def straight_road(units: int, step_m: float = 1.1) -> np.ndarray:
+    return se3.transform(np.eye(3), np.arange(units)[:, None] * np.array([step_m, 0.0, 0.0]))
+
+
+def round_the_block(units: int, radius_m: float = 40.0, rounds: float = 1.1) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi * rounds, units)
+    position = radius_m * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], 1)
+    return se3.transform(se3.exp_so3(angle[:, None] * [0.0, 0.0, 1.0]), position)
+
+
+def units_and_cameras(drive: Drive, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    unit = np.array([i.unit for i in drive.images])
+    camera = np.array([i.camera for i in drive.images])
+    return unit[pairs], camera[pairs]
+
+
+def check_form(drive: Drive, pairs: np.ndarray) -> None:
+    assert pairs.dtype == np.int64
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    assert pairs.max() < len(drive.images)
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+
+
+@pytest.mark.parametrize("prior", [True, False])
+def test_pairs_grow_linearly_with_the_drive(prior: bool) -> None:
+    counts = []
+    for units in (40, 80, 160):
+        drive = drive_of(6, units)
+        pairs = (
+            pairs_from_poses(drive, straight_road(units), PairConfig())
+            if prior
+            else pairs_from_window(drive, PairConfig())
+        )
+        check_form(drive, pairs)
+        counts.append(len(pairs))
+    grown = np.diff(counts) / [40, 80]
+    assert grown[1] == pytest.approx(grown[0], rel=0.05)
+    assert 6 * 2 < grown[1] < 6 * 17  # pairs a unit
+    assert counts[-1] < 0.05 * (6 * 160) ** 2 / 2
+
+
+@pytest.mark.parametrize("prior", [True, False])
+def test_pairs_hold_neighbours_in_time_and_across_cameras(prior: bool) -> None:
+    drive = drive_of(6, 12)
+    pairs = (
+        pairs_from_poses(drive, straight_road(12), PairConfig()) if prior else pairs_from_window(drive, PairConfig())
+    )
+    unit, camera = units_and_cameras(drive, pairs)
+    gap, same_camera = unit[:, 1] - unit[:, 0], camera[:, 0] == camera[:, 1]
+    for wanted in (1, 2):
+        for c in range(6):
+            assert ((gap == wanted) & same_camera & (camera[:, 0] == c)).sum() == 12 - wanted
+    assert ((gap == 0) & ~same_camera).any()
+    assert ((gap > 0) & ~same_camera).any()
+    # Front and front left see the same; front and back never do.
+    names = [c.name for c in drive.cameras]
+    front, left, back = names.index("front"), names.index("front_left"), names.index("back")
+    assert ((np.sort(camera, axis=1) == sorted([front, left])).all(1)).any()
+    assert not ((np.sort(camera, axis=1) == sorted([front, back])).all(1)).any()
+
+
+def test_a_stereo_pair_is_matched_within_every_unit() -> None:
+    drive = drive_of(2, 15)
+    for pairs in (pairs_from_window(drive, PairConfig()), pairs_from_poses(drive, straight_road(15), PairConfig())):
+        unit, camera = units_and_cameras(drive, pairs)
+        inside = (unit[:, 0] == unit[:, 1]) & (camera[:, 0] != camera[:, 1])
+        assert sorted(unit[inside, 0]) == list(range(15))
+
+
+def test_the_window_is_kept() -> None:
+    drive = drive_of(3, 30)
+    config = PairConfig(window_units=5, cross_window_units=1)
+    unit, camera = units_and_cameras(drive, pairs_from_window(drive, config))
+    gap, same = unit[:, 1] - unit[:, 0], camera[:, 0] == camera[:, 1]
+    assert gap[same].max() == 5
+    assert gap[same].min() == 1
+    assert gap[~same].max() == 1
+    assert same.sum() == 3 * sum(30 - g for g in range(1, 6))
+
+
+def test_pitfall_10_a_route_that_returns_has_loop_pairs() -> None:
+    units = 220
+    drive = drive_of(6, units)
+    poses = round_the_block(units)
+    pairs = pairs_from_poses(drive, poses, PairConfig())
+    check_form(drive, pairs)
+    unit, _ = units_and_cameras(drive, pairs)
+    loop = unit[:, 1] - unit[:, 0] > 150
+    assert 60 < loop.sum() < 0.5 * len(pairs)
+    distance = np.linalg.norm(poses[unit[loop, 0], :3, 3] - poses[unit[loop, 1], :3, 3], axis=1)
+    assert distance.max() < 60.0
+    # Every unit of the second round is tied to the first.
+    second_round = set(range(int(units / 1.1) + 3, units))
+    assert second_round <= set(unit[loop, 1].tolist())
+    assert len(pairs) < units * 6 * 17
+
+
+def test_pitfall_6_a_standing_car_has_neighbours_and_no_more() -> None:
+    drive = drive_of(2, 60)
+    pairs = pairs_from_poses(drive, straight_road(60, step_m=0.0), PairConfig())
+    unit, _ = units_and_cameras(drive, pairs)
+    assert (unit[:, 1] - unit[:, 0]).max() <= PairConfig().window_units
+
+
+def test_pitfall_8_opposite_directions_are_paired_only_where_cameras_look_the_same_way() -> None:
+    units = 60
+    there, back = straight_road(units), straight_road(units)[::-1] @ se3.transform(se3.exp_so3([0, 0, np.pi]), [0] * 3)
+    poses = np.concatenate([there, back + se3.transform(np.zeros((3, 3)), [0, 4.0, 0]) - np.diag([0, 0, 0, 1.0])])
+    drive = drive_of(6, 2 * units)
+    unit, camera = units_and_cameras(drive, pairs_from_poses(drive, poses, PairConfig()))
+    across = (unit[:, 0] < units - 10) & (unit[:, 1] >= units + 10)
+    assert across.sum() > 20
+    names = np.array([c.name for c in drive.cameras])[camera[across]]
+    assert not ((names == "front").all(1)).any()
+
+
+@pytest.mark.parametrize("prior", [True, False])
+def test_pitfall_5_missing_images_are_no_trouble(prior: bool) -> None:
+    drive = drive_of(6, 20, present=lambda unit, camera: (unit + camera) % 3 != 0)
+    assert len(drive.images) == 80
+    pairs = (
+        pairs_from_poses(drive, straight_road(20), PairConfig()) if prior else pairs_from_window(drive, PairConfig())
+    )
+    check_form(drive, pairs)
+    unit, _ = units_and_cameras(drive, pairs)
+    assert set(unit.ravel().tolist()) == set(range(20))
+
+
+@pytest.mark.parametrize("units", [1, 2])
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_tiny_drives(units: int, cameras: int) -> None:
+    drive = drive_of(cameras, units)
+    expected = units * cameras * (units * cameras - 1) // 2
+    assert 0 <= len(pairs_from_window(drive, PairConfig())) <= expected
+    assert 0 <= len(pairs_from_poses(drive, straight_road(units), PairConfig())) <= expected
+    if units == 2:
+        assert len(pairs_from_poses(drive, straight_road(units), PairConfig())) >= cameras
+
+
+def test_the_quota_per_image_is_kept() -> None:
+    drive = drive_of(6, 60)
+    config = PairConfig(pairs_per_image=4, window_units=8)
+    few = pairs_from_poses(drive, straight_road(60), config)
+    many = pairs_from_poses(drive, straight_road(60), PairConfig(pairs_per_image=16, window_units=8))
+    # Chosen by either end: at most twice the quota on average, and two neighbours.
+    assert len(few) <= len(drive.images) * (4 + 2)
+    assert len(few) < 0.6 * len(many)
+
+
+def test_without_selection_all_images_of_near_units_are_paired() -> None:
+    drive = drive_of(3, 6, present=lambda unit, camera: (unit, camera) != (2, 1))
+    pairs = pairs_without_selection(drive, PairConfig(window_units=2))
+    check_form(drive, pairs)
+    unit = [image.unit for image in drive.images]
+    expected = {(i, j) for i in range(17) for j in range(i + 1, 17) if unit[j] - unit[i] <= 2}
+    assert {(int(a), int(b)) for a, b in pairs} == expected
+    # Also cameras that look in opposite directions, which the selection leaves out.
+    assert set(map(tuple, pairs_from_window(drive, PairConfig(window_units=2)).tolist())) < expected

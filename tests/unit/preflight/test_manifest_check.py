@@ -1,0 +1,252 @@
+"""The check of a manifest alone, in the library and as a command."""
+
+from __future__ import annotations
+
+import copy
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mrasfm_engine.cli import main
+from mrasfm_engine.commands import preflight
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.findings import Finding
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.preflight.drive_check import UnsoundDriveError, check_manifest, is_sound
+from mrasfm_engine.preflight.drive_reader import check_drive, read_drive, require_sound
+from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from schemas import Pose
+from schemas.parsing import parse_manifest
+
+Document = dict[str, Any]
+WriteDrive = Callable[[Document], Path]
+
+
+def parsed(document: Document, **options: Any) -> list[Finding]:
+    return check_manifest(parse_manifest(json.dumps(document).encode()), **options)
+
+
+def codes(findings: list[Finding]) -> list[str]:
+    return [finding.code for finding in findings]
+
+
+def one_frame(d: Document) -> None:
+    d["frames"] = d["frames"][:1]
+
+
+def milliseconds(d: Document) -> None:
+    for frame in d["frames"]:
+        frame["timestamp_us"] //= 1000
+    del d["gnss"]
+
+
+def inverted(d: Document) -> None:
+    for camera in d["rig"]["cameras"]:
+        pose = pose_from_matrix(se3.inverse(matrix_from_pose(Pose(**camera["rig_from_cam"]))))
+        camera["rig_from_cam"] = pose.model_dump()
+
+
+def one_camera(d: Document) -> None:
+    for frame in d["frames"]:
+        del frame["images"]["right"]
+    del d["gnss"]
+
+
+def rough_poses_elsewhere(d: Document) -> None:
+    pose = {"rotation_xyzw": [0.0, 0.0, 0.0, 1.0], "translation_m": [0.0, 0.0, 0.0]}
+    d["rough_poses"] = {"poses": [{"timestamp_us": 9_000_000, "world_from_rig": pose}]}
+
+
+def gnss_goes_back(d: Document) -> None:
+    d["gnss"]["samples"].reverse()
+
+
+@pytest.mark.parametrize(
+    ("damage", "code"),
+    [
+        (one_frame, "too-few-frames"),
+        (milliseconds, "frame-rate"),
+        (inverted, "rig-axes"),
+        (one_camera, "no-metric-scale"),
+        (rough_poses_elsewhere, "rough-poses-not-covering"),
+        (gnss_goes_back, "gnss-order"),
+    ],
+)
+def test_needs_no_file(drive_document: Document, damage: Callable[[Document], None], code: str) -> None:
+    assert parsed(drive_document) == []
+    damage(drive_document)
+    findings = parsed(drive_document)
+    assert code in codes(findings)
+    assert not is_sound(findings)
+
+
+def test_gnss_that_is_not_used_is_not_checked(drive_document: Document) -> None:
+    gnss_goes_back(drive_document)
+    assert parsed(drive_document, use_gnss=False) == []
+
+
+def test_body_axes_are_converted(drive_document: Document, write_drive: WriteDrive) -> None:
+    """Upright cameras of a rig whose axes are the camera's: x right, y down, z forward."""
+    drive_document["rig"]["body_axes"] = "rdf"
+    for camera in drive_document["rig"]["cameras"]:
+        camera["rig_from_cam"]["rotation_xyzw"] = [0.0, 0.0, 0.0, 1.0]
+    assert parsed(drive_document) == []
+    assert check_drive(read_drive(write_drive(drive_document))) == []
+    drive_document["rig"]["body_axes"] = "flu"
+    assert "rig-axes" in codes(parsed(drive_document))
+
+
+def test_check_of_the_drive_is_that_and_the_files(drive_document: Document, write_drive: WriteDrive) -> None:
+    drive_document["frames"][1]["images"]["left"]["timestamp_us"] = drive_document["frames"][1]["timestamp_us"] + 70_000
+    gnss_goes_back(drive_document)
+    root = write_drive(drive_document)
+    (root / "images/left/000002.png").unlink()
+    assert codes(parsed(drive_document)) == ["gnss-order", "unsynchronised"]
+    findings = check_drive(read_drive(root))
+    assert codes(findings) == ["gnss-order", "missing-file", "unsynchronised"]
+    with pytest.raises(UnsoundDriveError) as caught:
+        require_sound(findings)
+    assert isinstance(caught.value, InputError)
+    assert caught.value.findings == tuple(findings)
+    assert (caught.value.code, caught.value.what) == ("gnss-order", findings[0].what + " (1 more errors)")
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The command as a process that loads nothing else."""
+    return subprocess.run(
+        [sys.executable, "-m", "mrasfm_engine.commands.preflight", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Document]:
+    code = preflight.main([*map(str, arguments), "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_command_on_a_manifest(drive_document: Document, tmp_path: Path) -> None:
+    sound, unsound = tmp_path / "upload-1", tmp_path / "upload-2"
+    sound.write_text(json.dumps(drive_document), encoding="utf-8")
+    result = command("--manifest-only", "--json", sound)
+    assert (result.returncode, json.loads(result.stdout), result.stderr) == (0, {"findings": [], "sound": True}, "")
+    gnss_goes_back(drive_document)
+    unsound.write_text(json.dumps(drive_document), encoding="utf-8")
+    result = command("--manifest-only", unsound)
+    assert (result.returncode, result.stderr) == (2, "")
+    assert "error: gnss.samples.1.timestamp_us goes back" in result.stdout
+    assert "cannot be reconstructed" in result.stdout
+
+
+def test_command_loads_only_what_it_needs() -> None:
+    script = "import sys, mrasfm_engine.commands.preflight; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert "mrasfm_engine.preflight.drive_check" in loaded
+    assert {"numba", "pycolmap", "scipy", "rich", "mrasfm_engine.pipeline", "sqlalchemy"} & set(loaded) == set()
+
+
+def test_command_on_a_folder(
+    drive_document: Document, write_drive: WriteDrive, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_drive(drive_document)
+    assert run(capsys, root) == (0, {"findings": [], "sound": True})
+    (root / "images/left/000002.png").unlink()
+    code, printed = run(capsys, root)
+    assert (code, printed["sound"]) == (2, False)
+    assert [finding["code"] for finding in printed["findings"]] == ["missing-file"]
+    assert set(printed["findings"][0]) == {"severity", "code", "what", "remedy"}
+    assert run(capsys, root, "--manifest-only")[0] == 0
+
+
+def test_command_without_gnss(drive_document: Document, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gnss_goes_back(drive_document)
+    path = tmp_path / "drive.json"
+    path.write_text(json.dumps(drive_document), encoding="utf-8")
+    assert run(capsys, path, "--manifest-only")[0] == 2
+    assert run(capsys, path, "--manifest-only", "--no-gnss") == (0, {"findings": [], "sound": True})
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"{", "is not valid JSON"),
+        (b"\xff", "is not UTF-8"),
+        (b'{"name": NaN}', "NaN"),
+        (b"[" * 100_000, "nested too deeply"),
+        (b"{}", "rig: is missing"),
+    ],
+)
+def test_command_on_a_broken_manifest(
+    tmp_path: Path, content: bytes, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "upload-7f3a"
+    path.write_bytes(content)
+    code, printed = run(capsys, path, "--manifest-only")
+    (finding,) = printed["findings"]
+    assert (code, printed["sound"], finding["severity"]) == (2, False, "error")
+    assert words in finding["what"]
+    assert "drive.json" in finding["what"]
+    assert "upload-7f3a" not in finding["what"]
+    assert finding["remedy"]
+
+
+def only_equals_one(d: Document) -> None:
+    d["version"] = True
+
+
+def differ_in_case(d: Document) -> None:
+    left, right = (d["frames"][0]["images"][name] for name in ("left", "right"))
+    left["file"], right["file"] = "images/A.png", "images/a.png"
+
+
+@pytest.mark.parametrize(("change", "words"), [(only_equals_one, "version"), (differ_in_case, "is one file with")])
+def test_command_on_what_only_new_drives_may_not_have(
+    drive_document: Document,
+    write_drive: WriteDrive,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[Document], None],
+    words: str,
+) -> None:
+    change(drive_document)
+    root = write_drive(drive_document)
+    for options in ([], ["--manifest-only"]):
+        code, printed = run(capsys, root, *options)
+        (finding,) = printed["findings"]
+        assert (code, finding["code"], finding["severity"]) == (2, "bad-document", "error")
+        assert words in finding["what"]
+        assert "Correct" in finding["remedy"]
+        assert run(capsys, root, "--accepted", *options) == (0, {"findings": [], "sound": True})
+    assert main(["reconstruct", str(root), "--out", str(root.parent / "scene")]) == 2
+    assert words in capsys.readouterr().err
+    assert check_drive(read_drive(root)) == []
+
+
+def test_command_on_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for options in ([], ["--manifest-only"]):
+        code, printed = run(capsys, tmp_path / "nowhere", *options)
+        assert code == 2
+        assert "does not exist" in printed["findings"][0]["what"]
+    code, printed = run(capsys, tmp_path)
+    assert (code, printed["findings"][0]["code"]) == (2, "no-manifest")
+
+
+def test_monstrous_manifest_is_refused_in_bounded_memory(drive_document: Document, tmp_path: Path) -> None:
+    """Twelve megabytes that unpack to many hundred."""
+    monstrous = copy.deepcopy(drive_document)
+    monstrous["frames"] = []
+    text = json.dumps(monstrous).replace('"frames": []', '"frames": [' + ",".join(["{}"] * 3_900_000) + "]")
+    path = tmp_path / "drive.json"
+    path.write_text(text, encoding="utf-8")
+    result = command("--manifest-only", "--json", "--max-memory-mb", 200, path)
+    assert result.returncode == 2
+    (finding,) = json.loads(result.stdout)["findings"]
+    assert (finding["code"], finding["severity"]) == ("bad-size", "error")
+    assert "memory" in finding["what"]

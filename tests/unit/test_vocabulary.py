@@ -1,0 +1,115 @@
+"""The product speaks the vocabulary of docs/development/naming.md, has no import cycle and no copied function."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PACKAGES = ("schemas", "service", "worker", "mrasfm_engine")
+MAX_EQUAL_LINES = 15
+# Migrations repeat tables as they once were; the renderer paints many things in the same way.
+MAY_REPEAT = ("service/database/migrations", "mrasfm_engine/synthetic")
+
+# Words that the code once had for things of which the field has a name.
+_OLD_NAMES = """
+    registration Model grow register_all Eyes rig_from_eye Shots Seen points_seen solved kept barred moving_along
+    still_images wrong_camera camera_vote single_images image_adjustment point_settling point_choice coupling reduced
+    unit_sets calibration_verdict fine final joint consensus peers growth run_apart Ran of heart patience silence
+    escalation settling wakeups assignments messages Verdict Look Tick Counting _asking _holding _ending _tree _rows
+    slots storing adopt take_back collecting trees owned keeping answers bodies heads Once pulse process_guard
+    parent_death unusable_database follow Told plugins search matching settle adjustment correspondence persistence
+"""
+OLD_NAMES = frozenset(_OLD_NAMES.split())
+OLD_BEGINNINGS = ("judge_", "settle_", "settled_")
+# Names of the list that the vocabulary gives to a room, by the room's section of the settings.
+ROOMS = {("mrasfm_engine/config.py", "matching")}
+
+
+@cache
+def _trees() -> dict[str, ast.Module]:
+    paths = [path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")]
+    return {str(path.relative_to(REPOSITORY)): ast.parse(path.read_text(encoding="utf-8")) for path in sorted(paths)}
+
+
+def _names(path: str, tree: ast.Module) -> Iterator[tuple[str, int]]:
+    yield from ((part.removesuffix(".py"), 0) for part in Path(path).parts[1:])
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node.name, node.lineno
+        elif isinstance(node, ast.ClassDef):
+            yield node.name, node.lineno
+            for field in node.body:  # settings, and fields of documents and data classes
+                if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                    yield field.target.id, field.lineno
+        elif isinstance(node, ast.arg):
+            yield node.arg, node.lineno
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_old_name_is_left(package: str) -> None:
+    found = [
+        f"{path}:{line} {name}"
+        for path, tree in _trees().items()
+        if path.startswith(f"{package}/")
+        for name, line in _names(path, tree)
+        if (name in OLD_NAMES or name.startswith(OLD_BEGINNINGS))
+        and (path, name) not in ROOMS
+        and not (line == 0 and name == "matching")
+    ]
+    assert found == []
+
+
+def _module_of(path: str) -> str:
+    return path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def _imports(tree: ast.Module, modules: frozenset[str]) -> Iterator[str]:
+    for node in ast.walk(tree):  # those of functions and those for type checkers too
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules)
+        elif isinstance(node, ast.ImportFrom) and node.module in modules:
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                yield full if full in modules else node.module
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    trees = {_module_of(path): tree for path, tree in _trees().items()}
+    modules = frozenset(trees)
+    left = {module: set(_imports(tree, modules)) - {module} for module, tree in trees.items()}
+    while free := {module for module, imported in left.items() if not imported & left.keys()}:
+        left = {module: imported for module, imported in left.items() if module not in free}
+    # What is left imports modules that are left: those that nothing left imports lead to a cycle, and are not in one.
+    while outer := left.keys() - {name for imported in left.values() for name in imported}:
+        left = {module: imported for module, imported in left.items() if module not in outer}
+    assert sorted(left) == []
+
+
+def _functions(path: str, tree: ast.Module) -> Iterator[tuple[str, list[str]]]:
+    lines = (REPOSITORY / path).read_text(encoding="utf-8").splitlines()
+    holders: list[ast.Module | ast.ClassDef] = [tree]
+    while holders:
+        for node in holders.pop().body:
+            if isinstance(node, ast.ClassDef):
+                holders.append(node)
+            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                first = node.body[1 if ast.get_docstring(node) and len(node.body) > 1 else 0]
+                body = [line.strip() for line in lines[first.lineno - 1 : node.end_lineno]]
+                yield f"{path}:{node.name}", [line for line in body if line and not line.startswith("#")]
+
+
+def test_no_two_functions_are_copies() -> None:
+    places: dict[tuple[str, ...], set[str]] = defaultdict(set)
+    for path, tree in _trees().items():
+        if path.startswith(MAY_REPEAT):
+            continue
+        for name, lines in _functions(path, tree):
+            for start in range(len(lines) - MAX_EQUAL_LINES):
+                places[tuple(lines[start : start + MAX_EQUAL_LINES + 1])].add(name)
+    assert {tuple(sorted(names)) for names in places.values() if len(names) > 1} == set()
