@@ -50,11 +50,11 @@ class Switch:
 
 
 SWITCHES = (
-    Switch("adjustment", "camera_set_adjustment", "no CSBA"),
+    Switch("bundle_adjustment", "camera_set_adjustment", "no CSBA"),
     Switch("mapping", "camera_set_registration", "no camera set PnP"),
     Switch("mapping", "semantic_triangulation", "no road surface"),
     Switch("pairs", "selection", "all pairs"),
-    Switch("adjustment", "priors", "no priors"),
+    Switch("bundle_adjustment", "priors", "no priors"),
 )
 
 
@@ -245,7 +245,7 @@ def warm_up(
     pairs = [p for p in matches if p.image_b < images]
     try:
         incremental_mapping.map_units(
-            few, Keypoints.of(few, features[:images]), pairs, poses, run.config, cancel=run.cancel
+            few, Keypoints.from_features(few, features[:images]), pairs, poses, run.config, cancel=run.cancel
         )
     except CancelledError:
         raise

@@ -147,7 +147,7 @@ class MappingConfig(_Section):
     )
 
 
-class AdjustmentConfig(_Section):
+class BundleAdjustmentConfig(_Section):
     """Camera set bundle adjustment."""
 
     camera_set_adjustment: bool = Field(
@@ -203,7 +203,7 @@ class AggregationConfig(_Section):
         3, description="image pairs between two scenes per image, once their transform is known"
     )
     max_pairs: Count = Field(1200, description="image pairs between two scenes")
-    consensus: bool = Field(
+    agreeing_units: bool = Field(
         True,
         description="several units must agree on a seam's transform; `false` takes the best unit's, for comparison",
     )
@@ -213,7 +213,7 @@ class AggregationConfig(_Section):
     max_scale_error: Positive = Field(
         0.05, description="largest difference of the scales of two scenes, beyond their uncertainty"
     )
-    joint: bool = Field(
+    multi_scene_adjustment: bool = Field(
         True,
         description="seams in loops are adjusted together; `false` adjusts one scene after the other, for comparison",
     )
@@ -254,7 +254,7 @@ class EngineConfig(_Section):
     pairs: PairConfig = PairConfig()
     matching: MatchConfig = MatchConfig()
     mapping: MappingConfig = MappingConfig()
-    adjustment: AdjustmentConfig = AdjustmentConfig()
+    bundle_adjustment: BundleAdjustmentConfig = BundleAdjustmentConfig()
     gnss: GnssConfig = GnssConfig()
     aggregation: AggregationConfig = AggregationConfig()
     output: OutputConfig = OutputConfig()

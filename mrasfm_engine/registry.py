@@ -73,7 +73,7 @@ class LoadedModel:
 
 
 @dataclass(frozen=True)
-class Plugins:
+class Components:
     """What finds and matches keypoints in this run. Building them is all that reads models."""
 
     extractor: Extractor
@@ -90,7 +90,7 @@ class Plugins:
         return {use: model.describe() for use, model in self.models.items()}
 
 
-def load_plugins(config: EngineConfig, label_map: LabelMap | None) -> Plugins:
+def load_components(config: EngineConfig, label_map: LabelMap | None) -> Components:
     """Build what the configuration asks for.
 
     Parameters
@@ -123,10 +123,10 @@ def load_plugins(config: EngineConfig, label_map: LabelMap | None) -> Plugins:
         loaded = load("semantics.model", config.semantics.model, "segmenter", None)
         models["segmenter"] = loaded
         segmenter = OnnxSegmenter(loaded.network, label_map)
-    return Plugins(extractor, matcher, segmenter, models)
+    return Components(extractor, matcher, segmenter, models)
 
 
-def require_compatible(features: FeatureConfig, matching: MatchConfig) -> None:
+def require_compatible(feature_config: FeatureConfig, match_config: MatchConfig) -> None:
     """Refuse a matcher that was trained on other descriptors.
 
     Raises
@@ -135,8 +135,8 @@ def require_compatible(features: FeatureConfig, matching: MatchConfig) -> None:
         That names both settings.
     """
     for section, what, choice in (
-        ("features", features.model, features.extractor),
-        ("matching", matching.model, matching.matcher),
+        ("features", feature_config.model, feature_config.extractor),
+        ("matching", match_config.model, match_config.matcher),
     ):
         if what is not None and choice in ("sift", "nearest"):
             name = "extractor" if section == "features" else "matcher"
@@ -145,12 +145,12 @@ def require_compatible(features: FeatureConfig, matching: MatchConfig) -> None:
                 remedy=f"Set {section}.{name}, or leave out {section}.model.",
                 code="bad-settings",
             )
-    if matching.matcher == "nearest" or default_model(matching.matcher, features.extractor) is not None:
+    if match_config.matcher == "nearest" or default_model(match_config.matcher, feature_config.extractor) is not None:
         return
-    partners = sorted({m.descriptors for m in CATALOGUE if m.method == matching.matcher and m.descriptors})
+    partners = sorted({m.descriptors for m in CATALOGUE if m.method == match_config.matcher and m.descriptors})
     raise InputError(
-        f'matching.matcher = "{matching.matcher}" was not trained on the descriptors of '
-        f'features.extractor = "{features.extractor}"',
+        f'matching.matcher = "{match_config.matcher}" was not trained on the descriptors of '
+        f'features.extractor = "{feature_config.extractor}"',
         remedy=f"Set features.extractor to {' or '.join(partners)}, or matching.matcher to nearest.",
         code="bad-settings",
     )

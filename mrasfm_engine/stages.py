@@ -23,7 +23,7 @@ from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
 from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.calibration_check import require_calibration_direction
@@ -33,9 +33,9 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_traje
 from mrasfm_engine.matching.retrieval import revisit_pairs
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
-from mrasfm_engine.registry import Plugins, load_plugins
+from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.drive import Drive, Incomplete
-from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
@@ -46,7 +46,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 STATE_ARRAYS = (
     "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
-    "shot_rotation", "shot_position_m",
+    "band_rotation", "band_position_m",
 )  # fmt: skip
 
 
@@ -63,15 +63,15 @@ class Run:
     key: str = ""  # fingerprint of what has been done so far; of the files of the drive where it is empty
 
     @cached_property
-    def plugins(self) -> Plugins:
+    def components(self) -> Components:
         """Extractor, matcher and segmenter; their models are loaded when first asked for, once."""
-        return load_plugins(self.config, self.drive.manifest.label_map)
+        return load_components(self.config, self.drive.manifest.label_map)
 
     @property
     def feature_settings(self) -> object:
         """What the features depend on: settings, and the models by their hashes."""
         config = self.config
-        models = self.plugins.fingerprint_of("extractor", "segmenter")
+        models = self.components.fingerprint_of("extractor", "segmenter")
         return [config.features.model_dump(), config.semantics.model_dump(), models]
 
     def step(self, stage: str) -> CountProgress:
@@ -113,7 +113,7 @@ class Run:
 
 def load_models(run: Run) -> None:
     """Read the models that the settings name; refuse what does not go together before any work."""
-    run.report["models"] = run.plugins.describe()
+    run.report["models"] = run.components.describe()
 
 
 def preflight(run: Run) -> None:
@@ -145,14 +145,14 @@ def probe(run: Run) -> None:
     first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
     features = extract_features(
         Drive(run.drive.root, first),
-        run.plugins.extractor,
+        run.components.extractor,
         threads=run.config.threads,
-        segmenter=run.plugins.segmenter,
+        segmenter=run.components.segmenter,
         cancel=run.cancel,
     )
     if all(f.left_out for f in features):
         return  # the extraction says whether there are others
-    require_calibration_direction(run.drive, images, features, run.plugins.matcher, run.config.matching)
+    require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)
 
 
 def features(run: Run) -> list[ImageFeatures]:
@@ -161,9 +161,9 @@ def features(run: Run) -> list[ImageFeatures]:
     def work() -> tuple[Arrays, dict[str, Any]]:
         found = extract_features(
             run.drive,
-            run.plugins.extractor,
+            run.components.extractor,
             threads=run.config.threads,
-            segmenter=run.plugins.segmenter,
+            segmenter=run.components.segmenter,
             class_margin_px=run.config.features.class_margin_px,
             progress=run.step("features"),
             cancel=run.cancel,
@@ -251,7 +251,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             run.drive,
             found,
             pairs,
-            run.plugins.matcher,
+            run.components.matcher,
             run.config.matching,
             threads=run.config.threads,
             progress=run.step("matches"),
@@ -267,7 +267,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
         }
 
     settings = [section.model_dump() for section in (run.config.pairs, run.config.matching, run.config.gnss)]
-    settings.append({"use_gnss": run.config.use_gnss, "models": run.plugins.fingerprint_of("matcher")})
+    settings.append({"use_gnss": run.config.use_gnss, "models": run.components.fingerprint_of("matcher")})
     arrays, report = run.stage("matches", settings, work)
     if not report["verified_pairs"]:
         raise ReconstructionError(
@@ -301,13 +301,13 @@ def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
     ]
 
 
-def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory) -> Model:
+def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory) -> Mapper:
     """Units registered one by one, points triangulated, everything adjusted."""
-    shots = Shots.of(run.drive, compensate=run.config.mapping.motion_compensation)
-    keypoints = Keypoints.of(run.drive, found, shots)
+    bands = RowBands.from_drive(run.drive, compensate=run.config.mapping.motion_compensation)
+    keypoints = Keypoints.from_features(run.drive, found, bands)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        model, log = incremental_mapping.map_units(
+        mapper, log = incremental_mapping.map_units(
             run.drive,
             keypoints,
             pairs,
@@ -316,69 +316,69 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             progress=run.step("mapping"),
             cancel=run.cancel,
         )
-        model.missing |= np.array([f.left_out is not None for f in found])
+        mapper.missing |= np.array([f.left_out is not None for f in found])
         arrays = {
-            "of_keypoint": model.tracks.of_keypoint,
-            "registered": model.registered,
-            "keyframe": model.keyframe,
-            "solved": model.solved,
-            "kept": model.kept,
-            "missing": model.missing,
-            "has_own_pose": model.motion.own_poses[0],
-            "unit_from_image": model.motion.own_poses[1],
-            **{name: getattr(model.state, name) for name in STATE_ARRAYS},
+            "of_keypoint": mapper.tracks.of_keypoint,
+            "registered": mapper.registered,
+            "keyframe": mapper.keyframe,
+            "solved": mapper.triangulated,
+            "kept": mapper.is_inlier,
+            "missing": mapper.missing,
+            "has_own_pose": mapper.motion.own_poses[0],
+            "unit_from_image": mapper.motion.own_poses[1],
+            **{name: getattr(mapper.state, name) for name in STATE_ARRAYS},
         }
-        return arrays, mapping_report.describe(model, log)
+        return arrays, mapping_report.describe(mapper, log)
 
-    settings = (run.config.mapping.model_dump(), run.config.adjustment.model_dump(), run.config.seed)
+    settings = (run.config.mapping.model_dump(), run.config.bundle_adjustment.model_dump(), run.config.seed)
     arrays, _ = run.stage("mapping", settings, work)
-    model = Model(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
-    model.registered, model.solved, model.kept = arrays["registered"], arrays["solved"], arrays["kept"]
-    model.keyframe = arrays["keyframe"]
-    model.state = replace(model.state, **{name: arrays[name] for name in STATE_ARRAYS})
-    model.missing = arrays["missing"]
+    mapper = Mapper(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
+    mapper.registered, mapper.triangulated, mapper.is_inlier = arrays["registered"], arrays["solved"], arrays["kept"]
+    mapper.keyframe = arrays["keyframe"]
+    mapper.state = replace(mapper.state, **{name: arrays[name] for name in STATE_ARRAYS})
+    mapper.missing = arrays["missing"]
     if known.world_from_rig is not None:
-        model.motion.follow_prior(known.world_from_rig)
+        mapper.motion.follow_prior(known.world_from_rig)
     for image in np.flatnonzero(arrays["has_own_pose"]):
-        model.set_image_pose(int(image), arrays["unit_from_image"][image])
-    return model
+        mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
+    return mapper
 
 
 def scene(
-    run: Run, model: Model, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
+    run: Run, mapper: Mapper, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
 ) -> Scene:
     """Georeferencing, the final adjustment with all priors, and how certain the result is."""
     started = time.perf_counter()
     run.begin("refinement")
     refinement = refine(
-        model,
+        mapper,
         gnss=known.gnss,
         antenna_in_rig_m=known.antenna_in_rig_m,
         rough_world_from_rig=known.rough_world_from_rig,
         progress=run.step("refinement"),
         cancel=run.cancel,
     )
-    between = register_between_keyframes(model, max_error_px=run.config.mapping.filter_error_px)
+    between = register_between_keyframes(mapper, max_error_px=run.config.mapping.filter_error_px)
     if refinement.placement is not None:
         run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
     run.report["findings"] += [
         as_json(miscalibration.finding(run.drive.cameras[wrong.camera].name, wrong))
-        for wrong in refinement.wrong_cameras
+        for wrong in refinement.miscalibrations
     ]
     if refinement.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
         run.report["findings"].append(as_json(miscalibration.pair_finding(names, refinement.wrong_pair)))
-    run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(model)]
+    run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(mapper)]
     run.report["stages"].append(
         {
             "stage": "refinement",
             "seconds": round(time.perf_counter() - started, 3),
             "reused": False,
-            **mapping_report.describe_refinement(model, refinement),
-            **mapping_report.describe_between(model, between),
+            **mapping_report.describe_refinement(mapper, refinement),
+            **mapping_report.describe_between(mapper, between),
         }
     )
-    result = build_scene(model, refinement, found, pairs, known, notes=run.drive.manifest.notes)
+    result = build_scene(mapper, refinement, found, pairs, known, notes=run.drive.manifest.notes)
     run.progress("refinement", 1, 1)
     return result
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from mrasfm_engine.aggregation.source import SourceScene
-from mrasfm_engine.bundle_adjustment.problem import Observations, ShotMotion
+from mrasfm_engine.bundle_adjustment.problem import Observations, RowBandMotion
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.scene.state import State
@@ -136,21 +136,21 @@ class Assembly:
         )
         if self.simultaneous:
             return state
-        shots = [
+        bands = [
             s.unit_from_image if len(s.unit_from_image) else np.tile(np.eye(4), (len(s.image_unit), 1, 1))
             for s in self.scenes
         ]
-        unit_from_shot = np.concatenate(shots)
+        unit_from_band = np.concatenate(bands)
         return replace(
             state,
-            shot_rotation=np.ascontiguousarray(unit_from_shot[:, :3, :3]),
-            shot_position_m=np.ascontiguousarray(unit_from_shot[:, :3, 3]),
+            band_rotation=np.ascontiguousarray(unit_from_band[:, :3, :3]),
+            band_position_m=np.ascontiguousarray(unit_from_band[:, :3, 3]),
         )
 
     @property
-    def motion(self) -> ShotMotion | None:
+    def motion(self) -> RowBandMotion | None:
         """Images at times of their own stay where they are relative to their units."""
-        return None if self.simultaneous else ShotMotion.held(self.image_unit)
+        return None if self.simultaneous else RowBandMotion.held(self.image_unit)
 
     def observations(self, rows: Ints, point: Ints, num_points: int) -> Observations:
         """Keypoints `rows` (n,) as observations of points `point` (n,), which ascend."""
@@ -161,5 +161,5 @@ class Assembly:
             point=point,
             xy_px=self.keypoint_xy_px[rows],
             num_points=num_points,
-            shot=None if self.simultaneous else image,
+            band=None if self.simultaneous else image,
         )

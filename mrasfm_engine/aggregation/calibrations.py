@@ -11,7 +11,7 @@ import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior
-from mrasfm_engine.config import AdjustmentConfig
+from mrasfm_engine.config import BundleAdjustmentConfig
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools
 
@@ -19,7 +19,7 @@ MAX_COUPLINGS = 500_000  # of cameras that vary with units and with one another:
 
 
 def calibration_priors(
-    assembly: Assembly, state: State, free_units: Bools, config: AdjustmentConfig
+    assembly: Assembly, state: State, free_units: Bools, config: BundleAdjustmentConfig
 ) -> list[CameraPosePrior]:
     """What scenes say of their cameras, one prior for each drive whose calibration may settle.
 

@@ -44,7 +44,7 @@ class MapModel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinalResult:
+class AdjustedMap:
     """The map's model and how its last adjustment went."""
 
     model: MapModel
@@ -72,7 +72,7 @@ def adjust_map(
     config: EngineConfig,
     *,
     cancel: Callable[[], bool],
-) -> FinalResult:
+) -> AdjustedMap:
     """Let units at the seams (or all, or none, as the settings say) settle; then filter what does not fit.
 
     Parameters
@@ -92,12 +92,12 @@ def adjust_map(
         state=state,
         camera_kind=assembly.camera_kind,
         observations=assembly.observations(tracks.rows, tracks.point, tracks.count),
-        layout=Layout.of(np.zeros(len(assembly.registered), dtype=np.bool_), cameras),
+        layout=Layout.from_free(np.zeros(len(assembly.registered), dtype=np.bool_), cameras),
         options=_options(config),
         motion=assembly.motion,
     )
     free = _free_units(assembly, problem, joined, config)
-    calibrations = calibration_priors(assembly, state, free, config.adjustment)
+    calibrations = calibration_priors(assembly, state, free, config.bundle_adjustment)
     for prior in calibrations:
         cameras[prior.camera] = True
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
@@ -107,7 +107,7 @@ def adjust_map(
     for _ in range(ROUNDS if free.any() else 0):
         part = replace(
             problem.of_points(seen),
-            layout=Layout.of(free, cameras),
+            layout=Layout.from_free(free, cameras),
             terms=[*_terms(assembly, positions, free), *calibrations],
         )
         solution, report = solve_with_chosen_points(
@@ -118,9 +118,9 @@ def adjust_map(
         points[seen] = solution.points_m
         problem = replace(problem, state=replace(solution, points_m=points))
         positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
-    problem = _others_settled(problem, seen, cameras)
+    problem = _others_refined(problem, seen, cameras)
     model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
-    return FinalResult(
+    return AdjustedMap(
         model=model,
         positions=positions,
         reports=tuple(reports),
@@ -131,7 +131,7 @@ def adjust_map(
     )
 
 
-def _others_settled(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:
+def _others_refined(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:
     """The problem with points where calibrations that vary have got, but for those (p,) that varied with units."""
     o, follow = problem.observations, np.zeros_like(varied)
     follow[o.point[free_cameras[o.camera]]] = True
@@ -140,7 +140,7 @@ def _others_settled(problem: Problem, varied: Bools, free_cameras: Bools) -> Pro
         return problem
     part = problem.of_points(follow)
     points = problem.state.points_m.copy()
-    points[follow] = part.with_points_settled(part.state).points_m
+    points[follow] = part.with_points_refined(part.state).points_m
     return replace(problem, state=replace(problem.state, points_m=points))
 
 
@@ -148,7 +148,7 @@ def _options(config: EngineConfig) -> SolverOptions:
     return SolverOptions(
         max_iterations=20,
         function_tolerance=1e-5,
-        loss_scale=config.adjustment.loss_scale,
+        loss_scale=config.bundle_adjustment.loss_scale,
         threads=config.threads,
     )
 

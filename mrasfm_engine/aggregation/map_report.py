@@ -13,14 +13,14 @@ from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain
-from mrasfm_engine.aggregation.map_adjustment import FinalResult
+from mrasfm_engine.aggregation.map_adjustment import AdjustedMap
 from mrasfm_engine.aggregation.map_scene import map_scene
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.export.calibration import settled_document
+from mrasfm_engine.export.calibration import document_in_map
 from mrasfm_engine.export.map import MapContent
 from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.export.scene import PICTURES
@@ -45,7 +45,7 @@ class MapResult:
     chained: Floats  # the same, one scene after the other
     joint_reports: Sequence[Report]
     assembly: Assembly
-    final: FinalResult
+    adjusted: AdjustedMap
 
     @property
     def unconnected(self) -> list[str]:
@@ -61,7 +61,7 @@ class MapResult:
     def units_of(self, k: int) -> Floats:
         """Poses (u, 4, 4) of a scene's units in the map; NaN where not registered."""
         first, stop = self.assembly.first_unit[k : k + 2]
-        poses = self.final.model.state.world_from_rig[first:stop].copy()
+        poses = self.adjusted.model.state.world_from_rig[first:stop].copy()
         poses[~self.assembly.registered[first:stop]] = np.nan
         return poses
 
@@ -90,7 +90,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
 def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
     """Everything that is written."""
     reference = result.scenes[result.association.reference]
-    scene = map_scene(result.assembly, result.final.model, reference)
+    scene = map_scene(result.assembly, result.adjusted.model, reference)
     by_name = {s.name: s for s in result.scenes}
     return MapContent(
         scene=scene,
@@ -111,9 +111,9 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
 
 def _calibration(result: MapResult, k: int) -> dict[str, Any]:
     scene, first = result.scenes[k], int(result.assembly.first_camera[k])
-    rig_from_cam = result.final.model.state.rig_from_cam[first:]
+    rig_from_cam = result.adjusted.model.state.rig_from_cam[first:]
     names = [camera.name for camera in scene.drive.cameras]
-    return settled_document(scene.calibration, dict(zip(names, rig_from_cam, strict=False)))
+    return document_in_map(scene.calibration, dict(zip(names, rig_from_cam, strict=False)))
 
 
 def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
 def _scene(result: MapResult, k: int) -> dict[str, Any]:
     scene = result.scenes[k]
     component = next(n for n, chain in enumerate(result.chains) if k in chain.scenes)
-    positions = result.final.positions.get(k)
+    positions = result.adjusted.positions.get(k)
     connected = scene.name not in result.unconnected
     moved = se3.apply(result.map_from_scene[k], scene.midpoint_m[None])[0]
     coarse = se3.apply(result.association.map_from_scene[k], scene.midpoint_m[None])[0]
@@ -240,5 +240,5 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
 
 def _points_of(result: MapResult, k: int) -> Floats:
     first, stop = result.assembly.first_point[k : k + 2]
-    owner = result.final.model.owner[first:stop]
-    return result.final.model.state.points_m[owner[owner >= 0]]
+    owner = result.adjusted.model.owner[first:stop]
+    return result.adjusted.model.state.points_m[owner[owner >= 0]]

@@ -49,7 +49,7 @@ def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Sc
         pairs=[],
         georeference=_georeference(assembly, reference) if reference.common_world is None else None,
         rough_world_from_local=reference.ecef_from_local if reference.common_world is not None else None,
-        unit_from_image=None if assembly.simultaneous else model.state.unit_from_shot,
+        unit_from_image=None if assembly.simultaneous else model.state.unit_from_band,
         rig_of_camera=np.repeat(np.arange(len(assembly.scenes)), np.diff(assembly.first_camera)),
     )
 

@@ -91,7 +91,7 @@ def adjust_jointly(
     """
     owner = joined_owner(assembly, seams)
     tracks = tracks_of(assembly, owner)
-    if not config.aggregation.joint or tracks.count < MIN_TRACKS or len(assembly.scenes) < 2:
+    if not config.aggregation.multi_scene_adjustment or tracks.count < MIN_TRACKS or len(assembly.scenes) < 2:
         return JointResult(first_from_scene=first_from_scene, owner=owner, report=None)
     sets = np.arange(len(assembly.scenes))
     sets = np.where(sets == fixed, -1, sets - (sets > fixed))

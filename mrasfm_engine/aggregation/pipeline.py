@@ -14,7 +14,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain, SeamGraph
 from mrasfm_engine.aggregation.load import name_scenes
-from mrasfm_engine.aggregation.map_adjustment import FinalResult, adjust_map
+from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, adjust_map
 from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
 from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner, placed
 from mrasfm_engine.aggregation.positions import drive_positions
@@ -86,7 +86,7 @@ def aggregate(
     known = stages.association(run, found)
     seams = stages.seams(run, found, known)
     graph, chains = _graph(found, known, seams)
-    result = _adjusted(run, found, known, seams, graph, chains)
+    result = _join_scenes(run, found, known, seams, graph, chains)
     say_findings(run, result)
     pictures = map_pictures(run, result) if config.output.pictures else {}
     if cancel():
@@ -118,7 +118,7 @@ def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Sea
     return graph, chains
 
 
-def _adjusted(
+def _join_scenes(
     run: stages.Run,
     found: Sequence[SourceScene],
     known: Association,
@@ -135,7 +135,7 @@ def _adjusted(
         if len(chain.scenes) < 2:
             continue
         members = sorted(chain.scenes)
-        balanced = graph.balanced(chain) if run.config.aggregation.joint else chain.first_from_scene
+        balanced = graph.balanced(chain) if run.config.aggregation.multi_scene_adjustment else chain.first_from_scene
         assembly = Assembly(scenes=[found[k] for k in members])
         joint = adjust_jointly(
             assembly,
@@ -151,7 +151,7 @@ def _adjusted(
         chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
     run.ended("joint", started, loops=sum(len(chain.closings) for chain in chains))
-    final = _final(run, found, known, graph, poses)
+    adjusted = _adjust_map(run, found, known, graph, poses)
     return MapResult(
         scenes=found,
         association=known,
@@ -162,7 +162,7 @@ def _adjusted(
         chained=chained,
         joint_reports=[r for r in reports if r is not None],
         assembly=Assembly(scenes=found),
-        final=final,
+        adjusted=adjusted,
     )
 
 
@@ -171,9 +171,9 @@ def _seams_among(graph: SeamGraph, found: Sequence[SourceScene], members: Sequen
     return [seam for seam in graph.seams if seam.accepted and {seam.a, seam.b} <= names]
 
 
-def _final(
+def _adjust_map(
     run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
-) -> FinalResult:
+) -> AdjustedMap:
     started = time.perf_counter()
     run.begin("adjustment")
     assembly = Assembly(scenes=found)
@@ -184,16 +184,16 @@ def _final(
         is not None
     }
     owner = joined_owner(assembly, _seams_among(graph, found, range(len(found))))
-    final = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
+    adjusted = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
     run.ended(
         "adjustment",
         started,
-        free_units=final.free_units,
-        free_cameras=final.free_cameras,
-        iterations=[r.iterations for r in final.reports],
-        points=len(final.model.state.points_m),
-        joined_points=int(final.model.joined.sum()),
-        observations_dropped=final.dropped_observations,
-        points_dropped=final.dropped_points,
+        free_units=adjusted.free_units,
+        free_cameras=adjusted.free_cameras,
+        iterations=[r.iterations for r in adjusted.reports],
+        points=len(adjusted.model.state.points_m),
+        joined_points=int(adjusted.model.joined.sum()),
+        observations_dropped=adjusted.dropped_observations,
+        points_dropped=adjusted.dropped_points,
     )
-    return final
+    return adjusted

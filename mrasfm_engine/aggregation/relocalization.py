@@ -41,7 +41,7 @@ class Sightings:
     xy_px: Floats  # (n, 2)
     points_m: Floats  # (n, 3) in a's frame
 
-    def of(self, rows: Ints | Bools) -> Sightings:
+    def select(self, rows: Ints | Bools) -> Sightings:
         """Some of them."""
         return Sightings(
             unit=self.unit[rows], image=self.image[rows], xy_px=self.xy_px[rows], points_m=self.points_m[rows]
@@ -49,7 +49,7 @@ class Sightings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Consensus:
+class Relocalization:
     """How b lies in a, and who says so; without a transform they do not agree, and the reason says why."""
 
     a_from_b: Floats | None
@@ -93,7 +93,7 @@ class Relocaliser:
 
     def hypothesis(self, unit: int, seen: Sightings) -> Floats | None:
         """How b lies in a (4, 4) by one unit alone."""
-        own = seen.of(seen.unit == unit)
+        own = seen.select(seen.unit == unit)
         if len(own.unit) < self._config.min_unit_inliers:
             return None
         found = self._unit_pose(unit, own)
@@ -154,11 +154,11 @@ class Relocaliser:
         good = (inliers >= self._config.min_unit_inliers) & (inliers >= MIN_SHARE * counts)
         return units[good], fits
 
-    def consensus(self, seen: Sightings) -> Consensus:
+    def relocalise(self, seen: Sightings) -> Relocalization:
         """How b lies in a by all units that see points of a."""
         units, counts = np.unique(seen.unit, return_counts=True)
         asked = units[counts >= self._config.min_unit_inliers]
-        if not self._config.consensus and len(asked):
+        if not self._config.agreeing_units and len(asked):
             return self._best_unit_alone(seen, int(units[counts.argmax()]), len(asked))
         proposals: list[tuple[Floats, Ints, int]] = []
         for unit in asked:
@@ -174,7 +174,7 @@ class Relocaliser:
         """A transform refined by all units that agree with it, these, and how many image points of theirs fit."""
         for _ in range(2):
             agreeing, fits = self.agreeing(a_from_b, seen)
-            better = self.refined(a_from_b, seen.of(fits & np.isin(seen.unit, agreeing)))
+            better = self.refined(a_from_b, seen.select(fits & np.isin(seen.unit, agreeing)))
             if better is None or not len(agreeing):
                 break
             a_from_b = better
@@ -191,7 +191,7 @@ class Relocaliser:
         """For how many units the best other place is nearly as good."""
         a_from_b, agreeing, _ = best
         _, fits = self.agreeing(a_from_b, seen)
-        rest = seen.of(~fits)
+        rest = seen.select(~fits)
         at_best = {int(u): int((fits & (seen.unit == u)).sum()) for u in asked}
         others = [p[0] for p in proposals]
         others += [h for u in asked if (h := self.hypothesis(int(u), rest)) is not None]
@@ -205,7 +205,7 @@ class Relocaliser:
             most = max(most, sum(counts[u] >= needed[u] for u in at_best))
         return most
 
-    def _best_unit_alone(self, seen: Sightings, unit: int, asked: int) -> Consensus:
+    def _best_unit_alone(self, seen: Sightings, unit: int, asked: int) -> Relocalization:
         """The one unit that sees most decides, as in the paper."""
         a_from_b = self.hypothesis(unit, seen)
         if a_from_b is None:
@@ -213,7 +213,7 @@ class Relocaliser:
         _, fits = self.agreeing(a_from_b, seen)
         return _found((a_from_b, np.array([unit]), int(fits.sum())), asked, 0, "the best unit alone decides")
 
-    def _judged(self, best: tuple[Floats, Ints, int], runner_up: int, asked: Ints) -> Consensus:
+    def _judged(self, best: tuple[Floats, Ints, int], runner_up: int, asked: Ints) -> Relocalization:
         agreeing = best[1]
         reason = ""
         if len(agreeing) < self._config.min_units:
@@ -233,12 +233,14 @@ class Relocaliser:
         return bool(shift <= SAME_PLACE_M and turn <= SAME_PLACE_DEG)
 
 
-def _none(reason: str, asked: int, *, runner_up: int = 0) -> Consensus:
-    return Consensus(a_from_b=None, reason=reason, units_asked=asked, units_agreeing=(), runner_up=runner_up, inliers=0)
+def _none(reason: str, asked: int, *, runner_up: int = 0) -> Relocalization:
+    return Relocalization(
+        a_from_b=None, reason=reason, units_asked=asked, units_agreeing=(), runner_up=runner_up, inliers=0
+    )
 
 
-def _found(best: tuple[Floats, Ints, int], asked: int, runner_up: int, reason: str) -> Consensus:
-    return Consensus(
+def _found(best: tuple[Floats, Ints, int], asked: int, runner_up: int, reason: str) -> Relocalization:
+    return Relocalization(
         a_from_b=best[0],
         reason=reason,
         units_asked=asked,

@@ -10,10 +10,10 @@ import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.pairs import guided_pairs, probes
-from mrasfm_engine.aggregation.relocalization import Consensus, Relocaliser, Sightings, sightings
+from mrasfm_engine.aggregation.relocalization import Relocaliser, Relocalization, Sightings, sightings
 from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
 from mrasfm_engine.aggregation.seam_refinement import (
-    FineResult,
+    RefinedSeam,
     Shared,
     adjust_transform,
     errors_focal,
@@ -97,11 +97,11 @@ def find_seam(
         quality["pairs_compared"] = cross.compared
         return _unconnected(a, b, coarse_a_from_b, found.reason, quality)
     assembly = Assembly(scenes=(a, b))
-    fine = _assemble(assembly, found.a_from_b, cross, config, cancel=cancel, progress=progress)
+    refined = _assemble(assembly, found.a_from_b, cross, config, cancel=cancel, progress=progress)
     quality["pairs_compared"] = cross.compared
-    if fine is None:
+    if refined is None:
         return _unconnected(a, b, coarse_a_from_b, "too few points of both scenes fit together", quality)
-    return _judged(assembly, coarse_a_from_b, found, fine, quality, config)
+    return _judged(assembly, coarse_a_from_b, found, refined, quality, config)
 
 
 def _relocalise(
@@ -113,13 +113,13 @@ def _relocalise(
     *,
     cancel: Callable[[], bool],
     progress: CountProgress,
-) -> tuple[Consensus, int]:
+) -> tuple[Relocalization, int]:
     """Look for units of b in a, a few at a time, until enough agree; and how many were looked for."""
     wanted = probes(a, b, coarse, config.aggregation)
     relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
     image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
     parts: list[CrossMatches] = []
-    found = Consensus(
+    found = Relocalization(
         a_from_b=None, reason="their views do not overlap", units_asked=0, units_agreeing=(), runner_up=0, inliers=0
     )
     # From the start and from the middle at once, so that the first units are not all at one place.
@@ -131,7 +131,7 @@ def _relocalise(
         progress(min(start + BATCH_UNITS, len(order)), len(order))
         matches = CrossMatches.joined(parts)
         seen: Sightings = sightings(a, b, matches.a, matches.b, image_of_b)
-        found = relocaliser.consensus(seen)
+        found = relocaliser.relocalise(seen)
         if found.a_from_b is not None and len(found.units_agreeing) >= ENOUGH_AGREEING and not found.runner_up:
             return found, start + len(batch)
     return found, len(order)
@@ -145,10 +145,10 @@ def _assemble(
     *,
     cancel: Callable[[], bool],
     progress: CountProgress,
-) -> FineResult | None:
+) -> RefinedSeam | None:
     """Match, merge and adjust in turns, each time from the better transform."""
     a, b = assembly.scenes
-    fine: FineResult | None = None
+    refined: RefinedSeam | None = None
     for match_error, _ in ROUNDS:
         pairs = guided_pairs(a, b, a_from_b, config.aggregation)
         if not len(pairs):
@@ -158,37 +158,37 @@ def _assemble(
         shared = merge_points(assembly, matches, matches_fit(assembly, state, matches, match_error))
         if len(shared) < 3:
             return None
-        fine = adjust_transform(assembly, a_from_b, shared, config, cancel=cancel)
-        if len(fine.shared) < 3:
+        refined = adjust_transform(assembly, a_from_b, shared, config, cancel=cancel)
+        if len(refined.shared) < 3:
             return None
-        a_from_b = fine.a_from_b
-    return fine
+        a_from_b = refined.a_from_b
+    return refined
 
 
 def _judged(
     assembly: Assembly,
     coarse: Floats,
-    found: Consensus,
-    fine: FineResult,
+    found: Relocalization,
+    refined: RefinedSeam,
     quality: dict[str, Any],
     config: EngineConfig,
 ) -> Seam:
     a, b = assembly.scenes
     settings = config.aggregation
-    units_a, units_b = (_units_at(assembly, fine.shared, side) for side in (0, 1))
-    scale, sigma_scale = scale_ratio(assembly, fine.a_from_b, fine.shared)
+    units_a, units_b = (_units_at(assembly, refined.shared, side) for side in (0, 1))
+    scale, sigma_scale = scale_ratio(assembly, refined.a_from_b, refined.shared)
     at = b.world_from_rig[units_b if len(units_b) else np.flatnonzero(b.unit_registered)].mean(0)[:3, 3]
-    covariance = _about(fine.covariance, b, fine.a_from_b, at)
-    shift = float(np.linalg.norm(se3.apply(fine.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
-    turn = float(se3.rotation_angle_deg(fine.a_from_b[:3, :3] @ coarse[:3, :3].T))
-    before = _residual_px(assembly, coarse, fine.shared)
+    covariance = _about(refined.covariance, b, refined.a_from_b, at)
+    shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
+    turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ coarse[:3, :3].T))
+    before = _residual_px(assembly, coarse, refined.shared)
     quality |= {
         "units_a": len(units_a),
         "units_b": len(units_b),
-        "inliers": len(fine.shared),
-        "observations": len(fine.errors_px),
+        "inliers": len(refined.shared),
+        "observations": len(refined.errors_px),
         "residual_before_px": before,
-        "residual_after_px": float(np.median(fine.errors_px)),
+        "residual_after_px": float(np.median(refined.errors_px)),
         "sigma_translation_m": float(np.sqrt(np.trace(covariance[3:, 3:]))),
         "sigma_rotation_deg": float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
         "scale": scale,
@@ -197,16 +197,16 @@ def _judged(
         "positions_off_deg": turn,
     }
     assert found.a_from_b is not None
-    reason = _why_not(found, fine, at, quality, settings.consensus, config)
+    reason = _why_not(found, refined, at, quality, settings.agreeing_units, config)
     return Seam(
         a=a.name,
         b=b.name,
         accepted=not reason,
         reason=reason,
         coarse_a_from_b=coarse,
-        a_from_b=fine.a_from_b,
+        a_from_b=refined.a_from_b,
         covariance=covariance,
-        shared=fine.shared.pairs - [0, assembly.first_point[1]],
+        shared=refined.shared.pairs - [0, assembly.first_point[1]],
         units_a=units_a,
         units_b=units_b,
         place_b_m=at,
@@ -215,8 +215,8 @@ def _judged(
 
 
 def _why_not(
-    found: Consensus,
-    fine: FineResult,
+    found: Relocalization,
+    refined: RefinedSeam,
     at: Floats,
     quality: dict[str, Any],
     strict: bool,
@@ -226,7 +226,7 @@ def _why_not(
     settings = config.aggregation
     if quality["inliers"] < settings.min_inliers:
         return f"only {quality['inliers']} points are shared, {settings.min_inliers} are needed"
-    if not np.isfinite(fine.covariance).all():
+    if not np.isfinite(refined.covariance).all():
         return "what is shared does not determine how the scenes lie"
     if not strict:
         return ""
@@ -234,8 +234,8 @@ def _why_not(
     least = min(quality["units_a"], quality["units_b"])
     if least < settings.min_units:
         return f"only {least} units of a scene see what is shared, {settings.min_units} are needed"
-    shift = float(np.linalg.norm(se3.apply(fine.a_from_b, at[None])[0] - se3.apply(found.a_from_b, at[None])[0]))
-    turn = float(se3.rotation_angle_deg(fine.a_from_b[:3, :3] @ found.a_from_b[:3, :3].T))
+    shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(found.a_from_b, at[None])[0]))
+    turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ found.a_from_b[:3, :3].T))
     if shift > MAX_SHIFT_M or turn > MAX_TURN_DEG:
         return f"what is shared contradicts the units that agree, by {shift:.2f} m and {turn:.2f} deg"
     off, unsure = abs(quality["scale"] - 1.0), 3.0 * quality["sigma_scale"]

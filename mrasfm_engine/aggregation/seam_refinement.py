@@ -17,7 +17,7 @@ from mrasfm_engine.aggregation.scene_matching import CrossMatches
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import Layout
-from mrasfm_engine.bundle_adjustment.rigid_groups import UnitSets
+from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
@@ -138,17 +138,17 @@ def transform_problem(
         state=replace(state, points_m=joined_points_m(state, tracks)),
         camera_kind=assembly.camera_kind,
         observations=assembly.observations(tracks.rows, tracks.point, tracks.count),
-        layout=Layout.of(of_unit >= 0, np.zeros(cameras, dtype=np.bool_)),
+        layout=Layout.from_free(of_unit >= 0, np.zeros(cameras, dtype=np.bool_)),
         terms=terms,
         options=SolverOptions(
             max_iterations=iterations,
             function_tolerance=1e-6,
             initial_damping=INITIAL_DAMPING,
-            loss_scale=config.adjustment.loss_scale,
+            loss_scale=config.bundle_adjustment.loss_scale,
             threads=config.threads,
         ),
         motion=assembly.motion,
-        sets=UnitSets(of_unit=of_unit, count=int(sets.max()) + 1),
+        sets=RigidGroups(of_unit=of_unit, count=int(sets.max()) + 1),
     )
 
 
@@ -162,7 +162,7 @@ def moved_scenes(assembly: Assembly, world_from_scene: Floats, solution: State) 
 
 
 @dataclass(frozen=True, kw_only=True)
-class FineResult:
+class RefinedSeam:
     """A seam after its adjustment."""
 
     a_from_b: Floats
@@ -174,7 +174,7 @@ class FineResult:
 
 def adjust_transform(
     assembly: Assembly, a_from_b: Floats, shared: Shared, config: EngineConfig, *, cancel: Callable[[], bool]
-) -> FineResult:
+) -> RefinedSeam:
     """Transformation-based adjustment of scene b against scene a, and a second one without points that do not fit."""
     poses = np.stack([np.eye(4), a_from_b])
     limit_px = config.mapping.max_error_px
@@ -205,7 +205,7 @@ def adjust_transform(
     assert sets is not None
     sigma2 = max(0.25, float(np.median(errors_px**2)) / (2 * np.log(2)) if len(errors_px) else 1.0)
     covariance = sets.covariances(problem.normal_equations(solution, 0.0), solution)[0] * sigma2 * CORRELATION
-    return FineResult(
+    return RefinedSeam(
         a_from_b=se3.inverse(poses[0]) @ poses[1],
         covariance=covariance,
         shared=shared,

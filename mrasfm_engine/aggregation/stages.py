@@ -23,7 +23,7 @@ from mrasfm_engine.export.map import SCENES_FOLDER, SEAMS_FOLDER
 from mrasfm_engine.findings import Finding, as_json, warning
 from mrasfm_engine.io.read_map import MAP_FILE
 from mrasfm_engine.io.stage_store import StageStore, code_version, fingerprint
-from mrasfm_engine.registry import Plugins, load_plugins
+from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.types import CountProgress, StageProgress
 
 FAR_APART_M = 50_000.0
@@ -44,9 +44,9 @@ class Run:
     )
 
     @cached_property
-    def plugins(self) -> Plugins:
+    def components(self) -> Components:
         """The matcher; its model is loaded when first asked for, once."""
-        return load_plugins(self.config, None)
+        return load_components(self.config, None)
 
     def step(self, stage: str) -> CountProgress:
         """The progress callback of a stage."""
@@ -263,11 +263,11 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
                 a,
                 b,
                 coarse_transform(a, b),
-                run.plugins.matcher,
+                run.components.matcher,
                 run.config,
                 cancel=run.cancel,
-                progress=lambda done, of, number=number: run.progress(  # type: ignore[misc]
-                    "seams", 100 * number + min(99, 100 * done // max(of, 1)), 100 * total
+                progress=lambda done, all_pairs, number=number: run.progress(  # type: ignore[misc]
+                    "seams", 100 * number + min(99, 100 * done // max(all_pairs, 1)), 100 * total
                 ),
             )
             if run.cancel():
@@ -292,7 +292,12 @@ def seam_name(a: str, b: str) -> str:
 def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
     """What a seam depends on: both scenes' content, in this order, settings, models and code; not their names."""
     config = run.config
-    settings = [config.matching.model_dump(), config.mapping.max_error_px, config.adjustment.loss_scale, config.seed]
-    aggregation = config.aggregation.model_dump(exclude={"candidates", "joint", "final_adjustment"})
-    models = run.plugins.fingerprint_of("matcher")
+    settings = [
+        config.matching.model_dump(),
+        config.mapping.max_error_px,
+        config.bundle_adjustment.loss_scale,
+        config.seed,
+    ]
+    aggregation = config.aggregation.model_dump(exclude={"candidates", "multi_scene_adjustment", "final_adjustment"})
+    models = run.components.fingerprint_of("matcher")
     return fingerprint(a.fingerprint, b.fingerprint, settings, aggregation, models, code_version())

@@ -1,1 +1,1 @@
-"""Measurements of the method beside its peers, on drives of its own and on published data sets."""
+"""Measurements of the method beside baseline methods, on drives of its own and on published data sets."""

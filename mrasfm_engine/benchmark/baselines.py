@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.evaluation.subprocess_run import memory_bytes, run_apart
+from mrasfm_engine.evaluation.subprocess_run import memory_bytes, run_in_subprocess
 from mrasfm_engine.evaluation.trajectory import TrajectoryErrors, compare_known
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Bools, Floats, StageProgress
@@ -26,7 +26,7 @@ from mrasfm_engine.types import Bools, Floats, StageProgress
 SMALL_INITIAL_ANGLE_DEG = 4.0
 
 
-class Mapper(StrEnum):
+class Baseline(StrEnum):
     """Which of COLMAP's mappers, and what it is told about the calibration it gets."""
 
     GLOBAL = "global"  # its defaults: focal lengths and poses of the cameras vary
@@ -54,7 +54,7 @@ class PeerResult:
         What its process had resident at most, and before it began to map; None where that is not known.
     """
 
-    mapper: Mapper
+    mapper: Baseline
     seconds: float
     registered_images: int
     world_from_rig: Floats
@@ -74,9 +74,9 @@ class PeerResult:
         return compare_known(self.world_from_rig, truth_world_from_rig[: len(self.world_from_rig)])
 
 
-def run_peer(
+def run_baseline(
     database: Path,
-    mapper: Mapper,
+    mapper: Baseline,
     *,
     threads: int,
     timeout_s: float = 3600.0,
@@ -98,10 +98,10 @@ def run_peer(
     """
     if not database.is_file():
         raise InputError(f"{database} does not exist", remedy="Give the features.db of a scene.")
-    with tempfile.TemporaryDirectory(prefix="mrasfm-peer-") as name:
+    with tempfile.TemporaryDirectory(prefix="mrasfm-baseline-") as name:
         folder = Path(name)
         shutil.copyfile(database, folder / "features.db")  # COLMAP writes into databases that it only reads
-        ran = run_apart(_map, folder, mapper, threads, timeout_s=timeout_s, cancel=cancel)
+        ran = run_in_subprocess(_map, folder, mapper, threads, timeout_s=timeout_s, cancel=cancel)
     if ran.result is None:
         return PeerResult(
             mapper=mapper, seconds=math.nan, registered_images=0, world_from_rig=np.zeros((0, 4, 4)),
@@ -110,15 +110,15 @@ def run_peer(
     return replace(ran.result, peak_memory_bytes=ran.peak_memory_bytes)
 
 
-def _map(progress: StageProgress, folder: Path, mapper: Mapper, threads: int) -> PeerResult:
+def _map(progress: StageProgress, folder: Path, mapper: Baseline, threads: int) -> PeerResult:
     pycolmap.logging.minloglevel = 3
     out = folder / "models"
     out.mkdir()
-    database = str(folder / "peer.db")
-    reference_from_rig, units = _rewrite(folder / "features.db", folder / "peer.db")
+    database = str(folder / "baseline.db")
+    reference_from_rig, units = _rewrite(folder / "features.db", folder / "baseline.db")
     start_memory_bytes = memory_bytes()
     started = time.perf_counter()
-    if mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION):
+    if mapper in (Baseline.GLOBAL, Baseline.GLOBAL_FIXED_CALIBRATION):
         models = pycolmap.global_mapping(database, folder, out, _global_options(mapper, threads))
     else:
         options = _incremental_options(mapper, threads)
@@ -187,11 +187,11 @@ def _copy_frames(old: Any, new: Any) -> int:
     return max(int(frame.frame_id) for frame in frames)
 
 
-def _global_options(mapper: Mapper, threads: int) -> Any:
+def _global_options(mapper: Baseline, threads: int) -> Any:
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
     options.random_seed = options.mapper.random_seed = 0
-    if mapper is Mapper.GLOBAL_FIXED_CALIBRATION:
+    if mapper is Baseline.GLOBAL_FIXED_CALIBRATION:
         options.mapper.refine_sensor_from_rig = False
         options.mapper.bundle_adjustment.refine_sensor_from_rig = False
         options.mapper.bundle_adjustment.refine_focal_length = False
@@ -199,11 +199,11 @@ def _global_options(mapper: Mapper, threads: int) -> Any:
     return options
 
 
-def _incremental_options(mapper: Mapper, threads: int) -> Any:
+def _incremental_options(mapper: Baseline, threads: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
     options.extract_colors = False
-    if mapper is Mapper.INCREMENTAL_FIXED_CALIBRATION:
+    if mapper is Baseline.INCREMENTAL_FIXED_CALIBRATION:
         options.ba_refine_sensor_from_rig = False
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     return options

@@ -68,7 +68,7 @@ def measure_growth(rig: str, units: Sequence[int], seed: int, work: Path, settin
 def _measure(rig: str, units: int, seed: int, folder: Path, settings: Settings) -> Growth:
     label = f"{rig}, {units} units"
     simulated, _ = settings.require(label, mapping.simulate, rig, units, seed, settings.config, folder)
-    if settings.peers:
+    if settings.baselines:
         settings.require(label, mapping.write_simulated_database, folder, folder / DATABASE)
     rows = [our_row(settings, mapping.map_simulated, folder, settings.config), *peer_rows(settings, folder / DATABASE)]
     truth = simulated.world_from_rig

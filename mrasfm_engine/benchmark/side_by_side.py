@@ -1,4 +1,4 @@
-"""Our mapping and its peers on the same features and matches, each in a process of its own."""
+"""Our mapping and its baselines on the same features and matches, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TypeVar
 import numpy as np
 
 from mrasfm_engine.benchmark import mapping
-from mrasfm_engine.benchmark.baselines import Mapper, run_peer
+from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
 from mrasfm_engine.benchmark.mapping import Mapped, Prepared
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError, ReconstructionError
 from mrasfm_engine.evaluation.pose_errors import TOLERANCE_US
-from mrasfm_engine.evaluation.subprocess_run import Ran, run_apart
+from mrasfm_engine.evaluation.subprocess_run import ProcessResult, run_in_subprocess
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_known, match_timestamps
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
@@ -27,11 +27,11 @@ Progress = Callable[[str, str, int, int], None]  # row, stage, done, total
 Call = TypeVar("Call")
 
 OURS = "mrasfm"
-PEERS = {
-    "colmap-global": Mapper.GLOBAL,
-    "colmap-global-fixed": Mapper.GLOBAL_FIXED_CALIBRATION,
-    "colmap-incremental": Mapper.INCREMENTAL,
-    "colmap-incremental-fixed": Mapper.INCREMENTAL_FIXED_CALIBRATION,
+BASELINES = {
+    "colmap-global": Baseline.GLOBAL,
+    "colmap-global-fixed": Baseline.GLOBAL_FIXED_CALIBRATION,
+    "colmap-incremental": Baseline.INCREMENTAL,
+    "colmap-incremental-fixed": Baseline.INCREMENTAL_FIXED_CALIBRATION,
 }
 TRUTH = "truth.tum"  # as importers and `mrasfm synth` leave it in a drive
 DATABASE = "features.db"
@@ -50,25 +50,29 @@ class Settings:
     """
 
     config: EngineConfig
-    peers: Sequence[str] = ()
+    baselines: Sequence[str] = ()
     repeat: int = 1
     timeout_s: float = math.inf
     progress: Progress = lambda row, stage, done, total: None
     cancel: Callable[[], bool] = lambda: False
 
     def __post_init__(self) -> None:
-        for peer in self.peers:
-            if peer not in PEERS:
-                raise InputError(f"--peers: there is no mapper {peer!r}", remedy=f"Give some of {', '.join(PEERS)}.")
+        for baseline in self.baselines:
+            if baseline not in BASELINES:
+                raise InputError(
+                    f"--baselines: there is no mapper {baseline!r}", remedy=f"Give some of {', '.join(BASELINES)}."
+                )
         if self.repeat < 1 or not self.timeout_s > 0:
             raise InputError(
                 f"cannot map {self.repeat} times within {self.timeout_s:g} s each",
                 remedy="Give --repeat 1 or more, and a positive --timeout-s.",
             )
 
-    def run(self, row: str, work: Callable[..., Call], *arguments: object, timeout_s: float = math.inf) -> Ran[Call]:
+    def run(
+        self, row: str, work: Callable[..., Call], *arguments: object, timeout_s: float = math.inf
+    ) -> ProcessResult[Call]:
         """Do some work in a process of its own, shown as a row's."""
-        return run_apart(
+        return run_in_subprocess(
             work,
             *arguments,
             timeout_s=timeout_s,
@@ -101,7 +105,7 @@ class Row:
     Attributes
     ----------
     mapping_s, refinement_s
-        Seconds of the run of median time; peers refine while they map.
+        Seconds of the run of median time; baselines refine while they map.
     runs_s
         Both together of every run that came to its end.
     start_memory_bytes, peak_memory_bytes
@@ -147,8 +151,8 @@ class Comparison:
     truth_world_from_rig: Floats | None = field(repr=False, default=None)
 
 
-def peers_named(text: str) -> list[str]:
-    """Names of peers from a list separated by commas; `Settings` refuses unknown ones."""
+def baselines_named(text: str) -> list[str]:
+    """Names of baselines from a list separated by commas; `Settings` refuses unknown ones."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
@@ -172,7 +176,7 @@ def compare_mappers(drive_folder: Path, truth: Trajectory | None, work: Path, se
     drive = read_drive(drive_folder)
     true_poses = None if truth is None else poses_of_units(drive, truth)
     prepared, peak = settings.require("features and matches", mapping.prepare, drive_folder, settings.config, work)
-    if settings.peers:
+    if settings.baselines:
         database = work / DATABASE
         settings.require("database", mapping.write_database, drive_folder, settings.config, work, database)
     rows = [
@@ -240,15 +244,17 @@ def _ours(settings: Settings, work: Callable[..., Mapped], *arguments: object) -
 
 
 def peer_rows(settings: Settings, database: Path) -> list[Row]:
-    """All peers that are asked for, as often as asked for."""
-    return [_median([_peer(settings, name, database) for _ in range(settings.repeat)]) for name in settings.peers]
+    """All baselines that are asked for, as often as asked for."""
+    return [
+        _median([_baseline(settings, name, database) for _ in range(settings.repeat)]) for name in settings.baselines
+    ]
 
 
-def _peer(settings: Settings, name: str, database: Path) -> Row:
+def _baseline(settings: Settings, name: str, database: Path) -> Row:
     settings.progress(name, "mapping", 0, 1)
-    result = run_peer(
+    result = run_baseline(
         database,
-        PEERS[name],
+        BASELINES[name],
         threads=settings.config.threads,
         timeout_s=settings.timeout_s,
         cancel=settings.cancel,
@@ -282,6 +288,6 @@ def with_errors(row: Row, truth_world_from_rig: Floats | None) -> Row:
     """The row with its errors against the truth (units, 4, 4)."""
     if truth_world_from_rig is None:
         return row
-    # A peer's model ends with its last unit.
+    # A baseline's model ends with its last unit.
     known = truth_world_from_rig[: len(row.world_from_rig)]
     return replace(row, errors=compare_known(row.world_from_rig, known))

@@ -70,7 +70,7 @@ class Elimination:
     transposed: Bools  # (blocks of the matrix,) whether it is above the diagonal there
 
     @staticmethod
-    def of(pattern: BlockPattern) -> Elimination:
+    def from_pattern(pattern: BlockPattern) -> Elimination:
         """A minimum degree order for a pattern (Liu's, of A' + A, as SuperLU has it)."""
         n, row, column = pattern.columns, pattern.row, pattern.column_of_block()
         full = len(row) > FULL * n * (n + 1) / 2
@@ -283,7 +283,7 @@ class BlockFactor:
     blocks: Floats  # (factor's blocks, 6, 6)
 
     @staticmethod
-    def of(elimination: Elimination, blocks: Floats) -> BlockFactor | None:
+    def from_blocks(elimination: Elimination, blocks: Floats) -> BlockFactor | None:
         """Factorise the matrix with these blocks (blocks, 6, 6) of its pattern; None where it is not positive definite.
 
         Diagonal blocks are taken by their lower triangle.

@@ -1,27 +1,27 @@
 """The compiled inner loops of camera set bundle adjustment: residuals, Jacobians, Schur complement over points.
 
-One observation of point X by camera c of unit u, with (R_u, t_u) = world_from_rig, (A, b) = unit_from_shot,
+One observation of point X by camera c of unit u, with (R_u, t_u) = world_from_rig, (A, b) = unit_from_band,
 (R_c, t_c) = rig_from_cam:
 
-    x_rig = R_u' (X - t_u)      x_shot = A' (x_rig - b)      x_cam = R_c' (x_shot - t_c)
+    x_rig = R_u' (X - t_u)      x_band = A' (x_rig - b)      x_cam = R_c' (x_band - t_c)
     residual = (pixel(x_cam) - observed) / sigma
 
 With P = d pixel / d x_cam (2x3), M = P R_c', Q = M A' and N = Q R_u' the derivatives in the steps of `problem` are,
 row by row,
 
     d/dX     =  N                       d/dtau_u = -N            d/domega_u = N x (X - t_u)
-    d/dtau_c = -M                       d/domega_c = M x (x_shot - t_c)
+    d/dtau_c = -M                       d/domega_c = M x (x_band - t_c)
     d/dphi   =  pixel - principal point
 
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
 reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
 
-Where the motion within a unit follows from the trajectory, a shot's pose takes part in steps of up to three units
-(`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_shot). Left out is that a turned unit
-also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A shot
-that is held to its unit has no other support, and the derivatives above. Where all images are taken at their unit's
-time, shot_r, shot_t, support, weight and obs_shot are None: numba compiles the kernels without them, so that nobody
-pays for what is not there.
+Where the motion within a unit follows from the trajectory, a row band's pose takes part in steps of up to three units
+(`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_band). Left out is that a turned unit
+also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A row
+band that is held to its unit has no other support, and the derivatives above. Where all images are taken at their
+unit's time, band_r, band_t, support, weight and obs_band are None: numba compiles the kernels without them, so that
+nobody pays for what is not there.
 
 Products of Jacobians need not be formed one observation at a time. With d = X - t_u and V = N' N all that an
 observation adds to its unit's block follows from V and V [d]x, and as d/dcamera = d/dunit T with a T that all
@@ -54,42 +54,42 @@ IMAGE_SUMS = 35  # unit's block by its lower triangle, gradient, with the focal 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def camera_point(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, band: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
     from_unit: Any, rig: Any, cam: Any,
 ) -> None:  # fmt: skip
-    """from_unit = X - t_u (X - t_shot where the shot follows several units), rig = x_shot - t_c, cam = x_cam."""
+    """from_unit = X - t_u (X - t_band where the row band follows several units), rig = x_band - t_c, cam = x_cam."""
     for i in range(3):
         from_unit[i] = x[i] - unit_t[i]
-    if shot_r is None:
+    if band_r is None:
         for i in range(3):
             rig[i] = unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
     else:
         for i in range(3):
             cam[i] = (
                 unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2]
-                - shot_t[shot, i]
+                - band_t[band, i]
             )  # fmt: skip
         if follows:
             for i in range(3):
                 from_unit[i] = unit_r[i, 0] * cam[0] + unit_r[i, 1] * cam[1] + unit_r[i, 2] * cam[2]
         for i in range(3):
-            rig[i] = shot_r[shot, 0, i] * cam[0] + shot_r[shot, 1, i] * cam[1] + shot_r[shot, 2, i] * cam[2] - cam_t[i]
+            rig[i] = band_r[band, 0, i] * cam[0] + band_r[band, 1, i] * cam[1] + band_r[band, 2, i] * cam[2] - cam_t[i]
     for i in range(3):
         cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def squared_errors(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared behind the camera."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for n in range(lo, hi):
         u, c = obs_unit[n], obs_camera[n]
-        shot = 0 if obs_shot is None else obs_shot[n]
+        band = 0 if obs_band is None else obs_band[n]
         camera_point(
-            unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam
+            unit_r[u], unit_t[u], band_r, band_t, band, False, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam
         )
         if cam[2] < MIN_DEPTH_M:
             out[n] = BEHIND_PX * BEHIND_PX
@@ -100,7 +100,7 @@ def squared_errors(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def linearise(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, shot: int, follows: bool, cam_r: Any, cam_t: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, band: int, follows: bool, cam_r: Any, cam_t: Any,
     kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
 ) -> bool:  # fmt: skip
@@ -108,7 +108,7 @@ def linearise(
 
     Those in the unit follow from jx = N and d = X - t_u.
     """
-    camera_point(unit_r, unit_t, shot_r, shot_t, shot, follows, cam_r, cam_t, x, d, rig, cam)
+    camera_point(unit_r, unit_t, band_r, band_t, band, follows, cam_r, cam_t, x, d, rig, cam)
     if cam[2] < MIN_DEPTH_M:
         return False
     project(kind, k, cam[0], cam[1], cam[2], work, proj)
@@ -121,12 +121,12 @@ def linearise(
         m0 = p0 * cam_r[0, 0] + p1 * cam_r[0, 1] + p2 * cam_r[0, 2]
         m1 = p0 * cam_r[1, 0] + p1 * cam_r[1, 1] + p2 * cam_r[1, 2]
         m2 = p0 * cam_r[2, 0] + p1 * cam_r[2, 1] + p2 * cam_r[2, 2]
-        if shot_r is None:
+        if band_r is None:
             q0, q1, q2 = m0, m1, m2
         else:
-            q0 = m0 * shot_r[shot, 0, 0] + m1 * shot_r[shot, 0, 1] + m2 * shot_r[shot, 0, 2]
-            q1 = m0 * shot_r[shot, 1, 0] + m1 * shot_r[shot, 1, 1] + m2 * shot_r[shot, 1, 2]
-            q2 = m0 * shot_r[shot, 2, 0] + m1 * shot_r[shot, 2, 1] + m2 * shot_r[shot, 2, 2]
+            q0 = m0 * band_r[band, 0, 0] + m1 * band_r[band, 0, 1] + m2 * band_r[band, 0, 2]
+            q1 = m0 * band_r[band, 1, 0] + m1 * band_r[band, 1, 1] + m2 * band_r[band, 1, 2]
+            q2 = m0 * band_r[band, 2, 0] + m1 * band_r[band, 2, 1] + m2 * band_r[band, 2, 2]
         n0 = q0 * unit_r[0, 0] + q1 * unit_r[0, 1] + q2 * unit_r[0, 2]
         n1 = q0 * unit_r[1, 0] + q1 * unit_r[1, 1] + q2 * unit_r[1, 2]
         n2 = q0 * unit_r[2, 0] + q1 * unit_r[2, 1] + q2 * unit_r[2, 2]
@@ -165,8 +165,8 @@ def invert3(v: Any, out: Any) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_image: Any, obs_xy: Any, first: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    support: Any, weight: Any, obs_unit: Any, obs_band: Any, obs_camera: Any, obs_image: Any, obs_xy: Any, first: Any,
     fixed: Any, unit_slot: Any, camera_slot: Any, num_units: int,
     order: Any, first_point: Any, blocks: Any, first_block: Any, places: Any, first_place: Any,
     sigma: float, loss2: float, damping: float, lo: int, hi: int,
@@ -195,10 +195,10 @@ def accumulate(
         w[: b1 - b0] = 0.0
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
-            shot = 0 if obs_shot is None else obs_shot[n]
-            follows = False if weight is None else weight[shot, 0] != 1.0
+            band = 0 if obs_band is None else obs_band[n]
+            follows = False if weight is None else weight[band, 0] != 1.0
             if not linearise(
-                unit_r[u], unit_t[u], shot_r, shot_t, shot, follows, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], band_r, band_t, band, follows, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
@@ -258,11 +258,11 @@ def accumulate(
                     _add_unit(w[at], 1.0, t00, t01, t02, t10, t11, t12, t20, t21, t22, v00, v01, v02, v11, v12, v22)
             else:
                 for k in range(3):
-                    su = -1 if weight[shot, k] == 0.0 else unit_slot[support[shot, k]]
+                    su = -1 if weight[band, k] == 0.0 else unit_slot[support[band, k]]
                     at = -1 if su < 0 else _find(blocks, b0, b1, su)
                     if at >= 0:
                         _add_unit(
-                            w[at], weight[shot, k],
+                            w[at], weight[band, k],
                             t00, t01, t02, t10, t11, t12, t20, t21, t22, v00, v01, v02, v11, v12, v22,
                         )  # fmt: skip
             sc = camera_slot[c]
@@ -382,22 +382,22 @@ def _subtract_products(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def add_images(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_t: Any, support: Any, weight: Any, image_unit: Any,
-    image_camera: Any, image_shot: Any, unit_slot: Any, camera_slot: Any, num_units: int, first_row: Any, rows: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_t: Any, support: Any, weight: Any, image_unit: Any,
+    image_camera: Any, image_band: Any, unit_slot: Any, camera_slot: Any, num_units: int, first_row: Any, rows: Any,
     images: Any, s_units: Any, s_border: Any, s_cameras: Any, diagonal: Any, g: Any,
 ) -> None:  # fmt: skip
     """Add the sums of every image to the matrix, to the undamped diagonal (n,) and to the gradient (n,).
 
     A camera's derivatives follow from the unit's: d/dcamera = d/dunit T with
 
-        T = [ R     0 ]      R = world_from_shot's rotation, q = the camera's place from that about which the unit turns
+        T = [ R     0 ]      R = world_from_band's rotation, q = the camera's place from that about which the unit turns
             [ [q]xR R ]
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
-        u, c, shot = image_unit[image], image_camera[image], image_shot[image]
+        u, c, band = image_unit[image], image_camera[image], image_band[image]
         s = images[image]
         k = 0
         for i in range(6):
@@ -406,7 +406,7 @@ def add_images(
                 k += 1
         sc = camera_slot[c]
         if sc >= 0:
-            _camera_from_unit(unit_r[u], shot_r, shot_t, weight, shot, cam_t[c], r, q, t)
+            _camera_from_unit(unit_r[u], band_r, band_t, weight, band, cam_t[c], r, q, t)
             for i in range(6):
                 for j in range(6):
                     x = 0.0
@@ -438,8 +438,8 @@ def add_images(
                     break
                 wa, sa = 1.0, unit_slot[u]
             else:
-                wa = weight[shot, a]
-                sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
+                wa = weight[band, a]
+                sa = -1 if wa == 0.0 else unit_slot[support[band, a]]
             if sa < 0:
                 continue
             for i in range(6):
@@ -457,8 +457,8 @@ def add_images(
                         break
                     wb, sb = 1.0, sa
                 else:
-                    wb = weight[shot, b]
-                    sb = -1 if wb == 0.0 else unit_slot[support[shot, b]]
+                    wb = weight[band, b]
+                    sb = -1 if wb == 0.0 else unit_slot[support[band, b]]
                 if sb < 0 or sb > sa:
                     continue
                 at = first_row[sb] + np.searchsorted(rows[first_row[sb] : first_row[sb + 1]], sa)
@@ -472,26 +472,26 @@ def add_images(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _camera_from_unit(
-    unit_r: Any, shot_r: Any, shot_t: Any, weight: Any, shot: int, cam_t: Any, r: Any, q: Any, t: Any
+    unit_r: Any, band_r: Any, band_t: Any, weight: Any, band: int, cam_t: Any, r: Any, q: Any, t: Any
 ) -> None:
     """R, q and T of `add_images` for one image."""
-    if shot_r is None:
+    if band_r is None:
         for i in range(3):
             q[i] = 0.0
             for j in range(3):
                 r[i, j] = unit_r[i, j]
                 q[i] += unit_r[i, j] * cam_t[j]
     else:
-        follows = False if weight is None else weight[shot, 0] != 1.0
+        follows = False if weight is None else weight[band, 0] != 1.0
         for i in range(3):
             q[i] = 0.0
             for j in range(3):
                 r[i, j] = 0.0
                 for k in range(3):
-                    r[i, j] += unit_r[i, k] * shot_r[shot, k, j]
+                    r[i, j] += unit_r[i, k] * band_r[band, k, j]
                 q[i] += r[i, j] * cam_t[j]
                 if not follows:
-                    q[i] += unit_r[i, j] * shot_t[shot, j]
+                    q[i] += unit_r[i, j] * band_t[band, j]
     for j in range(3):
         for i in range(3):
             t[i, j] = t[3 + i, 3 + j] = r[i, j]
@@ -502,8 +502,8 @@ def _camera_from_unit(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    support: Any, weight: Any, obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    support: Any, weight: Any, obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any,
     unit_slot: Any, camera_slot: Any, num_units: int,
     sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
@@ -518,10 +518,10 @@ def substitute(
             su, sc = unit_slot[u], camera_slot[c]
             if weight is None and su < 0 and sc < 0:
                 continue
-            shot = 0 if obs_shot is None else obs_shot[n]
-            follows = False if weight is None else weight[shot, 0] != 1.0
+            band = 0 if obs_band is None else obs_band[n]
+            follows = False if weight is None else weight[band, 0] != 1.0
             if not linearise(
-                unit_r[u], unit_t[u], shot_r, shot_t, shot, follows, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], band_r, band_t, band, follows, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
@@ -534,8 +534,8 @@ def substitute(
                         break
                     wa, sa = 1.0, su
                 else:
-                    wa = weight[shot, a]
-                    sa = -1 if wa == 0.0 else unit_slot[support[shot, a]]
+                    wa = weight[band, a]
+                    sa = -1 if wa == 0.0 else unit_slot[support[band, a]]
                 if sa >= 0:
                     o = 6 * sa
                     x0 += wa * (d[1] * step[o + 2] - d[2] * step[o + 1] - step[o + 3])

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF
-from mrasfm_engine.bundle_adjustment.reduced_camera_system import Reduced
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats
@@ -35,11 +35,11 @@ def covariances(problem: Problem, state: State) -> Covariances:
     told up to `LARGEST_DENSE` unknowns, beyond that all have one.
     """
     layout = problem.layout
-    reduced = problem.normal_equations(state, 0.0)
+    system = problem.normal_equations(state, 0.0)
     position = state.unit_position_m[layout.unit_slot >= 0]
-    found = _regular_marginals(reduced, position)
+    found = _regular_marginals(system, position)
     if found is None:
-        found = _dense_marginals(reduced, position)
+        found = _dense_marginals(system, position)
     per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
     per_unit[layout.unit_slot >= 0] = np.sqrt(found.units)
     per_camera = np.full((len(layout.camera_slot), CAMERA_DOF), np.nan)
@@ -60,13 +60,13 @@ class _Marginals:
     sigma_scale: float
 
 
-def _regular_marginals(reduced: Reduced, position: Floats) -> _Marginals | None:
+def _regular_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals | None:
     """By eliminating units and cameras; None where something besides single unknowns is not determined."""
-    layout = reduced.layout
+    layout = system.layout
     split = UNIT_DOF * layout.num_units
-    unseen = ~(reduced.matrix_diagonal() > 0.0)
-    solved = reduced.eliminate(unseen.astype(np.float64))
-    if solved is None or solved.smallest_pivot(reduced, unseen) < SINGULAR:
+    unseen = ~(system.matrix_diagonal() > 0.0)
+    solved = system.eliminate(unseen.astype(np.float64))
+    if solved is None or solved.smallest_pivot(system, unseen) < SINGULAR:
         return None
     units, cameras = solved.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
@@ -84,14 +84,14 @@ def _regular_marginals(reduced: Reduced, position: Floats) -> _Marginals | None:
     return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
 
 
-def _dense_marginals(reduced: Reduced, position: Floats) -> _Marginals:
+def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:
     """By the inverse without its null space."""
-    layout = reduced.layout
+    layout = system.layout
     size, split = layout.size, UNIT_DOF * layout.num_units
     if size > LARGEST_DENSE:
         cameras = np.diag(np.full(size - split, np.inf))
         return _Marginals(units=np.full((layout.num_units, UNIT_DOF), np.inf), cameras=cameras, sigma_scale=np.inf)
-    matrix = reduced.matrix
+    matrix = system.matrix
     free = np.setdiff1d(np.arange(size), layout.held())
     free = free[np.diagonal(matrix)[free] > 0.0]
     inverse, loose = _inverse(matrix[np.ix_(free, free)])

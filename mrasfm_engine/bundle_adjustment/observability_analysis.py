@@ -48,7 +48,7 @@ class Observability:
         return "only the prior" if self.scale_only_prior else "the prior and positions"
 
 
-def judge_directions(
+def assess_directions(
     covariance: Floats, *, position_m: Floats, sigma_rotation_rad: Floats, sigma_translation_m: Floats
 ) -> Observability:
     """Compare the posterior of all cameras' poses with their prior.

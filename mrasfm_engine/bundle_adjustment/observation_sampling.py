@@ -34,7 +34,7 @@ def solve_with_chosen_points(
     solution, report = solve(problem.of_points(chosen), cancel=cancel)
     points_m = problem.state.points_m.copy()
     points_m[chosen] = solution.points_m
-    return problem.with_points_settled(replace(solution, points_m=points_m)), report
+    return problem.with_points_refined(replace(solution, points_m=points_m)), report
 
 
 def choose_points(observations: Observations, free_units: Bools, image_size_px: Floats, *, an_image: int) -> Bools:

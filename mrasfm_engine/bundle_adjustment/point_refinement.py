@@ -24,16 +24,16 @@ WORTH = 3e-2  # gain an observation, after which a point is still far enough fro
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_cost(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, scale2: float, x: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
+    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, scale2: float, x: Any,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any,
 ) -> float:  # fmt: skip
     """Sum of log(1 + r^2 / scale^2) over a point's observations begin..end, were it at x; r in pixels."""
     result, product = 0.0, 1.0
     for n in range(begin, end):
         u, c = obs_unit[n], obs_camera[n]
-        shot = 0 if obs_shot is None else obs_shot[n]
-        camera_point(unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], x, d, rig, cam)
+        band = 0 if obs_band is None else obs_band[n]
+        camera_point(unit_r[u], unit_t[u], band_r, band_t, band, False, cam_r[c], cam_t[c], x, d, rig, cam)
         r2 = BEHIND_PX * BEHIND_PX
         if cam[2] >= MIN_DEPTH_M:
             project(kind[c], params[c], cam[0], cam[1], cam[2], work, proj)
@@ -47,8 +47,8 @@ def _point_cost(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_system(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, sigma: float, loss2: float,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
+    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, sigma: float, loss2: float,
     x: Any, d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
 ) -> None:  # fmt: skip
     """V (6,) and gradient e (3,) of a point at x over its observations begin..end."""
@@ -56,9 +56,9 @@ def _point_system(
     e[:] = 0.0
     for n in range(begin, end):
         u, c = obs_unit[n], obs_camera[n]
-        shot = 0 if obs_shot is None else obs_shot[n]
+        band = 0 if obs_band is None else obs_band[n]
         if not linearise(
-            unit_r[u], unit_t[u], shot_r, shot_t, shot, False, cam_r[c], cam_t[c], kind[c], params[c], x, obs_xy[n],
+            unit_r[u], unit_t[u], band_r, band_t, band, False, cam_r[c], cam_t[c], kind[c], params[c], x, obs_xy[n],
             sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
         ):  # fmt: skip
             continue
@@ -76,9 +76,9 @@ def _point_system(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def settle(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, fixed: Any,
+def refine_points(
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any, fixed: Any,
     sigma: float, loss2: float, before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
     """Move points lo..hi, in place, to where the poses and the calibration of now want them; what they cost to costs.
@@ -96,7 +96,7 @@ def settle(
         for i in range(3):
             x[i] = points[p, i]
         cost = _point_cost(
-            unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+            unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
             begin, end, scale2, x, d, rig, cam, work, proj,
         )  # fmt: skip
         if fixed[p]:
@@ -106,7 +106,7 @@ def settle(
             for i in range(3):
                 trial[i] = before[p, i]
             back = _point_cost(
-                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
                 begin, end, scale2, trial, d, rig, cam, work, proj,
             )  # fmt: skip
             if back < cost:
@@ -120,7 +120,7 @@ def settle(
             enough = WORTH
             gained = 0.0
             _point_system(
-                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
                 begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
             )  # fmt: skip
             if not invert3(v, inv):
@@ -129,7 +129,7 @@ def settle(
             trial[1] = x[1] - (inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2])
             trial[2] = x[2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])
             own = _point_cost(
-                unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+                unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
                 begin, end, scale2, trial, d, rig, cam, work, proj,
             )  # fmt: skip
             if own < cost:
@@ -144,13 +144,13 @@ def settle(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def point_costs(
-    unit_r: Any, unit_t: Any, shot_r: Any, shot_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, obs_xy: Any, first: Any, scale2: float, lo: int, hi: int, costs: Any,
+    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
+    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any, scale2: float, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
     """What points lo..hi cost: sums of log(1 + r^2 / scale^2) over their observations."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for p in range(lo, hi):
         costs[p] = _point_cost(
-            unit_r, unit_t, shot_r, shot_t, cam_r, cam_t, kind, params, obs_unit, obs_shot, obs_camera, obs_xy,
+            unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
             first[p], first[p + 1], scale2, points[p], d, rig, cam, work, proj,
         )  # fmt: skip

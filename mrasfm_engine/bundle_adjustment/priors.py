@@ -250,7 +250,7 @@ class UprightPrior:
     sigma_pitch_rad: float
     up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit vector of the world frame
 
-    def _rows(self, state: State) -> tuple[Floats, Floats]:
+    def _position_rows(self, state: State) -> tuple[Floats, Floats]:
         # The rig's y axis (left) tells roll, its x axis (forward) pitch.
         axes = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]], 1, 2)  # (n, 2, 3)
         scale = np.array([self.sigma_roll_rad, self.sigma_pitch_rad]) * np.sqrt(len(self.unit))
@@ -259,11 +259,11 @@ class UprightPrior:
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        return float(0.5 * (self._rows(state)[0] ** 2).sum())
+        return float(0.5 * (self._position_rows(state)[0] ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        r, j = self._rows(state)
+        r, j = self._position_rows(state)
         free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
         slots, j_t = layout.unit_slot[self.unit[free]], np.swapaxes(j[free], 1, 2)
         np.add.at(extra.units[:, :3, :3], slots, j_t @ j[free])

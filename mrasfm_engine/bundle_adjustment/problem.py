@@ -37,7 +37,7 @@ class Observations:
     xy_px: Floats  # (n, 2)
     first_of_point: Ints = field(init=False)  # (p + 1,) observations of point i: first[i]:first[i + 1]
     num_points: int
-    shot: Ints | None = None  # (n,) indices into the state's shots; without, all are at their unit's timestamp
+    band: Ints | None = None  # (n,) indices into the state's row bands; without, all are at their unit's timestamp
     fixed: Bools | None = None  # (p,) points that stay where they are; without, none does
 
     def __post_init__(self) -> None:
@@ -53,19 +53,21 @@ class Observations:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShotMotion:
-    """How shots follow the trajectory of the units that are adjusted."""
+class RowBandMotion:
+    """How row bands follow the trajectory of the units that are adjusted."""
 
-    support: Ints  # (s, 3) units whose steps move a shot; -1 where weight is 0
+    support: Ints  # (s, 3) units whose steps move a row band; -1 where weight is 0
     weight: Floats  # (s, 3) by how much; (1, 0, 0) where it is held to its unit
-    follow: Callable[[State], State]  # the state with its shots computed anew from its units
+    place_bands: Callable[[State], State]  # the state with its row bands computed anew from its units
 
     @staticmethod
-    def held(shot_unit: Ints) -> ShotMotion:
-        """Shots (s,) that stay where they are relative to their units."""
-        support = np.full((len(shot_unit), 3), -1, dtype=np.int64)
-        support[:, 0] = shot_unit
-        return ShotMotion(support=support, weight=np.tile([1.0, 0.0, 0.0], (len(support), 1)), follow=lambda s: s)
+    def held(band_unit: Ints) -> RowBandMotion:
+        """Row bands (s,) that stay where they are relative to their units."""
+        support = np.full((len(band_unit), 3), -1, dtype=np.int64)
+        support[:, 0] = band_unit
+        return RowBandMotion(
+            support=support, weight=np.tile([1.0, 0.0, 0.0], (len(support), 1)), place_bands=lambda s: s
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +81,7 @@ class Layout:
     free_focal: bool
 
     @staticmethod
-    def of(free_units: Bools, free_cameras: Bools, *, free_focal: bool = False) -> Layout:
+    def from_free(free_units: Bools, free_cameras: Bools, *, free_focal: bool = False) -> Layout:
         """The layout with the marked units and cameras free."""
         return Layout(
             unit_slot=np.where(free_units, np.cumsum(free_units) - 1, -1).astype(np.int64),

@@ -22,7 +22,7 @@ import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.block_cholesky import BlockFactor
 from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout
-from mrasfm_engine.bundle_adjustment.schur_structure import Coupling
+from mrasfm_engine.bundle_adjustment.schur_structure import SchurStructure
 from mrasfm_engine.types import Bools, Floats, Ints
 
 TINY = 1e-12  # damps what nothing observes
@@ -62,11 +62,11 @@ class Extra:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reduced:
+class ReducedCameraSystem:
     """Normal equations with the points eliminated."""
 
     layout: Layout
-    coupling: Coupling
+    structure: SchurStructure
     units: Floats  # (blocks of the units' pattern, 6, 6); diagonal ones are symmetric
     border: Floats  # (cameras, units, 7, 6)
     cameras: Floats  # (7 cameras, 7 cameras)
@@ -76,13 +76,13 @@ class Reduced:
     v_gradient: Floats  # (p, 3)
 
     @staticmethod
-    def of(
+    def from_sums(
         layout: Layout,
-        coupling: Coupling,
+        structure: SchurStructure,
         sums: tuple[Floats, ...],
         points: tuple[Floats, Floats],
         extra: Extra,
-    ) -> Reduced:
+    ) -> ReducedCameraSystem:
         """The system from what `accumulate` summed (units, border, cameras, diagonal, gradient) and other terms."""
         c = layout.num_cameras
         units = sums[0].reshape(-1, UNIT_DOF, UNIT_DOF)
@@ -90,16 +90,16 @@ class Reduced:
         squares = sums[2].reshape(c, c, CAMERA_DOF, CAMERA_DOF)
         diagonal, gradient = sums[3:]
         # Diagonal blocks come by their lower triangle.
-        on = coupling.pattern.first[:-1]
+        on = structure.pattern.first[:-1]
         lower = np.tril(units[on])
         units[on] = lower + np.swapaxes(np.tril(lower, -1), 1, 2) + extra.units
         size = CAMERA_DOF * c
         cameras = np.tril(np.swapaxes(squares, 1, 2).reshape(size, size))
         cameras = cameras + np.tril(cameras, -1).T + extra.cameras
         unit_diagonal = np.diagonal(extra.units, axis1=1, axis2=2).ravel()
-        return Reduced(
+        return ReducedCameraSystem(
             layout=layout,
-            coupling=coupling,
+            structure=structure,
             units=units,
             border=border,
             cameras=cameras,
@@ -115,8 +115,8 @@ class Reduced:
         n, split = self.layout.size, UNIT_DOF * self.layout.num_units
         result = np.zeros((n, n))
         steps = np.arange(UNIT_DOF)
-        rows = (UNIT_DOF * self.coupling.pattern.row)[:, None, None] + steps[:, None]
-        columns = (UNIT_DOF * self.coupling.pattern.column_of_block())[:, None, None] + steps[None, :]
+        rows = (UNIT_DOF * self.structure.pattern.row)[:, None, None] + steps[:, None]
+        columns = (UNIT_DOF * self.structure.pattern.column_of_block())[:, None, None] + steps[None, :]
         result[rows, columns] = self.units
         result[columns, rows] = self.units
         result[split:, :split] = self._border_rows()
@@ -131,7 +131,7 @@ class Reduced:
 
     def matrix_diagonal(self) -> Floats:
         """The diagonal (n,) of the matrix."""
-        units = np.diagonal(self.units[self.coupling.pattern.first[:-1]], axis1=1, axis2=2)
+        units = np.diagonal(self.units[self.structure.pattern.first[:-1]], axis1=1, axis2=2)
         return np.concatenate([units.ravel(), np.diagonal(self.cameras)])
 
     def step(self, damping: float) -> Floats | None:
@@ -155,10 +155,10 @@ class Reduced:
         layout = self.layout
         split = UNIT_DOF * layout.num_units
         units = self.units.copy()
-        on = self.coupling.pattern.first[:-1]
+        on = self.structure.pattern.first[:-1]
         axis = np.arange(UNIT_DOF)
         units[on[:, None], axis, axis] += damped[:split].reshape(-1, UNIT_DOF)
-        factor = BlockFactor.of(self.coupling.elimination, units)
+        factor = BlockFactor.from_blocks(self.structure.elimination, units)
         if factor is None:
             return None
         free = np.setdiff1d(np.arange(CAMERA_DOF * layout.num_cameras), layout.held() - split)
@@ -187,10 +187,10 @@ class Eliminated:
         """A^-1 (6 units,) of a right-hand side."""
         return self.factor.solve(right)
 
-    def smallest_pivot(self, reduced: Reduced, replaced: Bools) -> float:
+    def smallest_pivot(self, system: ReducedCameraSystem, replaced: Bools) -> float:
         """The smallest pivot relative to the diagonal that it came from, where that was not `replaced` (n,)."""
-        split = UNIT_DOF * reduced.layout.num_units
-        diagonal = reduced.matrix_diagonal()
+        split = UNIT_DOF * system.layout.num_units
+        diagonal = system.matrix_diagonal()
         pivots = self.factor.pivots().ravel() / np.where(replaced, 1.0, diagonal)[:split]
         smallest = float(pivots.min(initial=np.inf))
         if self.cameras is not None:

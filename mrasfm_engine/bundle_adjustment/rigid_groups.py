@@ -22,14 +22,14 @@ import numpy as np
 import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
-from mrasfm_engine.bundle_adjustment.reduced_camera_system import TINY, Reduced
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import TINY, ReducedCameraSystem
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnitSets:
+class RigidGroups:
     """Which units move together. Every free unit belongs to a set; a set's units are all free."""
 
     of_unit: Ints  # (u,) -1 for fixed units
@@ -58,13 +58,13 @@ class UnitSets:
         maps[:, 3:, :3] = -se3.skew(arm)
         return of, maps
 
-    def condense(self, reduced: Reduced, state: State) -> tuple[Floats, Floats, Floats]:
+    def condense(self, system: ReducedCameraSystem, state: State) -> tuple[Floats, Floats, Floats]:
         """Matrix (6 s, 6 s), gradient (6 s,) and undamped diagonal (6 s,) over the sets."""
-        layout = reduced.layout
+        layout = system.layout
         of, maps = self.unit_from_set_steps(state, layout)
-        pattern = reduced.coupling.pattern
+        pattern = system.structure.pattern
         row, column = pattern.row, pattern.column_of_block()
-        blocks = np.swapaxes(maps[row], 1, 2) @ reduced.units @ maps[column]
+        blocks = np.swapaxes(maps[row], 1, 2) @ system.units @ maps[column]
         square = np.zeros((self.count, self.count, UNIT_DOF, UNIT_DOF))
         np.add.at(square, (of[row], of[column]), blocks)
         # Of two different units only one block is stored.
@@ -72,21 +72,21 @@ class UnitSets:
         np.add.at(square, (of[column[off]], of[row[off]]), np.swapaxes(blocks[off], 1, 2))
         gradient, diagonal = np.zeros((self.count, UNIT_DOF)), np.zeros((self.count, UNIT_DOF))
         split = UNIT_DOF * layout.num_units
-        by_unit = reduced.gradient[:split].reshape(-1, UNIT_DOF)
+        by_unit = system.gradient[:split].reshape(-1, UNIT_DOF)
         np.add.at(gradient, of, np.einsum("nji,nj->ni", maps, by_unit))
-        np.add.at(diagonal, of, np.einsum("nji,nj->ni", maps**2, reduced.diagonal[:split].reshape(-1, UNIT_DOF)))
+        np.add.at(diagonal, of, np.einsum("nji,nj->ni", maps**2, system.diagonal[:split].reshape(-1, UNIT_DOF)))
         matrix = np.swapaxes(square, 1, 2).reshape(self.size, self.size)
         return matrix, gradient.ravel(), diagonal.ravel()
 
-    def step(self, reduced: Reduced, state: State, damping: float) -> Floats | None:
+    def step(self, system: ReducedCameraSystem, state: State, damping: float) -> Floats | None:
         """The damped step of the sets, as steps (6 units,) of the units; None where not positive definite."""
-        matrix, gradient, diagonal = self.condense(reduced, state)
+        matrix, gradient, diagonal = self.condense(system, state)
         matrix[np.diag_indices(self.size)] += damping * np.maximum(diagonal, TINY)
         try:
             step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, lower=True), gradient)
         except (np.linalg.LinAlgError, ValueError):
             return None
-        of, maps = self.unit_from_set_steps(state, reduced.layout)
+        of, maps = self.unit_from_set_steps(state, system.layout)
         result: Floats = np.einsum("nij,nj->ni", maps, step.reshape(-1, UNIT_DOF)[of]).ravel()
         return result if np.isfinite(result).all() else None
 
@@ -104,12 +104,12 @@ class UnitSets:
         position[units] = np.einsum("nij,nj->ni", turn, arm) + pivot + shift
         return replace(state, unit_rotation=rotation, unit_position_m=position, points_m=points_m)
 
-    def covariances(self, reduced: Reduced, state: State) -> Floats:
+    def covariances(self, system: ReducedCameraSystem, state: State) -> Floats:
         """Marginal covariances (sets, 6, 6) of the sets' steps [omega, v] from an undamped system.
 
         Infinite where the system determines nothing.
         """
-        matrix, _, _ = self.condense(reduced, state)
+        matrix, _, _ = self.condense(system, state)
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), TINY))
         try:
             factor = scipy.linalg.cho_factor(matrix * scale[:, None] * scale, lower=True)

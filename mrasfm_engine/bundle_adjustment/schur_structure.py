@@ -14,14 +14,14 @@ import numpy as np
 from numba import njit
 
 from mrasfm_engine.bundle_adjustment.block_cholesky import BlockPattern, Elimination
-from mrasfm_engine.bundle_adjustment.problem import Layout, Observations, ShotMotion
+from mrasfm_engine.bundle_adjustment.problem import Layout, Observations, RowBandMotion
 from mrasfm_engine.types import Ints
 
 MAX_BLOCKS = 128  # free units and cameras one point may couple; more observations of it still count for themselves
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coupling:
+class SchurStructure:
     """Groups of points that couple the same blocks, and where these couplings are in the reduced system."""
 
     points: Ints  # (p,) group by group
@@ -34,17 +34,17 @@ class Coupling:
     image: Ints  # (n,) of each observation, among those that were observed
     image_unit: Ints  # (images,)
     image_camera: Ints  # (images,)
-    image_shot: Ints  # (images,) 0 where there are no shots
+    image_band: Ints  # (images,) 0 where there are no row bands
     pattern: BlockPattern  # of the units
     elimination: Elimination
 
     @staticmethod
-    def of(observations: Observations, layout: Layout, motion: ShotMotion | None) -> Coupling:
+    def from_observations(observations: Observations, layout: Layout, motion: RowBandMotion | None) -> SchurStructure:
         """The coupling of a problem's free units and cameras by its points."""
         o = observations
         support, weight = (None, None) if motion is None else (motion.support, motion.weight)
         blocks, first_block, signature = _blocks_of_points(
-            o.unit, o.shot, o.camera, o.first_of_point, o.fixed, support, weight,
+            o.unit, o.band, o.camera, o.first_of_point, o.fixed, support, weight,
             layout.unit_slot, layout.camera_slot, layout.num_units,
         )  # fmt: skip
         leading = np.full(o.num_points, layout.num_units + layout.num_cameras)
@@ -55,12 +55,12 @@ class Coupling:
         blocks, first_block = _blocks_of_groups(points, first_point, blocks, first_block)
         first, row, places, first_place = _pattern(layout.num_units, blocks, first_block)
         pattern = BlockPattern(first=first, row=row)
-        image, image_unit, image_camera, image_shot = _images(o, layout)
-        return Coupling(
+        image, image_unit, image_camera, image_band = _images(o, layout)
+        return SchurStructure(
             image=image,
             image_unit=image_unit,
             image_camera=image_camera,
-            image_shot=image_shot,
+            image_band=image_band,
             points=points,
             first_point=first_point,
             observations_before=np.concatenate([[0], np.cumsum(np.diff(o.first_of_point)[points])]),
@@ -69,7 +69,7 @@ class Coupling:
             places=places,
             first_place=first_place,
             pattern=pattern,
-            elimination=Elimination.of(pattern),
+            elimination=Elimination.from_pattern(pattern),
         )
 
     @property
@@ -88,15 +88,15 @@ class Coupling:
 
 
 def _images(o: Observations, layout: Layout) -> tuple[Ints, Ints, Ints, Ints]:
-    """Images (or shots) that are observed, numbered: of each observation, and their units, cameras and shots."""
-    name = o.unit * len(layout.camera_slot) + o.camera if o.shot is None else o.shot
+    """Observed images (or row bands), numbered: of each observation, and their units, cameras and row bands."""
+    name = o.unit * len(layout.camera_slot) + o.camera if o.band is None else o.band
     row = np.full(int(name.max(initial=-1)) + 1, -1, dtype=np.int64)
     row[name] = np.arange(len(name))  # an observation of each
     row = row[row >= 0]
     number = np.zeros(int(name.max(initial=-1)) + 1, dtype=np.int64)
     number[name[row]] = np.arange(len(row))
-    shot = np.zeros(len(row), dtype=np.int64) if o.shot is None else o.shot[row]
-    return number[name], o.unit[row], o.camera[row], shot
+    band = np.zeros(len(row), dtype=np.int64) if o.band is None else o.band[row]
+    return number[name], o.unit[row], o.camera[row], band
 
 
 @njit(cache=True, inline="always")
@@ -115,7 +115,7 @@ def _insert(out: Any, begin: int, end: int, block: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _blocks_of_points(
-    obs_unit: Any, obs_shot: Any, obs_camera: Any, first: Any, fixed: Any, support: Any, weight: Any, unit_slot: Any,
+    obs_unit: Any, obs_band: Any, obs_camera: Any, first: Any, fixed: Any, support: Any, weight: Any, unit_slot: Any,
     camera_slot: Any, num_units: int,
 ) -> Any:  # fmt: skip
     """Blocks of every point, ascending, where each point's begin, and a hash (p,) of them; a fixed point has none."""
@@ -136,10 +136,10 @@ def _blocks_of_points(
                 if unit_slot[obs_unit[n]] >= 0:
                     end = _insert(out, begin, end, unit_slot[obs_unit[n]])
             else:
-                shot = obs_shot[n]
+                band = obs_band[n]
                 for a in range(3):
-                    if weight[shot, a] != 0.0 and unit_slot[support[shot, a]] >= 0:
-                        end = _insert(out, begin, end, unit_slot[support[shot, a]])
+                    if weight[band, a] != 0.0 and unit_slot[support[band, a]] >= 0:
+                        end = _insert(out, begin, end, unit_slot[support[band, a]])
         starts[p + 1] = end
         code = np.uint64(14695981039346656037)
         for i in range(begin, end):

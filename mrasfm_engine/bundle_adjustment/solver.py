@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.bundle_adjustment.kernels import IMAGE_SUMS, accumulate, add_images, squared_errors, substitute
-from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, settle
+from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, refine_points
 from mrasfm_engine.bundle_adjustment.priors import Term
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion, retract
-from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, Reduced
-from mrasfm_engine.bundle_adjustment.rigid_groups import UnitSets
-from mrasfm_engine.bundle_adjustment.schur_structure import Coupling
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, RowBandMotion, retract
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
+from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
+from mrasfm_engine.bundle_adjustment.schur_structure import SchurStructure
 from mrasfm_engine.parallel import in_parts, in_ranges
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
-SETTLING = 2  # steps of points whose poses have moved
+POINT_STEPS = 2  # steps of points whose poses have moved
 MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says little about where the minimum is
 
 
@@ -74,8 +74,8 @@ class Problem:
     layout: Layout
     terms: Sequence[Term] = ()
     options: SolverOptions = field(default_factory=SolverOptions)
-    motion: ShotMotion | None = None  # needed where the state has shots
-    sets: UnitSets | None = None  # free units that move as one; then calibration is fixed
+    motion: RowBandMotion | None = None  # needed where the state has row bands
+    sets: RigidGroups | None = None  # free units that move as one; then calibration is fixed
 
     def errors_px2(self, state: State) -> Floats:
         """Squared reprojection errors (n,) of all observations."""
@@ -85,7 +85,7 @@ class Problem:
             self.options.threads,
             len(out),
             lambda lo, hi, _: squared_errors(
-                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.point, o.xy_px, lo, hi, out
+                *_arrays(state, self.camera_kind), o.unit, o.band, o.camera, o.point, o.xy_px, lo, hi, out
             ),
         )
         return out
@@ -97,7 +97,7 @@ class Problem:
         """The state after a step of the reduced vector, with new points."""
         move = retract if self.sets is None else self.sets.retract
         after = move(state, self.layout, step, points_m)
-        return after if self.motion is None else self.motion.follow(after)
+        return after if self.motion is None else self.motion.place_bands(after)
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares."""
@@ -114,7 +114,7 @@ class Problem:
             self.options.threads,
             len(out),
             lambda lo, hi, _: point_costs(
-                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), o.unit, o.band, o.camera, o.xy_px, o.first_of_point,
                 (self.options.loss_scale * self.options.sigma_px) ** 2, lo, hi, out,
             ),
         )  # fmt: skip
@@ -134,43 +134,45 @@ class Problem:
                 point=number[o.point[rows]],
                 xy_px=o.xy_px[rows],
                 num_points=int(chosen.sum()),
-                shot=None if o.shot is None else o.shot[rows],
+                band=None if o.band is None else o.band[rows],
                 fixed=None if o.fixed is None else o.fixed[chosen],
             ),
         )
 
-    def with_points_settled(self, state: State) -> State:
+    def with_points_refined(self, state: State) -> State:
         """The state with every point moved to where poses and calibration want it; only those that gain move."""
         result = replace(state, points_m=state.points_m.copy())
-        self.settle(result, state, np.full(len(state.points_m), np.inf), steps=SETTLING)
+        self.refine_points(result, state, np.full(len(state.points_m), np.inf), steps=POINT_STEPS)
         return result
 
-    def settle(self, state: State, before: State, costs_before: Floats, *, steps: int = 1) -> tuple[Floats, float]:
+    def refine_points(
+        self, state: State, before: State, costs_before: Floats, *, steps: int = 1
+    ) -> tuple[Floats, float]:
         """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
         o, options, costs = self.observations, self.options, np.empty(self.observations.num_points)
         in_ranges(
             options.threads,
             len(costs),
-            lambda lo, hi, _: settle(
-                *_arrays(state, self.camera_kind), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point, o.fixed,
+            lambda lo, hi, _: refine_points(
+                *_arrays(state, self.camera_kind), o.unit, o.band, o.camera, o.xy_px, o.first_of_point, o.fixed,
                 options.sigma_px, options.loss_scale**2, before.points_m, costs_before, steps, lo, hi, costs,
             ),
         )  # fmt: skip
         return costs, self._sum(state, costs)
 
     @cached_property
-    def coupling(self) -> Coupling:
+    def structure(self) -> SchurStructure:
         """Which blocks the points couple; the same for every state."""
-        return Coupling.of(self.observations, self.layout, self.motion)
+        return SchurStructure.from_observations(self.observations, self.layout, self.motion)
 
-    def normal_equations(self, state: State, damping: float) -> Reduced:
+    def normal_equations(self, state: State, damping: float) -> ReducedCameraSystem:
         """The reduced system at a state."""
-        o, layout, options, coupling = self.observations, self.layout, self.options, self.coupling
+        o, layout, options, structure = self.observations, self.layout, self.options, self.structure
         units, cameras, p = layout.num_units, layout.num_cameras, o.num_points
         parts = min(options.threads, max(1, p // 256))
-        images = np.zeros((parts, len(coupling.image_unit), IMAGE_SUMS))
+        images = np.zeros((parts, len(structure.image_unit), IMAGE_SUMS))
         blocks = (
-            np.zeros((parts, len(coupling.pattern.row), UNIT_DOF * UNIT_DOF)),
+            np.zeros((parts, len(structure.pattern.row), UNIT_DOF * UNIT_DOF)),
             np.zeros((parts, cameras, units, CAMERA_DOF * UNIT_DOF)),
             np.zeros((parts, cameras, cameras, CAMERA_DOF * CAMERA_DOF)),
         )
@@ -178,10 +180,10 @@ class Problem:
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
         slots = layout.unit_slot, layout.camera_slot, units
         in_parts(
-            coupling.shares(parts),
+            structure.shares(parts),
             lambda lo, hi, t: accumulate(
-                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, coupling.image, o.xy_px,
-                o.first_of_point, o.fixed, *slots, *coupling.arrays,
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.band, o.camera, structure.image, o.xy_px,
+                o.first_of_point, o.fixed, *slots, *structure.arrays,
                 options.sigma_px, options.loss_scale**2, damping, lo, hi,
                 images[t], *(part[t] for part in blocks), gradient[t], v_inverse, v_gradient,
             ),
@@ -189,25 +191,25 @@ class Problem:
         sums = tuple(part[0] if parts == 1 else part.sum(0) for part in (*blocks, np.zeros_like(gradient), gradient))
         add_images(
             *_arrays(state, self.camera_kind)[:4], state.camera_position_m, *self._motion(),
-            coupling.image_unit, coupling.image_camera, coupling.image_shot, *slots,
-            coupling.pattern.first, coupling.pattern.row,
+            structure.image_unit, structure.image_camera, structure.image_band, *slots,
+            structure.pattern.first, structure.pattern.row,
             images.sum(0), *sums,
         )  # fmt: skip
         extra = Extra.none(layout)
         for term in self.terms:
             term.add_to(state, layout, extra)
-        return Reduced.of(layout, coupling, sums, (v_inverse, v_gradient), extra)
+        return ReducedCameraSystem.from_sums(layout, structure, sums, (v_inverse, v_gradient), extra)
 
-    def step(self, state: State, reduced: Reduced, damping: float) -> Floats | None:
+    def step(self, state: State, system: ReducedCameraSystem, damping: float) -> Floats | None:
         """The damped step (n,) of the reduced vector; None where there is none."""
-        return reduced.step(damping) if self.sets is None else self.sets.step(reduced, state, damping)
+        return system.step(damping) if self.sets is None else self.sets.step(system, state, damping)
 
     @property
     def unknowns(self) -> int:
         """How many unknowns the reduced vector really has."""
         return self.layout.size - len(self.layout.held()) if self.sets is None else self.sets.size
 
-    def points_after(self, state: State, reduced: Reduced, step: Floats) -> Floats:
+    def points_after(self, state: State, system: ReducedCameraSystem, step: Floats) -> Floats:
         """Points (p, 3) that go with a step of the reduced vector."""
         o, layout, options = self.observations, self.layout, self.options
         out = np.empty_like(state.points_m)
@@ -215,9 +217,9 @@ class Problem:
             options.threads,
             o.num_points,
             lambda lo, hi, _: substitute(
-                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.shot, o.camera, o.xy_px, o.first_of_point,
+                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.band, o.camera, o.xy_px, o.first_of_point,
                 layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
-                step, reduced.v_inverse, reduced.v_gradient, lo, hi, out,
+                step, system.v_inverse, system.v_gradient, lo, hi, out,
             ),
         )  # fmt: skip
         return out
@@ -227,8 +229,8 @@ def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic] | None, ...]:
     return (
         state.unit_rotation,
         state.unit_position_m,
-        None if state.simultaneous else state.shot_rotation,
-        None if state.simultaneous else state.shot_position_m,
+        None if state.simultaneous else state.band_rotation,
+        None if state.simultaneous else state.band_position_m,
         state.camera_rotation,
         state.camera_position_m,
         kind,
@@ -279,11 +281,11 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         if cancel is not None and cancel():
             break
         iterations += 1
-        reduced = problem.normal_equations(state, damping)
-        step = problem.step(state, reduced, damping)
+        system = problem.normal_equations(state, damping)
+        step = problem.step(state, system, damping)
         if step is not None:
-            trial = problem.retract(state, step, problem.points_after(state, reduced, step))
-            trial_costs, trial_cost = problem.settle(trial, state, costs)
+            trial = problem.retract(state, step, problem.points_after(state, system, step))
+            trial_costs, trial_cost = problem.refine_points(trial, state, costs)
         if step is None or not trial_cost < cost:
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
@@ -291,7 +293,7 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        decrement = -float(step @ reduced.gradient)
+        decrement = -float(step @ system.gradient)
         if cost - trial_cost <= options.function_tolerance * cost or (
             # A step that damping holds back is short wherever the minimum is.
             free and damping <= MAX_DAMPING_OF_DECREMENT and decrement <= options.decrement_tolerance

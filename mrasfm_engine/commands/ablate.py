@@ -131,8 +131,8 @@ def _print_table(rows: Sequence[Row], source: str) -> None:
             console.print(f"{row.title}: {row.remark}", soft_wrap=True)
 
 
-def _error(of: Callable[[PoseErrors], float]) -> Callable[[Row], str]:
-    return lambda row: "-" if row.errors is None else _number(of(row.errors), 4)
+def _error(measure: Callable[[PoseErrors], float]) -> Callable[[Row], str]:
+    return lambda row: "-" if row.errors is None else _number(measure(row.errors), 4)
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -42,7 +42,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--scenes", metavar="LIST", help="names of scenes, separated by commas (default: all)")
     parser.add_argument("--frames", metavar="START:STOP:STEP", help="slice of the frames of every sequence or scene")
     parser.add_argument(
-        "--peers",
+        "--baselines",
         default="",
         metavar="LIST",
         help="baseline mappers, separated by commas: colmap-incremental, colmap-global, and both with -fixed, which "
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure, and print tables or JSON."""
     _require_one_kind(arguments)
     config = read_config(arguments.config, **({"use_gnss": False} if arguments.no_gnss else {}))
-    from mrasfm_engine.benchmark.side_by_side import Settings, peers_named
+    from mrasfm_engine.benchmark.side_by_side import Settings, baselines_named
     from mrasfm_engine.commands import bench_output
     from mrasfm_engine.commands.reconstruct import cancel_on_interrupt
     from mrasfm_engine.commands.stage_progress import stage_progress
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         with cancel_on_interrupt(console) as cancelled, stage_progress(console) as bars:
             settings = Settings(
                 config=config,
-                peers=peers_named(arguments.peers),
+                baselines=baselines_named(arguments.baselines),
                 repeat=arguments.repeat,
                 timeout_s=arguments.timeout_s,
                 progress=lambda row, stage, done, total: bars(f"{row}: {stage}", done, total),

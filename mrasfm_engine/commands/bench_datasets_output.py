@@ -10,7 +10,7 @@ from rich.table import Table
 
 from mrasfm_engine.benchmark.datasets import SceneResult, planar_rmse_m
 from mrasfm_engine.benchmark.published import KITTI, METHODS, NUSCENES_RMSE_M
-from mrasfm_engine.benchmark.side_by_side import OURS, PEERS, Row
+from mrasfm_engine.benchmark.side_by_side import BASELINES, OURS, Row
 from mrasfm_engine.commands.bench_output import Document, comparison_document, megabytes, number
 
 
@@ -70,7 +70,7 @@ class NuScenesOutput:
         scenes = []
         for result in self.results:
             document = _scene(result)
-            for row, of in zip(document.get("mappers", []), _rows(result), strict=True):
+            for row, of in zip(document.get("mappers", []), _rows_of(result), strict=True):
                 row["planar_rmse_m"] = _planar(result, of)
             scenes.append(document)
         return {"scenes": scenes, "published_rmse_m": dict(NUSCENES_RMSE_M)}
@@ -121,16 +121,16 @@ def _scene(result: SceneResult) -> Document:
     return {"name": result.name, **comparison_document(result.comparison)}
 
 
-def _rows(result: SceneResult) -> list[Row]:
+def _rows_of(result: SceneResult) -> list[Row]:
     return [] if result.comparison is None else result.comparison.rows
 
 
 def _by_mapper(result: SceneResult) -> dict[str, Row]:
-    return {row.mapper: row for row in _rows(result)}
+    return {row.mapper: row for row in _rows_of(result)}
 
 
 def _mappers(results: Sequence[SceneResult]) -> list[str]:
-    return [name for name in (OURS, *PEERS) if name == OURS or any(name in _by_mapper(r) for r in results)]
+    return [name for name in (OURS, *BASELINES) if name == OURS or any(name in _by_mapper(r) for r in results)]
 
 
 def _planar(result: SceneResult, row: Row) -> float | None:
@@ -168,6 +168,6 @@ def _print_failures(console: Console, results: Sequence[SceneResult]) -> None:
     for result in results:
         if result.failure:
             console.print(f"{result.name}: {result.failure}", soft_wrap=True)
-        for row in _rows(result):
+        for row in _rows_of(result):
             if row.failure:
                 console.print(f"{result.name}, {row.mapper}: {row.failure}", soft_wrap=True)

@@ -113,12 +113,14 @@ def _row(row: Row) -> Document:
     return document | {"whole_s": row.whole_s, "errors": None if row.errors is None else asdict(row.errors)}
 
 
-def _print_rows(console: Console, measures: Mapping[str, Callable[[Row], str]], rows: Sequence[Row], of: int) -> None:
+def _print_rows(
+    console: Console, measures: Mapping[str, Callable[[Row], str]], rows: Sequence[Row], images: int
+) -> None:
     table = Table()
     table.add_column("")
     for row in rows:
         table.add_column(row.mapper, justify="right")
-    table.add_row("images registered", *(f"{row.registered_images} of {of}" for row in rows))
+    table.add_row("images registered", *(f"{row.registered_images} of {images}" for row in rows))
     for measure, value in measures.items():
         table.add_row(measure, *(value(row) for row in rows))
     console.print(table)
@@ -145,8 +147,8 @@ def megabytes(value: int | None) -> str:
     return number(None if value is None else value / MEGABYTE, 0)
 
 
-def _error(of: Callable[[TrajectoryErrors], float], digits: int) -> Callable[[Row], str]:
-    return lambda row: "-" if row.errors is None else number(of(row.errors), digits)
+def _error(measure: Callable[[TrajectoryErrors], float], digits: int) -> Callable[[Row], str]:
+    return lambda row: "-" if row.errors is None else number(measure(row.errors), digits)
 
 
 def _count(value: int | None) -> str:

@@ -88,8 +88,8 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--declare-sigmas", action="store_true", help="the manifest declares the sigmas of the calibration"
     )
     parser.add_argument("--tight", action="store_true", help="the manifest declares 0.01 degrees and 1 mm")
-    parser.add_argument("--wrong-camera", metavar="NAME", help="camera whose given rotation is wrong")
-    add("--wrong-by-deg", float, "error of that rotation, degrees")
+    parser.add_argument("--miscalibrated-camera", metavar="NAME", help="camera whose given rotation is wrong")
+    add("--miscalibrated-by-deg", float, "error of that rotation, degrees")
     parser.set_defaults(run=run)
 
 

@@ -24,7 +24,7 @@ END_S = 10.0  # that a process may take to end after its result is there
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ran(Generic[Result]):
+class ProcessResult(Generic[Result]):
     """What a process left behind.
 
     Attributes
@@ -42,13 +42,13 @@ class Ran(Generic[Result]):
     peak_memory_bytes: int | None = None
 
 
-def run_apart(
+def run_in_subprocess(
     work: Callable[..., Result],
     *arguments: Any,
     timeout_s: float = math.inf,
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
-) -> Ran[Result]:
+) -> ProcessResult[Result]:
     """Run `work(progress, *arguments)` in a fresh process; function, arguments and result (not None) must be picklable.
 
     An `MrasfmError` of the work is raised here. Whatever else ends it, a crash or the kernel when memory runs out, is
@@ -71,14 +71,16 @@ def run_apart(
                 raise CancelledError
             if time.monotonic() >= until:
                 peak = peak_memory_bytes(process.pid)
-                return Ran(result=None, failure=f"not finished within {timeout_s:g} s", peak_memory_bytes=peak)
+                return ProcessResult(
+                    result=None, failure=f"not finished within {timeout_s:g} s", peak_memory_bytes=peak
+                )
             if not receiver.poll(ASK_EVERY_S):
                 continue
             try:
                 kind, *content = receiver.recv()
             except EOFError:
                 process.join()
-                return Ran(result=None, failure=_ending(process))
+                return ProcessResult(result=None, failure=_exit_description(process))
             if kind == "progress":
                 progress(*content)
             elif kind == "refused":
@@ -86,7 +88,7 @@ def run_apart(
                 raise error(what, remedy=remedy, code=code)
             else:
                 process.join(END_S)
-                return Ran(result=content[0], peak_memory_bytes=content[1])
+                return ProcessResult(result=content[0], peak_memory_bytes=content[1])
     finally:
         if process.is_alive():
             process.kill()
@@ -104,7 +106,7 @@ def _work(sender: Connection, work: Callable[..., Any], arguments: tuple[Any, ..
         sender.send(("done", result, peak_memory_bytes()))
 
 
-def _ending(process: BaseProcess) -> str:
+def _exit_description(process: BaseProcess) -> str:
     code = process.exitcode
     if code is None or code >= 0:
         return f"ended with exit code {code}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
-from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, Scene
+from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibration, Scene
 from mrasfm_engine.types import Floats
 from schemas import CAMERA_MODELS, Camera, Pose
 
@@ -25,39 +25,41 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
     always among the others.
     """
     cameras = zip(scene.drive.cameras, scene.calibration, strict=True)
-    verdict = scene.calibration_verdict
+    observability = scene.calibration_observability
     return {
         "version": 1,
         **(
-            {} if verdict is None else {"adjusted": verdict.adjusted, "why": verdict.reason, "common": _common(verdict)}
+            {}
+            if observability is None
+            else {"adjusted": observability.adjusted, "why": observability.reason, "common": _common(observability)}
         ),
         "axes": "rotation_vector_deg, translation_m, sigmas and observed are about and along the rig's x, y, z",
         "cameras": {camera.name: _camera(camera, refined) for camera, refined in cameras},
     }
 
 
-def _common(verdict: CalibrationVerdict) -> dict[str, Any]:
+def _common(observability: CalibrationObservability) -> dict[str, Any]:
     """Motions of all cameras together: images show none of them, and only positions can tell the scale."""
-    scale: dict[str, Any] = {"observed": verdict.scale_observed}
-    if np.isfinite(verdict.sigma_scale):
-        scale["sigma_relative"] = verdict.sigma_scale
+    scale: dict[str, Any] = {"observed": observability.scale_observed}
+    if np.isfinite(observability.sigma_scale):
+        scale["sigma_relative"] = observability.sigma_scale
     return {
         "rotation": {"observed": [False] * 3, "verdict": ["held"] * 3},
         "translation": {"observed": [False] * 3, "verdict": ["held"] * 3},
-        "scale": scale | {"verdict": verdict.scale_rests_on},
+        "scale": scale | {"verdict": observability.scale_rests_on},
     }
 
 
-def settled_document(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
+def document_in_map(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
     """A scene's `calibration.json` after its cameras have settled in a map: `refined` and `difference` are the map's.
 
     `since_scene` is by how much that is another pose than the scene found, and absent where nothing moved; everything
     else is as the scene found it.
     """
-    return {**document, "cameras": {k: _settled(c, rig_from_cam[k]) for k, c in document["cameras"].items()}}
+    return {**document, "cameras": {k: _camera_in_map(c, rig_from_cam[k]) for k, c in document["cameras"].items()}}
 
 
-def _settled(camera: Mapping[str, Any], rig_from_cam: Floats) -> dict[str, Any]:
+def _camera_in_map(camera: Mapping[str, Any], rig_from_cam: Floats) -> dict[str, Any]:
     given, found = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("given", "refined"))
     if np.array_equal(found, rig_from_cam):
         return dict(camera)

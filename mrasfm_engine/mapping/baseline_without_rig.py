@@ -9,54 +9,56 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.per_camera_pnp import Vote, agree
-from mrasfm_engine.mapping.unit_registration import Registration, camera_votes, failed, points_seen
+from mrasfm_engine.mapping.unit_registration import Registration, camera_votes, correspondences_of_unit, failed
 from mrasfm_engine.types import Floats
 
 
-def register_images_singly(model: Model, unit: int) -> Registration:
+def register_images_singly(mapper: Mapper, unit: int) -> Registration:
     """Find the pose of a unit from that of its best image, and the poses of its other images."""
-    seen = points_seen(model, unit)
-    votes = camera_votes(model, seen)
+    matched = correspondences_of_unit(mapper, unit)
+    votes = camera_votes(mapper, matched)
     if not votes:
-        return failed(unit, seen, 0, "no image of it could be registered alone")
+        return failed(unit, matched, 0, "no image of it could be registered alone")
     best = max(votes, key=lambda vote: vote.inliers)
     own = _own_poses(votes, best.world_from_rig)
     voters = {vote.camera for vote in votes}
     return Registration(
         unit=unit,
         world_from_rig=best.world_from_rig,
-        correspondences=len(seen.camera),
+        correspondences=len(matched.camera),
         inliers=sum(vote.inliers for vote in votes),
         method="single images",
-        voted_out=tuple(model.drive.cameras[c].name for c in own),
+        voted_out=tuple(mapper.drive.cameras[c].name for c in own),
         own_poses=own,
-        missing=tuple(int(c) for i, c in _images_of(model, unit) if c not in voters),
+        missing=tuple(int(c) for i, c in _images_of(mapper, unit) if c not in voters),
     )
 
 
-def take_over(model: Model, registration: Registration) -> None:
+def take_over(mapper: Mapper, registered_unit: Registration) -> None:
     """Give the images of a registered unit the poses that are not the unit's."""
-    for image, camera in _images_of(model, registration.unit):
-        if camera in registration.own_poses:
-            model.set_image_pose(image, registration.own_poses[camera])
-        if camera in registration.missing:
-            model.missing[image] = True
+    for image, camera in _images_of(mapper, registered_unit.unit):
+        if camera in registered_unit.own_poses:
+            mapper.set_image_pose(image, registered_unit.own_poses[camera])
+        if camera in registered_unit.missing:
+            mapper.missing[image] = True
 
 
-def retry_missing(model: Model) -> None:
+def retry_missing(mapper: Mapper) -> None:
     """Try images that are missing once more, now that the scene has more points."""
-    for unit in np.unique(model.image_unit[model.missing]):
-        images = {camera: image for image, camera in _images_of(model, int(unit)) if model.missing[image]}
-        votes = [vote for vote in camera_votes(model, points_seen(model, int(unit))) if vote.camera in images]
-        own = _own_poses(votes, model.state.world_from_rig[unit])
+    for unit in np.unique(mapper.image_unit[mapper.missing]):
+        images = {camera: image for image, camera in _images_of(mapper, int(unit)) if mapper.missing[image]}
+        votes = [
+            vote for vote in camera_votes(mapper, correspondences_of_unit(mapper, int(unit))) if vote.camera in images
+        ]
+        own = _own_poses(votes, mapper.state.world_from_rig[unit])
         for vote in votes:
-            model.missing[images[vote.camera]] = False
+            mapper.missing[images[vote.camera]] = False
             if vote.camera in own:
-                model.set_image_pose(images[vote.camera], own[vote.camera])
+                mapper.set_image_pose(images[vote.camera], own[vote.camera])
         if votes:
-            model.extend(int(unit))
+            mapper.extend(int(unit))
 
 
 def _own_poses(votes: list[Vote], world_from_rig: Floats) -> dict[int, Floats]:
@@ -69,6 +71,6 @@ def _own_poses(votes: list[Vote], world_from_rig: Floats) -> dict[int, Floats]:
     return {vote.camera: relative[k] for k, vote in enumerate(votes) if not same[k]}
 
 
-def _images_of(model: Model, unit: int) -> list[tuple[int, int]]:
+def _images_of(mapper: Mapper, unit: int) -> list[tuple[int, int]]:
     """Images of a unit and their cameras."""
-    return [(int(i), int(model.image_camera[i])) for i in np.flatnonzero(model.image_unit == unit)]
+    return [(int(i), int(mapper.image_camera[i])) for i in np.flatnonzero(mapper.image_unit == unit)]

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
 
 MIN_BASELINES_M2 = 1e-6
@@ -19,13 +19,13 @@ SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
 MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 
 
-def calibration_prior(model: Model, held: Bools | None = None) -> CalibrationPrior:
+def calibration_prior(mapper: Mapper, held: Bools | None = None) -> CalibrationPrior:
     """The prior of `rig_from_cam` from the manifest's sigmas, or the default ones, with weights as of now.
 
     Directions that are `held` (cameras, 6) stay as given.
     """
-    settings, cameras = model.config.adjustment, model.drive.cameras
-    given = model.drive.rig_from_cam
+    settings, cameras = mapper.config.bundle_adjustment, mapper.drive.cameras
+    given = mapper.drive.rig_from_cam
     prior = CalibrationPrior(
         rotation=given[:, :3, :3],
         position_m=given[:, :3, 3],
@@ -33,12 +33,12 @@ def calibration_prior(model: Model, held: Bools | None = None) -> CalibrationPri
         sigma_translation_m=np.array([c.sigma_translation_m or settings.sigma_translation_m for c in cameras]),
         held=held,
     )
-    return prior.with_weights(model.state)
+    return prior.with_weights(mapper.state)
 
 
-def heading_change_deg(model: Model) -> float:
+def heading_change_deg(mapper: Mapper) -> float:
     """By how much the registered units' forward directions spread, degrees."""
-    forward = model.state.unit_rotation[model.registered][:, :, 0]
+    forward = mapper.state.unit_rotation[mapper.registered][:, :, 0]
     mean = forward.mean(0) / max(float(np.linalg.norm(forward.mean(0))), 1e-9)
     angles = np.degrees(np.arccos(np.clip(forward @ mean, -1, 1)))
     return float(2 * angles.max())
@@ -52,8 +52,8 @@ class CalibrationDecision:
     reason: str
 
 
-def judge_calibration(
-    model: Model, *, free_units: Bools, terms: Sequence[Term], georeferenced: bool, options: SolverOptions
+def assess_calibration(
+    mapper: Mapper, *, free_units: Bools, terms: Sequence[Term], georeferenced: bool, options: SolverOptions
 ) -> CalibrationDecision:
     """Whether the drive observes the calibration: freeing what it does not observe makes everything worse.
 
@@ -65,21 +65,21 @@ def judge_calibration(
     free_units, terms, options
         Of the adjustment that would follow; the calibration's own prior is added.
     """
-    settings = model.config.adjustment
+    settings = mapper.config.bundle_adjustment
     if not settings.refine_calibration:
         return CalibrationDecision(False, "held by the settings")
     if not settings.camera_set_adjustment:
         return CalibrationDecision(
             False, "held as given: images that are adjusted on their own have no common calibration"
         )
-    if model.drive.has_single_camera:
+    if mapper.drive.has_single_camera:
         return CalibrationDecision(False, "a single camera has no calibration to others")
-    if not georeferenced and heading_change_deg(model) < settings.min_heading_change_deg:
+    if not georeferenced and heading_change_deg(mapper) < settings.min_heading_change_deg:
         return CalibrationDecision(False, "held as given: without GNSS a drive this straight does not observe it")
-    problem, _ = model.problem(
+    problem, _ = mapper.problem(
         free_units,
-        free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
-        terms=[calibration_prior(model), *terms],
+        free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
+        terms=[calibration_prior(mapper), *terms],
         options=options,
     )
     if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
@@ -93,53 +93,53 @@ def judge_calibration(
     )
 
 
-def scale_of_baselines(model: Model) -> tuple[float, float]:
+def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
     """By which factor the baselines would have to grow to be as given, and its standard deviation by their prior."""
-    prior = calibration_prior(model)
+    prior = calibration_prior(mapper)
     given = prior.position_m - prior.position_m.mean(0)
-    current = model.state.camera_position_m - model.state.camera_position_m.mean(0)
+    current = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
     information = float(((given**2).sum(1) / prior.sigma_translation_m**2).sum())
     if min(float((current**2).sum()), float((given**2).sum())) < MIN_BASELINES_M2:
         return 1.0, np.inf  # cameras in one place have no scale
     return float((given * current).sum() / (current**2).sum()), 1.0 / float(np.sqrt(information))
 
 
-def scale_with_baselines(model: Model, factor: float) -> None:
+def scale_with_baselines(mapper: Mapper, factor: float) -> None:
     """Scale units, points and cameras about their middle: this changes no image, and adjustment hardly notices it.
 
     The cameras' mean place in the rig is kept, as the gauge holds it; the units move instead.
     """
-    state = model.state
-    centre = state.unit_position_m[model.registered].mean(0)
+    state = mapper.state
+    centre = state.unit_position_m[mapper.registered].mean(0)
     mean = state.camera_position_m.mean(0)
-    unit_position_m, camera_position_m = _scaled_places(model, factor)
+    unit_position_m, camera_position_m = _scaled_places(mapper, factor)
     state.points_m[:] = centre + factor * (state.points_m - centre)
-    model.motion.scale(state, factor, mean)
+    mapper.motion.scale(state, factor, mean)
     state.unit_position_m[:] = unit_position_m
     state.camera_position_m[:] = camera_position_m
 
 
-def settle_scale(model: Model, terms: Sequence[Term]) -> None:
+def resolve_scale(mapper: Mapper, terms: Sequence[Term]) -> None:
     """Scale the scene with its baselines to where the terms cost least.
 
     No image changes with that, so priors and positions decide alone. Adjustment comes there slowly if at all: the cost
-    is nearly flat along this direction, and where shots follow the trajectory its derivatives are not exact.
+    is nearly flat along this direction, and where row bands follow the trajectory its derivatives are not exact.
     """
 
     def cost(log_factor: float) -> float:
-        unit_position_m, camera_position_m = _scaled_places(model, float(np.exp(log_factor)))
-        state = replace(model.state, unit_position_m=unit_position_m, camera_position_m=camera_position_m)
+        unit_position_m, camera_position_m = _scaled_places(mapper, float(np.exp(log_factor)))
+        state = replace(mapper.state, unit_position_m=unit_position_m, camera_position_m=camera_position_m)
         return sum(term.cost(state) for term in terms)
 
     found = minimize_scalar(cost, bounds=(-SCALE_RANGE, SCALE_RANGE), method="bounded", options={"xatol": 1e-6})
     if found.fun < cost(0.0):
-        scale_with_baselines(model, float(np.exp(found.x)))
+        scale_with_baselines(mapper, float(np.exp(found.x)))
 
 
-def _scaled_places(model: Model, factor: float) -> tuple[Floats, Floats]:
+def _scaled_places(mapper: Mapper, factor: float) -> tuple[Floats, Floats]:
     """Positions of units (u, 3) in the world and of cameras (c, 3) in the rig, scaled about their middle."""
-    state = model.state
-    centre = state.unit_position_m[model.registered].mean(0)
+    state = mapper.state
+    centre = state.unit_position_m[mapper.registered].mean(0)
     mean = state.camera_position_m.mean(0)
     # Scaled about the rig's origin the cameras' mean would move by this.
     moved = (factor - 1.0) * mean

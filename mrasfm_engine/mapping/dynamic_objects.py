@@ -18,7 +18,7 @@ from numba import njit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.parallel import mapped
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -51,7 +51,7 @@ class MovingAlong:
         return bool(self.covered.any())
 
 
-def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong:
+def find_moving_along(mapper: Mapper, pairs: Sequence[PairMatches]) -> MovingAlong:
     """Keypoints and images that contradict the motion of their units, from matches of one camera at two instants.
 
     Parameters
@@ -61,10 +61,10 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
     pairs
         Verified matches.
     """
-    keypoints, images = model.keypoints, len(model.drive.images)
+    keypoints, images = mapper.keypoints, len(mapper.drive.images)
     along = np.zeros(len(keypoints.image), dtype=np.int64)  # matches for and against
     seen, moves = np.zeros((2, len(keypoints.image)), dtype=np.bool_)
-    for a, b, least_px, moved_px in _flows(model, pairs):
+    for a, b, least_px, moved_px in _flows(mapper, pairs):
         _vote(a, b, least_px, moved_px, along, seen, moves)
     # What stands still may be far away where no ground tells: above the horizon of a straight street. It counts with
     # what moves along only where most of the keypoints that do tell are such.
@@ -78,18 +78,18 @@ def find_moving_along(model: Model, pairs: Sequence[PairMatches]) -> MovingAlong
     return MovingAlong(keypoint=no_world, share=share, covered=covered)
 
 
-def units_to_doubt(model: Model, moving: MovingAlong, known: Bools) -> Ints:
+def units_to_doubt(mapper: Mapper, moving: MovingAlong, known: Bools) -> Ints:
     """Units whose pose has to be found anew, as covered images may have outvoted the others.
 
     Not those from whose covered images most of what moves along had been taken out before: `known` (keypoints,).
     """
-    image, units = model.keypoints.image, len(model.registered)
+    image, units = mapper.keypoints.image, len(mapper.registered)
     missed = np.bincount(image[moving.keypoint & ~known], minlength=len(moving.covered))
     found = np.bincount(image[moving.keypoint & known], minlength=len(moving.covered))
     misled = moving.covered & (missed > found)
-    doubt = model.registered & (np.bincount(model.image_unit[misled], minlength=units) > 0)
+    doubt = mapper.registered & (np.bincount(mapper.image_unit[misled], minlength=units) > 0)
     # A scene of two units is the least to register others against.
-    return np.flatnonzero(doubt) if (model.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(doubt) if (mapper.registered & ~doubt).sum() >= 2 else np.zeros(0, dtype=np.int64)
 
 
 def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools) -> list[PairMatches]:
@@ -106,32 +106,32 @@ def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools)
     return result
 
 
-def _flows(model: Model, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
+def _flows(mapper: Mapper, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
     """Of every pair of one camera's images: keypoints of both, and by how much each must and does move, pixels."""
-    posed = model.registered[model.image_unit] & ~model.missing
-    world_from_cam = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
-    world_from_cam = world_from_cam @ model.state.rig_from_cam[model.image_camera]
+    posed = mapper.registered[mapper.image_unit] & ~mapper.missing
+    world_from_cam = mapper.state.world_from_rig[mapper.image_unit] @ mapper.motion.unit_from_image(mapper.state)
+    world_from_cam = world_from_cam @ mapper.state.rig_from_cam[mapper.image_camera]
 
     def tells(pair: PairMatches) -> bool:
         a, b = pair.image_a, pair.image_b
-        along = model.image_unit[a] != model.image_unit[b] and model.image_camera[a] == model.image_camera[b]
+        along = mapper.image_unit[a] != mapper.image_unit[b] and mapper.image_camera[a] == mapper.image_camera[b]
         return bool(along and posed[a] and posed[b])
 
     def flow(pair: PairMatches) -> tuple[Ints, Ints, Floats, Floats]:
-        keypoints, camera = model.keypoints, int(model.image_camera[pair.image_a])
-        a, b = model.matched_keypoints(pair, int(model.image_unit[pair.image_a]))
+        keypoints, camera = mapper.keypoints, int(mapper.image_camera[pair.image_a])
+        a, b = mapper.matched_keypoints(pair, int(mapper.image_unit[pair.image_a]))
         xy_px = keypoints.xy_px.take(a, axis=0)
         least_px = _least_flow_px(
             keypoints.rays.take(a, axis=0),
             xy_px,
             se3.inverse(world_from_cam[pair.image_b]) @ world_from_cam[pair.image_a],
-            up=model.state.rig_from_cam[camera, 2, :3],
-            kind=int(model.camera_kind[camera]),
-            params=model.state.camera_params[camera],
+            up=mapper.state.rig_from_cam[camera, 2, :3],
+            kind=int(mapper.camera_kind[camera]),
+            params=mapper.state.camera_params[camera],
         )
         return a, b, least_px, np.hypot(*(keypoints.xy_px.take(b, axis=0) - xy_px).T)
 
-    yield from mapped(model.config.threads, flow, [pair for pair in pairs if tells(pair)])
+    yield from mapped(mapper.config.threads, flow, [pair for pair in pairs if tells(pair)])
 
 
 @njit(cache=True, nogil=True)

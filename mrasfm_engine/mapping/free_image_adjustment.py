@@ -1,16 +1,15 @@
 """Bundle adjustment as it is without camera sets: every image is a variable of its own.
 
-With `[adjustment] camera_set_adjustment = false` this takes the place of camera set bundle adjustment: 6 n k unknowns
-for n units of k cameras instead of 6 (n + k). Observations, points, priors, solver and tolerances are the same. An
-image is treated as a unit that has only this image, so that the rig's calibration says where its camera is on a vehicle
-that is its alone; nothing ties the images of a unit together any more.
+With `[bundle_adjustment] camera_set_adjustment = false` this takes the place of camera set bundle adjustment: 6 n k
+unknowns for n units of k cameras instead of 6 (n + k). Observations, points, priors, solver and tolerances are the
+same. Every image is treated as a unit of its own, whose vehicle carries that one camera as the rig's calibration says;
+nothing ties the images of a unit together any more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,18 +20,15 @@ from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOption
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats, Ints
-
-if TYPE_CHECKING:
-    from mrasfm_engine.mapping.mapper import Model
-
 
 MIN_OBSERVATIONS = 4  # of an image; one with fewer has no pose of its own and stays where its unit is
 
 
 def adjust_images(
-    model: Model,
+    mapper: Mapper,
     free_units: Bools,
     *,
     terms: Sequence[Term],
@@ -45,49 +41,49 @@ def adjust_images(
     Of the terms, positions hold for every image of a unit, with as much weight in sum as for the unit, and vehicles are
     upright in every image; there is no calibration that could have a prior.
     """
-    rows, tracks, point = model.observed(free_units)
-    image = model.keypoints.image[rows]
-    counts = np.bincount(image, minlength=len(model.image_unit))
-    adjusted = (free_units & model.registered)[model.image_unit] & (counts >= MIN_OBSERVATIONS)
-    state, image_shots = _state_of_images(model, model.state.points_m[tracks])
+    rows, tracks, point = mapper.observed(free_units)
+    image = mapper.keypoints.image[rows]
+    counts = np.bincount(image, minlength=len(mapper.image_unit))
+    adjusted = (free_units & mapper.registered)[mapper.image_unit] & (counts >= MIN_OBSERVATIONS)
+    state, image_bands = _state_of_images(mapper, mapper.state.points_m[tracks])
     problem = Problem(
         state=state,
-        camera_kind=model.camera_kind,
+        camera_kind=mapper.camera_kind,
         observations=Observations(
             unit=image,
-            camera=model.keypoints.camera[rows],
+            camera=mapper.keypoints.camera[rows],
             point=point,
-            xy_px=model.keypoints.xy_px[rows],
+            xy_px=mapper.keypoints.xy_px[rows],
             num_points=len(tracks),
-            shot=model.keypoints.shot[rows] if image_shots else None,
+            band=mapper.keypoints.band[rows] if image_bands else None,
         ),
-        layout=Layout.of(adjusted, np.zeros(len(model.camera_kind), dtype=np.bool_)),
-        terms=terms_of_images(terms, model.image_unit, adjusted),
+        layout=Layout.from_free(adjusted, np.zeros(len(mapper.camera_kind), dtype=np.bool_)),
+        terms=terms_of_images(terms, mapper.image_unit, adjusted),
         options=options,
     )
-    solution, report = solve_with_chosen_points(problem, model.image_size_px, an_image=an_image, cancel=cancel)
+    solution, report = solve_with_chosen_points(problem, mapper.image_size_px, an_image=an_image, cancel=cancel)
     if cancel is not None and cancel():
         raise CancelledError
-    model.state.points_m[tracks] = solution.points_m
-    _take_over(model, np.flatnonzero(adjusted), solution.world_from_rig)
+    mapper.state.points_m[tracks] = solution.points_m
+    _take_over(mapper, np.flatnonzero(adjusted), solution.world_from_rig)
     return report
 
 
-def _state_of_images(model: Model, points_m: Floats) -> tuple[State, bool]:
-    """A state whose units are the images, and whether images have several shots."""
-    unit_from_image = model.motion.unit_from_image(model.state)
-    pose = model.state.world_from_rig[model.image_unit] @ unit_from_image
-    shots = model.motion.shots
-    several = len(shots) > len(pose)
+def _state_of_images(mapper: Mapper, points_m: Floats) -> tuple[State, bool]:
+    """A state whose units are the images, and whether images have several row bands."""
+    unit_from_image = mapper.motion.unit_from_image(mapper.state)
+    pose = mapper.state.world_from_rig[mapper.image_unit] @ unit_from_image
+    bands = mapper.motion.bands
+    several = len(bands) > len(pose)
     moved = np.zeros((0, 4, 4))
     if several:
-        moved = se3.inverse(unit_from_image)[shots.image] @ model.state.unit_from_shot
+        moved = se3.inverse(unit_from_image)[bands.image] @ mapper.state.unit_from_band
     return replace(
-        model.state,
+        mapper.state,
         unit_rotation=np.ascontiguousarray(pose[:, :3, :3]),
         unit_position_m=np.ascontiguousarray(pose[:, :3, 3]),
-        shot_rotation=np.ascontiguousarray(moved[:, :3, :3]),
-        shot_position_m=np.ascontiguousarray(moved[:, :3, 3]),
+        band_rotation=np.ascontiguousarray(moved[:, :3, :3]),
+        band_position_m=np.ascontiguousarray(moved[:, :3, 3]),
         points_m=points_m,
     ), several
 
@@ -110,14 +106,14 @@ def terms_of_images(terms: Sequence[Term], image_unit: Ints, adjusted: Bools) ->
     return result
 
 
-def _take_over(model: Model, images: Ints, world_from_image: Floats) -> None:
-    order = np.argsort(model.image_unit[images], kind="stable")
-    units, first = np.unique(model.image_unit[images][order], return_index=True)
+def _take_over(mapper: Mapper, images: Ints, world_from_image: Floats) -> None:
+    order = np.argsort(mapper.image_unit[images], kind="stable")
+    units, first = np.unique(mapper.image_unit[images][order], return_index=True)
     for unit, members in zip(units, np.split(images[order], first[1:]), strict=True):
         poses = world_from_image[members]
         mean = se3.transform(robust_mean_rotation(poses[:, :3, :3]), geometric_median(poses[:, :3, 3]))
-        model.set_pose(int(unit), mean)
-        model.set_image_poses(members, se3.inverse(mean) @ poses)
-    model.renew_motion(units)
+        mapper.set_pose(int(unit), mean)
+        mapper.set_image_poses(members, se3.inverse(mean) @ poses)
+    mapper.renew_motion(units)
     # What images moved against their unit is this adjustment's result, and nothing that depends on the units' motion.
-    model.renew_motion(units)
+    mapper.renew_motion(units)

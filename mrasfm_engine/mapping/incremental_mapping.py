@@ -12,8 +12,8 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.mapping.baseline_without_rig import register_images_singly, retry_missing, take_over
 from mrasfm_engine.mapping.calibration import (
+    assess_calibration,
     calibration_prior,
-    judge_calibration,
     scale_of_baselines,
     scale_with_baselines,
 )
@@ -21,8 +21,9 @@ from mrasfm_engine.mapping.dynamic_objects import find_moving_along, units_to_do
 from mrasfm_engine.mapping.initialization import Initialisation, initialise
 from mrasfm_engine.mapping.keyframes import select_keyframes
 from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits, split_pairs
-from mrasfm_engine.mapping.mapper import Model
-from mrasfm_engine.mapping.road import RoadJudgement, drop_off_road
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.mapping.static_images import find_still_keypoints
 from mrasfm_engine.mapping.unit_registration import Registration, register_unit
 from mrasfm_engine.scene.drive import Drive
@@ -45,15 +46,15 @@ class MappingLog:
     calibration_free: bool = False  # whether global adjustments vary rig_from_cam
     local_adjustments: int = 0
     global_adjustments: list[Report] = field(default_factory=list)
-    roads: list[RoadJudgement | str] = field(default_factory=list)  # after each of them; why there is none
+    roads: list[RoadAssessment | str] = field(default_factory=list)  # after each of them; why there is none
     revisits_tried: int = 0  # pairs of units across a gap that were compared
     revisits: list[tuple[int, int]] = field(default_factory=list)  # those that were believed
     loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
     covered_images: dict[int, float] = field(default_factory=dict)  # by image, the share of keypoints that move along
 
 
-def grow(
-    model: Model,
+def run_incremental_mapping(
+    mapper: Mapper,
     pairs: Sequence[PairMatches],
     prior_world_from_rig: Floats | None,
     *,
@@ -70,41 +71,41 @@ def grow(
         Where `cancel` answers True.
     """
     log = MappingLog()
-    log.initialisation = initialise(model, pairs, prior_world_from_rig)
-    adjust_globally(model, log, cancel)
-    register_all(model, log, progress=progress, cancel=cancel)
+    log.initialisation = initialise(mapper, pairs, prior_world_from_rig)
+    adjust_globally(mapper, log, cancel)
+    register_remaining(mapper, log, progress=progress, cancel=cancel)
     return log
 
 
-def register_all(
-    model: Model,
+def register_remaining(
+    mapper: Mapper,
     log: MappingLog,
     *,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> None:
     """Register what can be registered of the keyframes that have no pose yet."""
-    config, since_local, at_global = model.config, 0, int(model.registered.sum())
-    while not model.registered[model.keyframe].all():
+    config, since_local, at_global = mapper.config, 0, int(mapper.registered.sum())
+    while not mapper.registered[mapper.keyframe].all():
         if cancel is not None and cancel():
             raise CancelledError
-        registration = _register_next(model, log)
+        registration = _register_next(mapper, log)
         if registration is None:
             break
         log.registrations.append(registration)
-        model.extend(registration.unit)
+        mapper.extend(registration.unit)
         since_local += 1
         if since_local >= config.mapping.local_every:
-            _adjust_locally(model, registration.unit)
+            _adjust_locally(mapper, registration.unit)
             log.local_adjustments += 1
             since_local = 0
-        if model.registered.sum() >= at_global * (1 + config.mapping.global_growth):
-            adjust_globally(model, log, cancel, growing=True)
-            at_global = int(model.registered.sum())
+        if mapper.registered.sum() >= at_global * (1 + config.mapping.global_growth):
+            adjust_globally(mapper, log, cancel, growing=True)
+            at_global = int(mapper.registered.sum())
         if progress is not None:
-            progress(int(model.registered.sum()), int(model.keyframe.sum()))
+            progress(int(mapper.registered.sum()), int(mapper.keyframe.sum()))
     if not config.mapping.camera_set_registration:
-        retry_missing(model)
+        retry_missing(mapper)
 
 
 def map_units(
@@ -116,7 +117,7 @@ def map_units(
     *,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
-) -> tuple[Model, MappingLog]:
+) -> tuple[Mapper, MappingLog]:
     """The whole mapping: the scene grows along the drive, what moves along is taken out, then loops are closed.
 
     Raises
@@ -131,150 +132,152 @@ def map_units(
     image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
     still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, near)
     sound = without_keypoints(near, keypoints.first, still) if still.any() else near
-    model = Model(drive, keypoints, build_tracks(keypoints, sound), config)
-    model.keyframe = select_keyframes(model)
+    mapper = Mapper(drive, keypoints, build_tracks(keypoints, sound), config)
+    mapper.keyframe = select_keyframes(mapper)
     if prior_world_from_rig is not None:
-        model.motion.follow_prior(prior_world_from_rig)
-    log = grow(model, sound, prior_world_from_rig, progress=progress, cancel=cancel)
+        mapper.motion.follow_prior(prior_world_from_rig)
+    log = run_incremental_mapping(mapper, sound, prior_world_from_rig, progress=progress, cancel=cancel)
     # Only the poses of all cameras together tell surely what moves along, so the scene grows before it is cleaned.
-    moving = find_moving_along(model, near)
+    moving = find_moving_along(mapper, near)
     if moving.any:
         log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}
         near, far = (without_keypoints(p, keypoints.first, moving.keypoint) for p in (near, far))
-        doubt = units_to_doubt(model, moving, still)
-        model = _registered_anew(model, near, doubt, log, progress, cancel)
-    revisits, log.revisits_tried = find_revisits(model, far)
+        doubt = units_to_doubt(mapper, moving, still)
+        mapper = _registered_anew(mapper, near, doubt, log, progress, cancel)
+    revisits, log.revisits_tried = find_revisits(mapper, far)
     if not revisits:
-        return model, log
+        return mapper, log
     log.revisits = [(r.earlier, r.later) for r in revisits]
-    log.loop_moved_m = close_loops(model, revisits)
+    log.loop_moved_m = close_loops(mapper, revisits)
     # Tracks anew, now with the matches across the loop that were believed, and points from the moved units.
     believed = set(log.revisits)
     across = [p for p in far if (*sorted((int(image_unit[p.image_a]), int(image_unit[p.image_b]))),) in believed]
-    closed = _with_tracks_of(model, [*near, *across])
+    closed = _with_tracks_of(mapper, [*near, *across])
     adjust_globally(closed, log, cancel)
     return closed, log
 
 
 def _registered_anew(
-    model: Model,
+    mapper: Mapper,
     pairs: Sequence[PairMatches],
     units: Ints,
     log: MappingLog,
     progress: CountProgress | None,
     cancel: Cancel | None,
-) -> Model:
+) -> Mapper:
     """The scene with tracks from other matches, in which some units find their pose anew; else they keep it."""
-    before = model.state.world_from_rig
-    model.forget(units)
-    model = _with_tracks_of(model, pairs)
-    register_all(model, log, progress=progress, cancel=cancel)
+    before = mapper.state.world_from_rig
+    mapper.forget(units)
+    mapper = _with_tracks_of(mapper, pairs)
+    register_remaining(mapper, log, progress=progress, cancel=cancel)
     # Where the units around have no pose either, there is nothing to register against: rather an old pose than none.
-    lost = units[~model.registered[units]]
+    lost = units[~mapper.registered[units]]
     for unit in lost:
-        model.set_pose(int(unit), before[unit])
+        mapper.set_pose(int(unit), before[unit])
         log.failures.pop(int(unit), None)
     if len(lost):
-        model.renew_motion()
-        model.triangulate()
-    adjust_globally(model, log, cancel)
-    return model
+        mapper.renew_motion()
+        mapper.triangulate()
+    adjust_globally(mapper, log, cancel)
+    return mapper
 
 
-def _with_tracks_of(model: Model, pairs: Sequence[PairMatches]) -> Model:
+def _with_tracks_of(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
     """The model's poses and calibration with tracks from other matches, and points from these."""
-    result = Model(model.drive, model.keypoints, build_tracks(model.keypoints, pairs), model.config)
-    result.state = replace(model.state, points_m=result.state.points_m)
-    result.registered, result.missing, result.motion = model.registered, model.missing, model.motion
-    result.keyframe = model.keyframe
+    result = Mapper(mapper.drive, mapper.keypoints, build_tracks(mapper.keypoints, pairs), mapper.config)
+    result.state = replace(mapper.state, points_m=result.state.points_m)
+    result.registered, result.missing, result.motion = mapper.registered, mapper.missing, mapper.motion
+    result.keyframe = mapper.keyframe
     result.renew_motion()
     result.triangulate()
     return result
 
 
-def _register_next(model: Model, log: MappingLog) -> Registration | None:
+def _register_next(mapper: Mapper, log: MappingLog) -> Registration | None:
     """Register the unit that sees most points; units that failed wait until they see more."""
-    counts = model.visible_counts()
-    waiting = np.flatnonzero(~model.registered & model.keyframe & (counts >= model.config.mapping.min_pnp_inliers))
+    counts = mapper.visible_counts()
+    waiting = np.flatnonzero(~mapper.registered & mapper.keyframe & (counts >= mapper.config.mapping.min_pnp_inliers))
     for unit in waiting[np.argsort(-counts[waiting], kind="stable")].tolist():
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue
-        model.motion.predict(model.state, model.registered, unit)
-        register = register_unit if model.config.mapping.camera_set_registration else register_images_singly
-        registration = register(model, unit)
+        mapper.motion.predict(mapper.state, mapper.registered, unit)
+        register = register_unit if mapper.config.mapping.camera_set_registration else register_images_singly
+        registration = register(mapper, unit)
         if registration.world_from_rig is not None:
             log.failures.pop(unit, None)
-            model.set_pose(unit, registration.world_from_rig)
-            model.renew_motion(np.array([unit]))
-            take_over(model, registration)
+            mapper.set_pose(unit, registration.world_from_rig)
+            mapper.renew_motion(np.array([unit]))
+            take_over(mapper, registration)
             return registration
         log.failures[unit] = registration
     return None
 
 
-def _adjust_locally(model: Model, unit: int) -> None:
+def _adjust_locally(mapper: Mapper, unit: int) -> None:
     """Adjust a new unit and those it shares most points with; all other units and the calibration stay."""
-    tracks = model.tracks_of_units(np.array([unit]))
-    rows = model.observation_rows(tracks[model.solved[tracks]])
-    shared = np.bincount(model.keypoints.unit[rows], minlength=len(model.registered))
+    tracks = mapper.tracks_of_units(np.array([unit]))
+    rows = mapper.observation_rows(tracks[mapper.triangulated[tracks]])
+    shared = np.bincount(mapper.keypoints.unit[rows], minlength=len(mapper.registered))
     shared[unit] = np.iinfo(np.int64).max
-    best = np.argsort(-shared, kind="stable")[: model.config.mapping.local_units]
-    free = np.zeros(len(model.registered), dtype=np.bool_)
+    best = np.argsort(-shared, kind="stable")[: mapper.config.mapping.local_units]
+    free = np.zeros(len(mapper.registered), dtype=np.bool_)
     free[best[shared[best] > 0]] = True
-    free &= model.registered
+    free &= mapper.registered
     # Without a fixed unit the gauge is loose: hold the one that shares least.
-    if (free == model.registered).all():
+    if (free == mapper.registered).all():
         free[best[free[best]][-1]] = False
-    model.adjust(
+    adjust_poses(
+        mapper,
         free,
         options=SolverOptions(
             max_iterations=10,
             function_tolerance=LOCAL_TOLERANCE,
             decrement_tolerance=DECREMENT_TOLERANCE,
-            loss_scale=model.config.adjustment.loss_scale,
-            threads=model.config.threads,
+            loss_scale=mapper.config.bundle_adjustment.loss_scale,
+            threads=mapper.config.threads,
         ),
-        an_image=model.config.mapping.pose_observations,
+        an_image=mapper.config.mapping.pose_observations,
     )
 
 
-def adjust_globally(model: Model, log: MappingLog, cancel: Cancel | None, *, growing: bool = False) -> None:
+def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None, *, growing: bool = False) -> None:
     """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter.
 
     Once while the scene is still `growing`: the next time is near. Else once more, with what is clearly wrong left out.
     """
-    free_units = model.registered.copy()
-    free_units[np.flatnonzero(model.registered)[0]] = False
+    free_units = mapper.registered.copy()
+    free_units[np.flatnonzero(mapper.registered)[0]] = False
     options = SolverOptions(
         max_iterations=20,
         function_tolerance=GLOBAL_TOLERANCE,
         decrement_tolerance=DECREMENT_TOLERANCE,
-        loss_scale=model.config.adjustment.loss_scale,
-        threads=model.config.threads,
+        loss_scale=mapper.config.bundle_adjustment.loss_scale,
+        threads=mapper.config.threads,
     )
     # Once a part of the drive observes the calibration, more of it does so all the more.
     log.calibration_free = (
         log.calibration_free
-        or judge_calibration(model, free_units=free_units, terms=(), georeferenced=False, options=options).free
+        or assess_calibration(mapper, free_units=free_units, terms=(), georeferenced=False, options=options).free
     )
-    free, priors = log.calibration_free, model.config.adjustment.priors
-    limits_px = (model.config.mapping.max_error_px, model.config.mapping.filter_error_px)
+    free, priors = log.calibration_free, mapper.config.bundle_adjustment.priors
+    limits_px = (mapper.config.mapping.max_error_px, mapper.config.mapping.filter_error_px)
     for error_px in limits_px[:1] if growing else limits_px:
-        report = model.adjust(
+        report = adjust_poses(
+            mapper,
             free_units,
-            free_cameras=np.full(len(model.camera_kind), free),
-            terms=[calibration_prior(model)] if free and priors else (),
+            free_cameras=np.full(len(mapper.camera_kind), free),
+            terms=[calibration_prior(mapper)] if free and priors else (),
             options=options,
-            an_image=model.config.mapping.pose_observations,
+            an_image=mapper.config.mapping.pose_observations,
             cancel=cancel,
         )
         log.global_adjustments.append(report)
         if free and priors:
             # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
-            scale_with_baselines(model, scale_of_baselines(model)[0])
-        model.complete()  # filters, too
-        if error_px < model.config.mapping.max_error_px:
-            model.filter(error_px)
-        if model.config.mapping.semantic_triangulation:
-            log.roads.append(drop_off_road(model))
+            scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
+        mapper.complete()  # filters, too
+        if error_px < mapper.config.mapping.max_error_px:
+            mapper.filter(error_px)
+        if mapper.config.mapping.semantic_triangulation:
+            log.roads.append(drop_off_road(mapper))

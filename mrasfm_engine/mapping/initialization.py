@@ -11,8 +11,9 @@ import pycolmap
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.mapper import Model
-from mrasfm_engine.mapping.unit_registration import Eyes, cameras_of, matrix_of, register_unit, rigid3d
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.unit_registration import CameraViews, cameras_of, matrix_of, register_unit, rigid3d
 from mrasfm_engine.matching.verification import parallax_rad
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.types import Floats, Ints
@@ -46,29 +47,29 @@ class UnitScores:
     those that come into question are asked first.
     """
 
-    model: Model
+    mapper: Mapper
     inside: Ints  # (units,) verified matches between the images of a unit
     between: dict[tuple[int, int], list[PairMatches]]  # by unit and later unit
 
     @staticmethod
-    def of(model: Model, pairs: Sequence[PairMatches]) -> UnitScores:
+    def from_pairs(mapper: Mapper, pairs: Sequence[PairMatches]) -> UnitScores:
         """Of a drive's keyframes."""
-        inside = np.zeros(len(model.registered), dtype=np.int64)
+        inside = np.zeros(len(mapper.registered), dtype=np.int64)
         between: dict[tuple[int, int], list[PairMatches]] = {}
         for pair in pairs:
-            u, v = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
-            if not (model.keyframe[u] and model.keyframe[v]):
+            u, v = sorted((int(mapper.image_unit[pair.image_a]), int(mapper.image_unit[pair.image_b])))
+            if not (mapper.keyframe[u] and mapper.keyframe[v]):
                 continue
             if u == v:
                 inside[u] += np.count_nonzero(pair.inliers)
             else:
                 between.setdefault((u, v), []).append(pair)
-        return UnitScores(model=model, inside=inside, between=between)
+        return UnitScores(mapper=mapper, inside=inside, between=between)
 
     def moving(self, u: int, v: int) -> int:
         """Verified matches between two units that show motion."""
         return sum(
-            round(np.count_nonzero(pair.inliers) * _share_that_moves(self.model, pair)) for pair in self.between[u, v]
+            round(np.count_nonzero(pair.inliers) * _share_that_moves(self.mapper, pair)) for pair in self.between[u, v]
         )
 
     def best_of_gap(self, gap: int) -> tuple[int, int]:
@@ -88,16 +89,16 @@ class UnitScores:
         return best
 
 
-def _share_that_moves(model: Model, pair: PairMatches) -> float:
+def _share_that_moves(mapper: Mapper, pair: PairMatches) -> float:
     """How far the matches show motion, 0 to 1: units at which the car stands match best, but give no points."""
     matches = pair.matches[pair.inliers]
     matches = matches[:: 1 + len(matches) // MAX_PARALLAX_MATCHES]
-    a = model.keypoints.rays[model.keypoints.first[pair.image_a] + matches[:, 0]]
-    b = model.keypoints.rays[model.keypoints.first[pair.image_b] + matches[:, 1]]
+    a = mapper.keypoints.rays[mapper.keypoints.first[pair.image_a] + matches[:, 0]]
+    b = mapper.keypoints.rays[mapper.keypoints.first[pair.image_b] + matches[:, 1]]
     return min(1.0, parallax_rad(a, b) / float(FULL_PARALLAX_RAD))
 
 
-def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig: Floats | None) -> Initialisation:
+def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_rig: Floats | None) -> Initialisation:
     """Register the two best-connected units.
 
     For each of the best pairs of units by verified matches inside and between them, every source of a relative pose is
@@ -110,25 +111,25 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
         Where no pair of units gives points.
     """
     prior = prior_world_from_rig
-    known = np.isfinite(prior[:, 0, 3]) if prior is not None else np.zeros(len(model.registered), dtype=np.bool_)
-    scores = UnitScores.of(model, pairs)
+    known = np.isfinite(prior[:, 0, 3]) if prior is not None else np.zeros(len(mapper.registered), dtype=np.bool_)
+    scores = UnitScores.from_pairs(mapper, pairs)
     best: tuple[int, Initialisation, Floats, Floats] | None = None
     # Not the same gap over and over: with a longer step points get better angles.
     for gap in sorted({v - u for u, v in scores.between})[:CANDIDATES]:
         u, v = scores.best_of_gap(gap)
         anchor = np.eye(4) if prior is None or not known[u] else prior[u]
-        for method, pose in _proposals(model, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
-            points = _evaluate(model, u, v, anchor, pose)
+        for method, pose in _proposals(mapper, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
+            points = _evaluate(mapper, u, v, anchor, pose)
             if best is None or points > best[0]:
                 best = (
                     points,
                     Initialisation(units=(u, v), points=points, method=method),
-                    model.state.world_from_rig[u],
-                    model.state.world_from_rig[v],
+                    mapper.state.world_from_rig[u],
+                    mapper.state.world_from_rig[v],
                 )
             if method == INSIDE and points >= GOOD_START_POINTS:
                 break  # the relative pose from images alone costs most; it is for cameras that share no view
-    model.clear()
+    mapper.clear()
     if best is None or best[0] < MIN_POINTS:
         raise ReconstructionError(
             f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the "
@@ -138,15 +139,15 @@ def initialise(model: Model, pairs: Sequence[PairMatches], prior_world_from_rig:
             code="nothing-matches",
         )
     _, result, pose_u, pose_v = best
-    model.set_pose(result.units[0], pose_u)
-    model.set_pose(result.units[1], pose_v)
-    model.renew_motion()
-    model.triangulate()
+    mapper.set_pose(result.units[0], pose_u)
+    mapper.set_pose(result.units[1], pose_v)
+    mapper.renew_motion()
+    mapper.triangulate()
     return result
 
 
 def _proposals(
-    model: Model,
+    mapper: Mapper,
     pairs: Sequence[PairMatches],
     u: int,
     v: int,
@@ -156,38 +157,38 @@ def _proposals(
     """Poses of unit v, given that of u, and where they come from."""
     if prior_world_from_rig is not None:
         yield "prior poses", anchor @ se3.inverse(prior_world_from_rig[u]) @ prior_world_from_rig[v]
-    model.clear()
-    model.set_pose(u, anchor)
-    model.renew_motion()
-    if model.triangulate(model.tracks_of_units(np.array([u]))) >= MIN_POINTS:
-        model.motion.predict(model.state, model.registered, v)
-        registration = register_unit(model, v)
+    mapper.clear()
+    mapper.set_pose(u, anchor)
+    mapper.renew_motion()
+    if mapper.triangulate(mapper.tracks_of_units(np.array([u]))) >= MIN_POINTS:
+        mapper.motion.predict(mapper.state, mapper.registered, v)
+        registration = register_unit(mapper, v)
         if registration.world_from_rig is not None:
             yield INSIDE, registration.world_from_rig
     relative = (
-        _single_camera_relative_pose(model, pairs, u, v, prior_world_from_rig)
-        if model.drive.has_single_camera
-        else _generalised_relative_pose(model, pairs, u, v)
+        _single_camera_relative_pose(mapper, pairs, u, v, prior_world_from_rig)
+        if mapper.drive.has_single_camera
+        else _generalised_relative_pose(mapper, pairs, u, v)
     )
     if relative is not None:
         yield "generalised relative pose", anchor @ relative
 
 
-def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> Floats | None:
+def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int) -> Floats | None:
     """rig_u_from_rig_v from matches between all cameras of the two units."""
-    a, b = _matches_between(model, pairs, u, v)
+    a, b = _matches_between(mapper, pairs, u, v)
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
+    options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
     options.min_num_trials, options.max_num_trials = 100, 2000
-    both, cameras = np.concatenate([a, b]), cameras_of(model)
-    eyes = Eyes.of(model, model.keypoints.camera[both], model.keypoints.shot[both])
+    both, cameras = np.concatenate([a, b]), cameras_of(mapper)
+    views = CameraViews.from_keypoints(mapper, mapper.keypoints.camera[both], mapper.keypoints.band[both])
     result = pycolmap.estimate_generalized_relative_pose(
-        model.keypoints.xy_px[a],
-        model.keypoints.xy_px[b],
-        [int(i) for i in eyes.index[: len(a)]],
-        [int(i) for i in eyes.index[len(a) :]],
-        [rigid3d(m) for m in se3.inverse(eyes.rig_from_eye)],
-        [cameras[c] for c in eyes.camera],
+        mapper.keypoints.xy_px[a],
+        mapper.keypoints.xy_px[b],
+        [int(i) for i in views.index[: len(a)]],
+        [int(i) for i in views.index[len(a) :]],
+        [rigid3d(m) for m in se3.inverse(views.rig_from_view)],
+        [cameras[c] for c in views.camera],
         estimation_options=options,
     )
     if result is None or "rig2_from_rig1" not in result:
@@ -196,16 +197,16 @@ def _generalised_relative_pose(model: Model, pairs: Sequence[PairMatches], u: in
 
 
 def _single_camera_relative_pose(
-    model: Model, pairs: Sequence[PairMatches], u: int, v: int, prior_world_from_rig: Floats | None
+    mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int, prior_world_from_rig: Floats | None
 ) -> Floats | None:
     """rig_u_from_rig_v of a rig with one camera: its length is the prior's, or one metre, as images do not tell it."""
-    a, b = _matches_between(model, pairs, u, v)
+    a, b = _matches_between(mapper, pairs, u, v)
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = RELATIVE_ERROR_PX, model.config.seed
-    index = int(model.image_camera[0])
-    camera = cameras_of(model)[index]
+    options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
+    index = int(mapper.image_camera[0])
+    camera = cameras_of(mapper)[index]
     result = pycolmap.estimate_essential_matrix(
-        model.keypoints.xy_px[a], model.keypoints.xy_px[b], camera, camera, estimation_options=options
+        mapper.keypoints.xy_px[a], mapper.keypoints.xy_px[b], camera, camera, estimation_options=options
     )
     if result is None:
         return None
@@ -214,19 +215,21 @@ def _single_camera_relative_pose(
         length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
     u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))
     u_from_v[:3, 3] *= length_m / max(float(np.linalg.norm(u_from_v[:3, 3])), 1e-9)
-    rig_from_eye = np.stack([model.motion.unit_from_image(model.state)[model.keypoints.image[k[0]]] for k in (a, b)])
-    rig_from_eye = rig_from_eye @ model.state.rig_from_cam[index]
-    result_pose: Floats = rig_from_eye[0] @ u_from_v @ se3.inverse(rig_from_eye[1])
+    rig_from_view = np.stack(
+        [mapper.motion.unit_from_image(mapper.state)[mapper.keypoints.image[k[0]]] for k in (a, b)]
+    )
+    rig_from_view = rig_from_view @ mapper.state.rig_from_cam[index]
+    result_pose: Floats = rig_from_view[0] @ u_from_v @ se3.inverse(rig_from_view[1])
     return result_pose
 
 
-def _matches_between(model: Model, pairs: Sequence[PairMatches], u: int, v: int) -> tuple[Ints, Ints]:
+def _matches_between(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int) -> tuple[Ints, Ints]:
     """Keypoints of unit u and of unit v that match, over all cameras; a sample where there are many."""
     rows_u, rows_v = [], []
     for pair in pairs:
-        if {int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])} != {u, v}:
+        if {int(mapper.image_unit[pair.image_a]), int(mapper.image_unit[pair.image_b])} != {u, v}:
             continue
-        a, b = model.matched_keypoints(pair, u)
+        a, b = mapper.matched_keypoints(pair, u)
         rows_u.append(a)
         rows_v.append(b)
     a, b = np.concatenate(rows_u), np.concatenate(rows_v)
@@ -234,25 +237,25 @@ def _matches_between(model: Model, pairs: Sequence[PairMatches], u: int, v: int)
     return a[keep], b[keep]
 
 
-def _evaluate(model: Model, u: int, v: int, anchor: Floats, pose: Floats) -> int:
+def _evaluate(mapper: Mapper, u: int, v: int, anchor: Floats, pose: Floats) -> int:
     """Points of the two units after adjusting the second; the model is left in that state."""
-    model.clear()
-    model.set_pose(u, anchor)
-    model.set_pose(v, pose)
-    model.renew_motion()
-    tracks = model.tracks_of_units(np.array([u, v]))
-    free = np.zeros(len(model.registered), dtype=np.bool_)
+    mapper.clear()
+    mapper.set_pose(u, anchor)
+    mapper.set_pose(v, pose)
+    mapper.renew_motion()
+    tracks = mapper.tracks_of_units(np.array([u, v]))
+    free = np.zeros(len(mapper.registered), dtype=np.bool_)
     free[v] = True
-    options = SolverOptions(max_iterations=30, function_tolerance=1e-3, threads=model.config.threads)
-    threshold = model.triangulator.max_error_px
+    options = SolverOptions(max_iterations=30, function_tolerance=1e-3, threads=mapper.config.threads)
+    threshold = mapper.triangulator.max_error_px
     # Baselines between cameras that are not simultaneous follow from the pose that is sought: it takes some turns.
-    rough_rounds = 1 if model.state.simultaneous else MOTION_ROUNDS
+    rough_rounds = 1 if mapper.state.simultaneous else MOTION_ROUNDS
     try:
         for error_px in (*([ROUGH_ERROR_PX] * rough_rounds), ROUGH_ERROR_PX / 2, threshold):
-            model.triangulator.max_error_px = max(error_px, threshold)
-            if model.triangulate(tracks) < MIN_POINTS:
+            mapper.triangulator.max_error_px = max(error_px, threshold)
+            if mapper.triangulate(tracks) < MIN_POINTS:
                 return 0
-            model.adjust(free, options=options, an_image=model.config.mapping.pose_observations)
+            adjust_poses(mapper, free, options=options, an_image=mapper.config.mapping.pose_observations)
     finally:
-        model.triangulator.max_error_px = threshold
-    return model.triangulate(tracks)
+        mapper.triangulator.max_error_px = threshold
+    return mapper.triangulate(tracks)

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_graph import Edges, optimise_pose_graph
-from mrasfm_engine.mapping.unit_registration import Seen, register_seen
+from mrasfm_engine.mapping.unit_registration import Correspondences2D3D, register_from_correspondences
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.types import Floats, Ints
 
@@ -52,38 +52,40 @@ def split_pairs(
     return near, far
 
 
-def find_revisits(model: Model, far_pairs: Sequence[PairMatches]) -> tuple[list[Revisit], int]:
+def find_revisits(mapper: Mapper, far_pairs: Sequence[PairMatches]) -> tuple[list[Revisit], int]:
     """Believed revisits, and how many pairs of units were tried."""
     by_units: dict[tuple[int, int], list[PairMatches]] = {}
     for pair in far_pairs:
-        units = sorted((int(model.image_unit[pair.image_a]), int(model.image_unit[pair.image_b])))
-        if model.registered[units].all():
+        units = sorted((int(mapper.image_unit[pair.image_a]), int(mapper.image_unit[pair.image_b])))
+        if mapper.registered[units].all():
             by_units.setdefault((units[0], units[1]), []).append(pair)
-    found = [r for (i, j), own in sorted(by_units.items()) if (r := _try(model, i, j, own)) is not None]
-    known = np.flatnonzero(model.registered)
-    steps = np.linalg.norm(np.diff(model.state.unit_position_m[known], axis=0), axis=1)
+    found = [r for (i, j), own in sorted(by_units.items()) if (r := _try(mapper, i, j, own)) is not None]
+    known = np.flatnonzero(mapper.registered)
+    steps = np.linalg.norm(np.diff(mapper.state.unit_position_m[known], axis=0), axis=1)
     way = dict(zip(known.tolist(), np.concatenate([[0.0], np.cumsum(steps)]), strict=True))
-    plausible = [r for r in found if _plausible(r, model, float(way[r.later] - way[r.earlier]))]
-    return _supported(plausible, model), len(by_units)
+    plausible = [r for r in found if _plausible(r, mapper, float(way[r.later] - way[r.earlier]))]
+    return _supported(plausible, mapper), len(by_units)
 
 
-def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -> Revisit | None:
+def _try(mapper: Mapper, earlier: int, later: int, pairs: Sequence[PairMatches]) -> Revisit | None:
     """Register the later unit against points that the earlier one observes."""
     rows_later, tracks = [], []
     for pair in pairs:
-        a, b = model.matched_keypoints(pair, earlier)
-        observed = model.kept[a]
+        a, b = mapper.matched_keypoints(pair, earlier)
+        observed = mapper.is_inlier[a]
         rows_later.append(b[observed])
-        tracks.append(model.tracks.of_keypoint[a[observed]])
+        tracks.append(mapper.tracks.of_keypoint[a[observed]])
     rows, track = np.concatenate(rows_later), np.concatenate(tracks)
-    seen = Seen(
-        xy_px=model.keypoints.xy_px[rows],
-        points_m=model.state.points_m[track],
-        camera=model.keypoints.camera[rows],
-        shot=model.keypoints.shot[rows],
+    matched = Correspondences2D3D(
+        xy_px=mapper.keypoints.xy_px[rows],
+        points_m=mapper.state.points_m[track],
+        camera=mapper.keypoints.camera[rows],
+        band=mapper.keypoints.band[rows],
     )
-    current = model.state.world_from_rig_of(np.array([later]))[0]
-    registration = register_seen(model, later, seen, min_inliers=MIN_INLIERS, by_vote=False, expected=current)
+    current = mapper.state.world_from_rig_of(np.array([later]))[0]
+    registration = register_from_correspondences(
+        mapper, later, matched, min_inliers=MIN_INLIERS, by_vote=False, expected=current
+    )
     if registration.world_from_rig is None:
         return None
     return Revisit(
@@ -94,20 +96,20 @@ def _try(model: Model, earlier: int, later: int, pairs: Sequence[PairMatches]) -
     )
 
 
-def _plausible(revisit: Revisit, model: Model, way_m: float) -> bool:
-    at = model.state.unit_position_m[revisit.later]
+def _plausible(revisit: Revisit, mapper: Mapper, way_m: float) -> bool:
+    at = mapper.state.unit_position_m[revisit.later]
     shift = np.linalg.norm(revisit.drift[:3, :3] @ at + revisit.drift[:3, 3] - at)
     turn = float(se3.rotation_angle_deg(revisit.drift[:3, :3]))
     return bool(shift <= MAX_DRIFT_M + MAX_DRIFT_PER_M * way_m and turn <= MAX_DRIFT_DEG)
 
 
-def _supported(revisits: Sequence[Revisit], model: Model) -> list[Revisit]:
+def _supported(revisits: Sequence[Revisit], mapper: Mapper) -> list[Revisit]:
     """Those that several neighbours, themselves among them, agree with: they report the same drift."""
     if not revisits:
         return []
     units = np.array([(r.earlier, r.later) for r in revisits])
     drifts = np.stack([r.drift for r in revisits])
-    at = model.state.unit_position_m[units[:, 1]]
+    at = mapper.state.unit_position_m[units[:, 1]]
     result = []
     for i, revisit in enumerate(revisits):
         # Revisits are in the order of their earlier units.
@@ -121,13 +123,13 @@ def _supported(revisits: Sequence[Revisit], model: Model) -> list[Revisit]:
     return result
 
 
-def close_loops(model: Model, revisits: Sequence[Revisit]) -> float:
+def close_loops(mapper: Mapper, revisits: Sequence[Revisit]) -> float:
     """Move the units by a pose graph of the drive's own steps and the revisits; by how much at most, in metres.
 
     Points stay where they are: they have to be triangulated anew.
     """
-    poses = model.state.world_from_rig
-    units = np.flatnonzero(model.registered)
+    poses = mapper.state.world_from_rig
+    units = np.flatnonzero(mapper.registered)
     chain = np.stack([units[:-1], units[1:]], axis=1)
     loops = np.array([(r.earlier, r.later) for r in revisits], dtype=np.int64).reshape(-1, 2)
     measured = [
@@ -150,5 +152,5 @@ def close_loops(model: Model, revisits: Sequence[Revisit]) -> float:
     closed = optimise_pose_graph(poses, edges)
     moved = float(np.linalg.norm(closed[units, :3, 3] - poses[units, :3, 3], axis=1).max())
     for unit in units:
-        model.set_pose(int(unit), closed[unit])
+        mapper.set_pose(int(unit), closed[unit])
     return moved

@@ -8,31 +8,28 @@ from itertools import pairwise
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
-from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
+from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
-from mrasfm_engine.mapping.free_image_adjustment import adjust_images
 from mrasfm_engine.mapping.rig_motion import RigMotion
 from mrasfm_engine.scene.drive import Drive
-from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, kept_members
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, inlier_members
 from mrasfm_engine.triangulation.triangulate import Triangulator
-from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+from mrasfm_engine.types import Bools, Floats, Ints
 
 
-class Model:
+class Mapper:
     """Registered units, tracks and their points. A track has at most one point.
 
     Attributes
     ----------
     state
-        Poses and calibration; `state.points_m` has a row for every track, valid where `solved`.
+        Poses and calibration; `state.points_m` has a row for every track, valid where `triangulated`.
     registered
         (units,) which units have a pose.
     keyframe
@@ -66,21 +63,21 @@ class Model:
         )
         self.registered = np.zeros(units, dtype=np.bool_)
         self.keyframe = np.ones(units, dtype=np.bool_)
-        self.solved = np.zeros(len(tracks), dtype=np.bool_)
-        self.kept = np.zeros(len(keypoints.image), dtype=np.bool_)
+        self.triangulated = np.zeros(len(tracks), dtype=np.bool_)
+        self.is_inlier = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.missing = np.zeros(len(drive.images), dtype=np.bool_)
-        self.barred = np.zeros(len(tracks), dtype=np.bool_)
+        self.rejected = np.zeros(len(tracks), dtype=np.bool_)
         self.track_class = tracks.classes(keypoints.classes)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
-        shots = Shots.of(drive, compensate=config.mapping.motion_compensation)
-        self.motion = RigMotion(shots, drive.timestamps_us)
+        bands = RowBands.from_drive(drive, compensate=config.mapping.motion_compensation)
+        self.motion = RigMotion(bands, drive.timestamps_us)
         if self.motion.needed:
-            self._place_shots()
+            self._place_bands()
         self.triangulator = Triangulator(
             keypoints,
-            shots.unit,
-            shots.camera,
+            bands.unit,
+            bands.camera,
             self.camera_kind,
             max_error_px=config.mapping.max_error_px,
             min_angle_deg=config.mapping.min_angle_deg,
@@ -113,12 +110,12 @@ class Model:
         for image, pose in zip(images, unit_from_image, strict=True):
             self.motion.set_image_pose(int(image), pose)
         if self.state.simultaneous:
-            self._place_shots()
+            self._place_bands()
 
-    def _place_shots(self) -> None:
-        count = len(self.motion.shots)
+    def _place_bands(self) -> None:
+        count = len(self.motion.bands)
         self.state = replace(
-            self.state, shot_rotation=np.tile(np.eye(3), (count, 1, 1)), shot_position_m=np.zeros((count, 3))
+            self.state, band_rotation=np.tile(np.eye(3), (count, 1, 1)), band_position_m=np.zeros((count, 3))
         )
 
     def renew_motion(self, units: Ints | None = None) -> float:
@@ -127,7 +124,7 @@ class Model:
 
     def drop_unsupported(self, min_observations: int) -> Ints:
         """Take the poses of units back that hardly observe a point any more; which ones."""
-        counts = np.bincount(self.keypoints.unit[self.kept], minlength=len(self.registered))
+        counts = np.bincount(self.keypoints.unit[self.is_inlier], minlength=len(self.registered))
         lost = np.flatnonzero(self.registered & (counts < min_observations))
         self.forget(lost)
         return lost
@@ -138,12 +135,12 @@ class Model:
         images = np.flatnonzero(np.isin(self.image_unit, units))
         self.missing[images] = False
         self.motion.forget_image_poses(images)
-        self.kept[np.isin(self.keypoints.unit, units)] = False
+        self.is_inlier[np.isin(self.keypoints.unit, units)] = False
 
     def clear(self) -> None:
         """Forget all poses and points."""
         self.forget(np.arange(len(self.registered)))
-        self.solved[:] = False
+        self.triangulated[:] = False
 
     def tracks_of_units(self, units: Ints) -> Ints:
         """Tracks seen by any of the units, ascending."""
@@ -160,9 +157,9 @@ class Model:
 
     def visible_counts(self) -> Ints:
         """How many keypoints with a point every unit has (units,); not to be written to."""
-        changed = np.flatnonzero(self.solved != self._visible_of)
-        count_members(self.tracks, changed, self.solved, self.keypoints.unit, self._visible)
-        self._visible_of[changed] = self.solved[changed]
+        changed = np.flatnonzero(self.triangulated != self._visible_of)
+        count_members(self.tracks, changed, self.triangulated, self.keypoints.unit, self._visible)
+        self._visible_of[changed] = self.triangulated[changed]
         return self._visible
 
     def triangulate(self, which: Ints | None = None) -> int:
@@ -172,51 +169,51 @@ class Model:
         self.triangulator.triangulate(
             self.state,
             self.tracks,
-            (self.registered[self.image_unit] & ~self.missing)[self.motion.shots.image],
+            (self.registered[self.image_unit] & ~self.missing)[self.motion.bands.image],
             which=which,
             points_m=self.state.points_m,
-            solved=self.solved,
-            kept=self.kept,
+            triangulated=self.triangulated,
+            is_inlier=self.is_inlier,
         )
-        return int(self.solved[which].sum())
+        return int(self.triangulated[which].sum())
 
     def extend(self, unit: int) -> None:
         """Let a newly registered unit observe the points of its tracks, and give its other tracks points."""
         rows = self.rows_of_unit[unit]
         rows = rows[~self.missing[self.keypoints.image[rows]]]
         tracks = self.tracks.of_keypoint[rows]
-        has_point = self.solved[tracks]
+        has_point = self.triangulated[tracks]
         errors = self.triangulator.errors_px(self.state, rows[has_point], self.state.points_m, tracks[has_point])
         fits = errors < self.triangulator.max_error_px
-        self.kept[rows[has_point]] = fits
+        self.is_inlier[rows[has_point]] = fits
         # Also points that the new view contradicts: with it, another hypothesis may win.
         again = np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]]))
-        self.triangulate(again[~self.barred[again]])
+        self.triangulate(again[~self.rejected[again]])
 
     def complete(self) -> None:
         """Let every point have the observations that now fit it, and try again for tracks without a point."""
         of_keypoint = self.tracks.of_keypoint
         rows = np.flatnonzero((of_keypoint >= 0) & self.registered[self.keypoints.unit])
         rows = rows[~self.missing[self.keypoints.image[rows]]]
-        rows = rows[self.solved[of_keypoint[rows]]]
+        rows = rows[self.triangulated[of_keypoint[rows]]]
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, of_keypoint[rows])
-        self.kept[:] = False
-        self.kept[rows] = errors < self.triangulator.max_error_px
-        self.barred[:] = False
-        self.triangulate(np.flatnonzero(~self.solved))
+        self.is_inlier[:] = False
+        self.is_inlier[rows] = errors < self.triangulator.max_error_px
+        self.rejected[:] = False
+        self.triangulate(np.flatnonzero(~self.triangulated))
         self.filter(self.triangulator.max_error_px)
 
     def drop(self, tracks: Ints) -> None:
         """Take the points of tracks away and bar them until `complete` or `readmit`."""
-        self.solved[tracks] = False
-        self.barred[tracks] = True
-        rows = np.flatnonzero(self.kept)
-        self.kept[rows[self.barred[self.tracks.of_keypoint[rows]]]] = False
+        self.triangulated[tracks] = False
+        self.rejected[tracks] = True
+        rows = np.flatnonzero(self.is_inlier)
+        self.is_inlier[rows[self.rejected[self.tracks.of_keypoint[rows]]]] = False
 
     def readmit(self) -> None:
         """Triangulate barred tracks again: poses have changed since."""
-        tracks = np.flatnonzero(self.barred)
-        self.barred[:] = False
+        tracks = np.flatnonzero(self.rejected)
+        self.rejected[:] = False
         self.triangulate(tracks)
 
     def filter(self, max_error_px: float) -> tuple[int, int]:
@@ -224,33 +221,33 @@ class Model:
 
         Returns how many of both.
         """
-        rows = np.flatnonzero(self.kept)
+        rows = np.flatnonzero(self.is_inlier)
         tracks = self.tracks.of_keypoint[rows]
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, tracks)
         bad = errors > max_error_px
-        self.kept[rows[bad]] = False
+        self.is_inlier[rows[bad]] = False
         left = np.bincount(tracks[~bad], minlength=len(self.tracks))
-        lost = self.solved & (left < 2)
+        lost = self.triangulated & (left < 2)
         reduced = np.unique(tracks[bad])
-        lost[reduced[~self.triangulator.has_angle(self.state, self.tracks, self.kept, reduced)]] = True
-        self.solved[lost] = False
-        alone = np.flatnonzero(self.kept)
-        self.kept[alone[lost[self.tracks.of_keypoint[alone]]]] = False
+        lost[reduced[~self.triangulator.has_angle(self.state, self.tracks, self.is_inlier, reduced)]] = True
+        self.triangulated[lost] = False
+        alone = np.flatnonzero(self.is_inlier)
+        self.is_inlier[alone[lost[self.tracks.of_keypoint[alone]]]] = False
         return int(bad.sum()), int(lost.sum())
 
     def observation_rows(self, tracks: Ints | None = None) -> Ints:
         """Keypoints that are observations (of the given solved tracks, ascending), sorted by track."""
         if tracks is not None:
-            return kept_members(self.tracks, tracks, self.kept)
+            return inlier_members(self.tracks, tracks, self.is_inlier)
         members = self.tracks.keypoints
-        return members[self.kept[members]]
+        return members[self.is_inlier[members]]
 
     def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
         """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by
         point, the points' tracks, and the keypoints' points as rows of these."""
         everything = everything or bool((free_units | ~self.registered).all())
         seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
-        rows = self.observation_rows(None if seen is None else seen[self.solved[seen]])
+        rows = self.observation_rows(None if seen is None else seen[self.triangulated[seen]])
         track = self.tracks.of_keypoint[rows]
         begins = np.diff(track, prepend=-1) > 0
         return rows, track[begins], np.cumsum(begins) - 1
@@ -275,9 +272,9 @@ class Model:
                 point=point,
                 xy_px=self.keypoints.xy_px.take(rows, axis=0),
                 num_points=len(tracks),
-                shot=None if self.state.simultaneous else self.keypoints.shot[rows],
+                band=None if self.state.simultaneous else self.keypoints.band[rows],
             ),
-            layout=Layout.of(
+            layout=Layout.from_free(
                 free_units & self.registered,
                 np.zeros(len(self.camera_kind), dtype=np.bool_) if free_cameras is None else free_cameras,
                 free_focal=free_focal,
@@ -289,32 +286,3 @@ class Model:
             else self.motion.in_adjustment(self.state, self.registered, free_units),
         )
         return problem, tracks
-
-    def adjust(
-        self,
-        free_units: Bools,
-        *,
-        free_cameras: Bools | None = None,
-        free_focal: bool = False,
-        terms: Sequence[Term] = (),
-        options: SolverOptions,
-        an_image: int = 0,
-        cancel: Cancel | None = None,
-    ) -> Report:
-        """Solve the adjustment and take over its result.
-
-        With `an_image` poses are estimated from about so many observations of an image; points follow all of theirs.
-        """
-        if not self.config.adjustment.camera_set_adjustment:
-            return adjust_images(self, free_units, terms=terms, options=options, an_image=an_image, cancel=cancel)
-        self.renew_motion(np.flatnonzero(free_units & self.registered))
-        problem, tracks = self.problem(
-            free_units, free_cameras=free_cameras, free_focal=free_focal, terms=terms, options=options
-        )
-        solution, report = solve_with_chosen_points(problem, self.image_size_px, an_image=an_image, cancel=cancel)
-        if cancel is not None and cancel():
-            raise CancelledError  # else a half-solved model would pass for a finished one
-        points = self.state.points_m
-        points[tracks] = solution.points_m
-        self.state = replace(solution, points_m=points)
-        return report

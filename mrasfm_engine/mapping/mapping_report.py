@@ -13,22 +13,22 @@ from mrasfm_engine.findings import Finding
 from mrasfm_engine.mapping import rig_motion
 from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import voted_out
 from mrasfm_engine.mapping.refinement import Refinement
-from mrasfm_engine.mapping.road import RoadJudgement
+from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
 from mrasfm_engine.scene.road import RoadSource
-from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.types import Ints
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
 
-def describe(model: Model, log: MappingLog) -> dict[str, Any]:
+def describe(mapper: Mapper, log: MappingLog) -> dict[str, Any]:
     """Counts of the incremental loop, and what was rejected and why."""
-    frames = model.drive.manifest.frames
-    covered, poor = _covered(model, log), _poorly_seen(model)
+    frames = mapper.drive.manifest.frames
+    covered, poor = _covered(mapper, log), _poorly_seen(mapper)
     unclear = Counter(name for r in log.registrations for name in r.unclear)
     start = log.initialisation
     missing = [
@@ -37,23 +37,23 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
             "source_frame": frames[u].source_frame,
             "reason": log.failures[int(u)].reason if int(u) in log.failures else "it sees no point of the scene",
         }
-        for u in np.flatnonzero(~model.registered & model.keyframe)
+        for u in np.flatnonzero(~mapper.registered & mapper.keyframe)
     ]
     return {
         "initial_units": None if start is None else list(start.units),
         "initial_pose_from": None if start is None else start.method,
-        "registered_units": int(model.registered.sum()),
+        "registered_units": int(mapper.registered.sum()),
         "units_not_registered": missing,
-        "units_without_motion": int((~model.keyframe).sum()),
+        "units_without_motion": int((~mapper.keyframe).sum()),
         "registered_by": dict(Counter(r.method for r in log.registrations)),
         "cameras_voted_out": voted_out(log.registrations, {image["unit"] for image in covered}),
         "cameras_without_a_vote": dict(unclear),
         "images_occluded": covered,
         "images_posed_by_their_unit_alone": poor,
         "images_dark_or_without_texture": [file for file in poor if file not in {image["file"] for image in covered}],
-        "tracks": len(model.tracks),
-        "points": int(model.solved.sum()),
-        "observations": int(model.kept.sum()),
+        "tracks": len(mapper.tracks),
+        "points": int(mapper.triangulated.sum()),
+        "observations": int(mapper.is_inlier.sum()),
         "revisits": {
             "unit_pairs_tried": log.revisits_tried,
             "unit_pairs_believed": len(log.revisits),
@@ -61,13 +61,13 @@ def describe(model: Model, log: MappingLog) -> dict[str, Any]:
         },
         "local_adjustments": log.local_adjustments,
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
-        "road_points_dropped": [0 if isinstance(j, str) else int((~j.kept).sum()) for j in log.roads],
+        "road_points_dropped": [0 if isinstance(j, str) else int((~j.is_inlier).sum()) for j in log.roads],
     }
 
 
-def _covered(model: Model, log: MappingLog) -> list[dict[str, Any]]:
+def _covered(mapper: Mapper, log: MappingLog) -> list[dict[str, Any]]:
     """Images covered by something that moves along with the vehicle."""
-    images, cameras = model.drive.images, model.drive.cameras
+    images, cameras = mapper.drive.images, mapper.drive.cameras
     return [
         {
             "file": images[i].file,
@@ -79,13 +79,13 @@ def _covered(model: Model, log: MappingLog) -> list[dict[str, Any]]:
     ]
 
 
-def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
+def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
     """Alignment, adjustments and certainty of the last stage."""
     placement, certainty = refinement.placement, refinement.certainty
     alignment = None if placement is None else placement.alignment
     result: dict[str, Any] = {
-        "points": int(model.solved.sum()),
-        "observations": int(model.kept.sum()),
+        "points": int(mapper.triangulated.sum()),
+        "observations": int(mapper.is_inlier.sum()),
         "rejected": {
             "observations": refinement.observations_dropped,
             "points": refinement.points_dropped,
@@ -96,23 +96,23 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
         "calibration": {
             "adjusted": refinement.calibration.free,
             "adjusted_cameras": [
-                c.name for c, a in zip(model.drive.cameras, refinement.recalibrated, strict=True) if a
+                c.name for c, a in zip(mapper.drive.cameras, refinement.recalibrated, strict=True) if a
             ],
             "reason": refinement.calibration.reason,
-            "heading_change_deg": heading_change_deg(model),
-            **_directions(model, refinement),
+            "heading_change_deg": heading_change_deg(mapper),
+            **_directions(mapper, refinement),
         },
         "georeferenced": refinement.georeferenced,
         "road": _road(refinement.road),
-        "motion_within_units": _motion(model),
+        "motion_within_units": _motion(mapper),
     }
     if certainty is not None and np.isfinite(certainty.sigma_scale):
         result["scale"] = {
             "sigma_relative": certainty.sigma_scale,
-            "from": _scale_source(model, refinement),
+            "from": _scale_source(mapper, refinement),
         }
     if placement is not None and alignment is not None:
-        times = model.drive.timestamps_us[placement.units[~alignment.inlier]]
+        times = mapper.drive.timestamps_us[placement.units[~alignment.inlier]]
         result["gnss"] = {
             "units_used": int(alignment.inlier.sum()),
             "outliers_at_us": [int(t) for t in times],
@@ -125,9 +125,9 @@ def describe_refinement(model: Model, refinement: Refinement) -> dict[str, Any]:
     return result
 
 
-def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
+def _directions(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
     """What of the cameras' poses was observed, by name, and which of them were wrong."""
-    cameras, directions = model.drive.cameras, refinement.directions
+    cameras, directions = mapper.drive.cameras, refinement.directions
     if directions is None:
         return {}
     observed = directions.observed & refinement.recalibrated[:, None]
@@ -151,16 +151,16 @@ def _directions(model: Model, refinement: Refinement) -> dict[str, Any]:
                 "others_rotation_deg": w.others_rotation_deg,
                 "others_translation_m": w.others_translation_m,
             }
-            for w in refinement.wrong_cameras
+            for w in refinement.miscalibrations
         ],
     }
 
 
-def _road(judged: RoadJudgement | str) -> dict[str, Any]:
+def _road(judged: RoadAssessment | str) -> dict[str, Any]:
     """Thicknesses are of all points that were taken for the road's, and of those that were kept: none else left out."""
     if isinstance(judged, str):
         return {"source": None, "reason": judged}
-    road, kept = judged.road, judged.kept
+    road, kept = judged.road, judged.is_inlier
     result = {
         "source": str(road.source),
         "patches": len(road.surface),
@@ -183,12 +183,12 @@ def _road(judged: RoadJudgement | str) -> dict[str, Any]:
     return result
 
 
-def describe_between(model: Model, registrations: Sequence[Registration]) -> dict[str, Any]:
+def describe_between(mapper: Mapper, registrations: Sequence[Registration]) -> dict[str, Any]:
     """The units that are no keyframes, and those of them that the finished scene gave no pose."""
-    frames = model.drive.manifest.frames
+    frames = mapper.drive.manifest.frames
     return {
         "between_keyframes": {
-            "units": int((~model.keyframe).sum()),
+            "units": int((~mapper.keyframe).sum()),
             "registered": sum(r.world_from_rig is not None for r in registrations),
             "units_not_registered": [
                 {"unit": r.unit, "source_frame": frames[r.unit].source_frame, "reason": r.reason}
@@ -199,48 +199,48 @@ def describe_between(model: Model, registrations: Sequence[Registration]) -> dic
     }
 
 
-def _motion(model: Model) -> dict[str, Any]:
+def _motion(mapper: Mapper) -> dict[str, Any]:
     """How far images are from their unit in time and, where that was taken into account, in space."""
-    shots = Shots.of(model.drive)
-    if shots.simultaneous:
+    bands = RowBands.from_drive(mapper.drive)
+    if bands.simultaneous:
         return {"simultaneous": True}
-    largest = model.motion.largest(model.state, model.registered)
+    largest = mapper.motion.largest(mapper.state, mapper.registered)
     result: dict[str, Any] = {
         "simultaneous": False,
-        "largest_time_offset_s": float(np.abs(shots.time_offset_s).max()),
-        "compensated": not model.motion.shots.simultaneous,
+        "largest_time_offset_s": float(np.abs(bands.time_offset_s).max()),
+        "compensated": not mapper.motion.bands.simultaneous,
     }
     if result["compensated"]:
         result |= {
             "largest_translation_m": largest.translation_m,
             "largest_rotation_deg": largest.rotation_deg,
-            "units_not_compensated": len(_not_compensated(model)),
+            "units_not_compensated": len(_not_compensated(mapper)),
         }
     return result
 
 
-def _not_compensated(model: Model) -> Ints:
+def _not_compensated(mapper: Mapper) -> Ints:
     # The others did not move: that is why they are no keyframes.
-    return model.motion.not_compensated(model.state, model.registered & model.keyframe)
+    return mapper.motion.not_compensated(mapper.state, mapper.registered & mapper.keyframe)
 
 
-def motion_findings(model: Model) -> list[Finding]:
+def motion_findings(mapper: Mapper) -> list[Finding]:
     """What a user is told of the motion within units."""
-    units = _not_compensated(model)
-    return [rig_motion.finding(len(units), int(model.registered.sum()))] if len(units) else []
+    units = _not_compensated(mapper)
+    return [rig_motion.finding(len(units), int(mapper.registered.sum()))] if len(units) else []
 
 
-def _poorly_seen(model: Model) -> list[str]:
+def _poorly_seen(mapper: Mapper) -> list[str]:
     """Images that observe too little to be registered alone: dark, without texture, or occluded."""
-    images = model.drive.images
-    counts = np.bincount(model.keypoints.image[model.kept], minlength=len(images))
-    posed = model.registered[model.image_unit] & ~model.missing
+    images = mapper.drive.images
+    counts = np.bincount(mapper.keypoints.image[mapper.is_inlier], minlength=len(images))
+    posed = mapper.registered[mapper.image_unit] & ~mapper.missing
     poor = np.flatnonzero(posed & (counts < MIN_CAMERA_MATCHES))
     return [images[i].file for i in poor]
 
 
-def _scale_source(model: Model, refinement: Refinement) -> str:
-    if model.drive.has_single_camera:
+def _scale_source(mapper: Mapper, refinement: Refinement) -> str:
+    if mapper.drive.has_single_camera:
         return "GNSS" if refinement.georeferenced else "rough poses"
     return "baselines of the rig and GNSS" if refinement.georeferenced else "baselines of the rig"
 

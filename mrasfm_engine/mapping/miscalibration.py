@@ -23,7 +23,7 @@ MIN_OTHERS = 2  # cameras that say what is usual
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrongCamera:
+class Miscalibration:
     """A camera that stands or looks otherwise than given; lengths and angles of its correction."""
 
     camera: int
@@ -35,14 +35,14 @@ class WrongCamera:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrongPair:
+class MiscalibratedPair:
     """Two cameras that stand or look otherwise to each other than given: which of them is wrong, nothing tells."""
 
     rotation_deg: float
     translation_m: float
 
 
-def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observability) -> WrongPair | None:
+def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observability) -> MiscalibratedPair | None:
     """Of a rig of two cameras, whether they are off against each other by more than their prior can be."""
     corrections = np.where(directions.observed, prior.corrections(state), 0.0)
     if len(corrections) != 2:
@@ -55,13 +55,13 @@ def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observabi
     ):
         return None
     between = corrections[1] - corrections[0]
-    return WrongPair(
+    return MiscalibratedPair(
         rotation_deg=float(np.degrees(np.linalg.norm(between[:3]))),
         translation_m=float(np.linalg.norm(between[3:])),
     )
 
 
-def find_wrong_cameras(prior: CalibrationPrior, state: State, directions: Observability) -> list[WrongCamera]:
+def find_miscalibrations(prior: CalibrationPrior, state: State, directions: Observability) -> list[Miscalibration]:
     """Cameras whose correction is certain, and far outside its prior or far from what the other cameras need.
 
     Only directions count that the drive observes.
@@ -85,7 +85,7 @@ def find_wrong_cameras(prior: CalibrationPrior, state: State, directions: Observ
         size = np.stack([np.linalg.norm(corrections[:, :3], axis=1), np.linalg.norm(corrections[:, 3:], axis=1)])
         others = np.median(np.delete(size, c, axis=1), axis=1)
         found.append(
-            WrongCamera(
+            Miscalibration(
                 camera=c,
                 rotation_deg=float(np.degrees(size[0, c])),
                 translation_m=float(size[1, c]),
@@ -120,7 +120,7 @@ def voted_out(registrations: Sequence[Registration], covered_units: set[int]) ->
     return dict(Counter(name for r in registrations for name in r.voted_out if r.unit not in covered_units))
 
 
-def finding(name: str, wrong: WrongCamera) -> Finding:
+def finding(name: str, wrong: Miscalibration) -> Finding:
     """What a user is told of a wrong camera."""
     return warning(
         "camera-miscalibrated",
@@ -131,7 +131,7 @@ def finding(name: str, wrong: WrongCamera) -> Finding:
     )
 
 
-def pair_finding(names: Sequence[str], wrong: WrongPair) -> Finding:
+def pair_finding(names: Sequence[str], wrong: MiscalibratedPair) -> Finding:
     """What a user is told of a wrong pair."""
     return warning(
         "camera-miscalibrated",

@@ -28,14 +28,14 @@ class Vote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Consensus:
+class Agreement:
     """What the cameras agree on."""
 
     world_from_rig: Floats  # (4, 4)
     agreeing: Bools  # (votes,)
 
 
-def consensus(votes: list[Vote]) -> Consensus | None:
+def largest_agreement(votes: list[Vote]) -> Agreement | None:
     """The average of the largest group of votes, of equally large ones the better supported; None without votes.
 
     The L1 average of all votes comes first (MRASfM, eq. 6): while most cameras are right it is near them. Without a
@@ -50,7 +50,7 @@ def consensus(votes: list[Vote]) -> Consensus | None:
     groups = [agree(poses, centre) for centre in (average, *poses)]
     group = max(groups, key=lambda g: (g.sum(), inliers[g].sum()))
     weights = inliers[group]
-    return Consensus(
+    return Agreement(
         world_from_rig=se3.transform(
             se3.mean_rotation(poses[group, :3, :3], weights), np.average(poses[group, :3, 3], axis=0, weights=weights)
         ),

@@ -13,7 +13,7 @@ from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotat
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Floats, Ints
 
 MIN_CLOCK_OFFSET_S = 0.05
@@ -36,30 +36,30 @@ class Placement:
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
 
-def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Placement:
+def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Placement:
     """Move the model into the receiver's frame, and make its positions a prior for the adjustment.
 
     The model keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
     """
-    settings, times = model.config.gnss, model.drive.timestamps_us
+    settings, times = mapper.config.gnss, mapper.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
-    units = np.flatnonzero(model.registered & np.isfinite(measured[:, 0]))
-    single = model.drive.has_single_camera
+    units = np.flatnonzero(mapper.registered & np.isfinite(measured[:, 0]))
+    single = mapper.drive.has_single_camera
     if single and len(units) > 1:
-        scale_with_baselines(model, _extent(measured[units]) / _extent(model.state.unit_position_m[units]))
-    alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
+        scale_with_baselines(mapper, _extent(measured[units]) / _extent(mapper.state.unit_position_m[units]))
+    alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma)
     for _ in range(SCALE_ROUNDS if single else 0):
         if isinstance(alignment, GnssAlignment):
-            scale_with_baselines(model, alignment.scale)
-            alignment = _align(model, units, antenna_in_rig_m, measured, sigma)
+            scale_with_baselines(mapper, alignment.scale)
+            alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma)
     if isinstance(alignment, str):
         return Placement(reason=alignment)
-    _move(model, alignment.world_from_model)
+    _move(mapper, alignment.world_from_model)
     good = units[alignment.inlier]
     correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
     findings = []
     if not single:
-        findings = _findings(model, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
+        findings = _findings(mapper, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
     prior = PositionPrior(
         unit=good,
         position_m=measured[good],
@@ -69,35 +69,37 @@ def place_by_gnss(model: Model, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Pl
     return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
 
 
-def _align(model: Model, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats) -> GnssAlignment | str:
-    rotation = model.state.unit_rotation[units]
+def _align(
+    mapper: Mapper, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats
+) -> GnssAlignment | str:
+    rotation = mapper.state.unit_rotation[units]
     return align_with_gnss(
-        model.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
+        mapper.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
         rotation[:, :, 2],
         rotation[:, :, 0],
         measured[units],
         sigma[units],
-        outlier_sigmas=model.config.gnss.outlier_sigmas,
-        rng=np.random.default_rng(model.config.seed),
+        outlier_sigmas=mapper.config.gnss.outlier_sigmas,
+        rng=np.random.default_rng(mapper.config.seed),
     )
 
 
-def place_by_rough_poses(model: Model, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
+def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
     """Move the model into the frame of the rough poses (units, 4, 4; NaN where unknown), by the units' own rotations.
 
     One camera also gets its scale there. Returns whether there were poses enough.
     """
-    units = np.flatnonzero(model.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
+    units = np.flatnonzero(mapper.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
     if len(units) < MIN_ROUGH_POSES:
         return False
     rough = rough_world_from_rig[units]
-    if model.drive.has_single_camera:
+    if mapper.drive.has_single_camera:
         if _extent(rough[:, :3, 3]) < MIN_EXTENT_SIGMAS * sigma_translation_m:
             return False
-        scale_with_baselines(model, _extent(rough[:, :3, 3]) / _extent(model.state.unit_position_m[units]))
-    own = model.state.world_from_rig[units]
+        scale_with_baselines(mapper, _extent(rough[:, :3, 3]) / _extent(mapper.state.unit_position_m[units]))
+    own = mapper.state.world_from_rig[units]
     rotation = robust_mean_rotation(rough[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
-    _move(model, se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T)))
+    _move(mapper, se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T)))
     return True
 
 
@@ -106,8 +108,8 @@ def _extent(position_m: Floats) -> float:
     return max(float(np.median(np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1))), 1e-9)
 
 
-def _move(model: Model, world_from_model: Floats) -> None:
-    state = model.state
+def _move(mapper: Mapper, world_from_model: Floats) -> None:
+    state = mapper.state
     state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
     state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)
     state.points_m[:] = se3.apply(world_from_model, state.points_m)
@@ -121,7 +123,7 @@ def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> 
 
 
 def _findings(
-    model: Model,
+    mapper: Mapper,
     alignment: GnssAlignment,
     measured_m: Floats,
     sigma_m: Floats,
@@ -131,10 +133,10 @@ def _findings(
 ) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
     findings = []
-    antenna = model.state.unit_position_m[units] + model.state.unit_rotation[units] @ antenna_in_rig_m
+    antenna = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ antenna_in_rig_m
     centre = antenna.mean(0)
     fitted = centre + alignment.scale * (antenna - centre)
-    times = model.drive.timestamps_us[units]
+    times = mapper.drive.timestamps_us[units]
     offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, times)
     # The receiver's errors change slowly, so its samples know less of the clock than independent ones would.
     inflation = float(np.sqrt(correlated))
@@ -148,7 +150,7 @@ def _findings(
                 "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
             )
         )
-    _, sigma_rig = scale_of_baselines(model)
+    _, sigma_rig = scale_of_baselines(mapper)
     sigma = float(np.hypot(sigma_rig, inflation * alignment.sigma_scale))
     if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
         findings.append(

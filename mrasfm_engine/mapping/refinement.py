@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
-from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, judge_directions
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions, solve
 from mrasfm_engine.errors import ReconstructionError
@@ -16,17 +16,24 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
     CalibrationDecision,
+    assess_calibration,
     calibration_prior,
-    judge_calibration,
+    resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
-    settle_scale,
 )
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
-from mrasfm_engine.mapping.mapper import Model
-from mrasfm_engine.mapping.miscalibration import MIN_OTHERS, WrongCamera, WrongPair, find_wrong_cameras, find_wrong_pair
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.miscalibration import (
+    MIN_OTHERS,
+    MiscalibratedPair,
+    Miscalibration,
+    find_miscalibrations,
+    find_wrong_pair,
+)
 from mrasfm_engine.mapping.placement import Placement, place_by_gnss, place_by_rough_poses
-from mrasfm_engine.mapping.road import RoadJudgement, drop_off_road
+from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering
@@ -54,9 +61,9 @@ class Refinement:
     certainty: Covariances | None = None
     directions: Observability | None = None  # of the cameras' poses; None where it is not known
     held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
-    wrong_cameras: list[WrongCamera] = field(default_factory=list)
-    wrong_pair: WrongPair | None = None  # of a rig of two cameras
-    road: RoadJudgement | str = "semantic_triangulation is switched off"  # the last one, or why there is none
+    miscalibrations: list[Miscalibration] = field(default_factory=list)
+    wrong_pair: MiscalibratedPair | None = None  # of a rig of two cameras
+    road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
     def georeferenced(self) -> bool:
@@ -65,7 +72,7 @@ class Refinement:
 
 
 def refine(
-    model: Model,
+    mapper: Mapper,
     *,
     gnss: GnssTrack | None,
     antenna_in_rig_m: Floats | None,
@@ -85,77 +92,78 @@ def refine(
     result = Refinement()
     positions = None
     if gnss is not None and antenna_in_rig_m is not None:
-        result.placement = place_by_gnss(model, gnss, antenna_in_rig_m)
+        result.placement = place_by_gnss(mapper, gnss, antenna_in_rig_m)
         positions = result.placement.prior
-    rough = model.drive.manifest.rough_poses
+    rough = mapper.drive.manifest.rough_poses
     placed = positions is not None
     if not placed and rough_world_from_rig is not None and rough is not None:
-        placed = place_by_rough_poses(model, rough_world_from_rig, rough.sigma_translation_m)
+        placed = place_by_rough_poses(mapper, rough_world_from_rig, rough.sigma_translation_m)
         result.placed_by_rough_poses = placed
-    if not placed and model.drive.has_single_camera:
+    if not placed and mapper.drive.has_single_camera:
         raise ReconstructionError(
             "one camera tells no scale, and neither GNSS nor rough poses could: "
             + (result.placement.reason if result.placement is not None else "the drive has none that are usable"),
             remedy="Give a second camera with its baseline, or positions that follow the car's way.",
             code="no-metric-scale",
         )
-    free_units = _free_units(model, georeferenced=positions is not None and model.config.adjustment.priors)
-    result.sigma_px = _observation_sigma(model)
-    result.calibration = judge_calibration(
-        model,
+    free_units = _free_units(mapper, georeferenced=positions is not None and mapper.config.bundle_adjustment.priors)
+    result.sigma_px = _observation_sigma(mapper)
+    result.calibration = assess_calibration(
+        mapper,
         free_units=free_units,
-        terms=_terms(model, positions, result),
+        terms=_terms(mapper, positions, result),
         georeferenced=positions is not None,
-        options=_options(model, result.sigma_px),
+        options=_options(mapper, result.sigma_px),
     )
-    result.recalibrated = np.full(len(model.camera_kind), result.calibration.free)
+    result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
     if not result.calibration.free:
-        result.recalibrated = _wrong_although_held(model, free_units, positions, result, cancel)
-    result.focal_free = model.config.adjustment.refine_focal and result.calibration.free
-    _settle(model, result, _terms(model, positions, result))
+        result.recalibrated = _wrong_although_held(mapper, free_units, positions, result, cancel)
+    result.focal_free = mapper.config.bundle_adjustment.refine_focal and result.calibration.free
+    _settle(mapper, result, _terms(mapper, positions, result))
     for done in range(ROUNDS):
         is_last = done == ROUNDS - 1
-        result.sigma_px = _observation_sigma(model)
-        terms = _terms(model, positions, result)
+        result.sigma_px = _observation_sigma(mapper)
+        terms = _terms(mapper, positions, result)
         result.adjustments.append(
-            model.adjust(
-                free_units & model.registered,
+            adjust_poses(
+                mapper,
+                free_units & mapper.registered,
                 free_cameras=result.recalibrated,
                 free_focal=result.focal_free,
                 terms=terms,
-                options=_options(model, result.sigma_px, rough=not is_last),
+                options=_options(mapper, result.sigma_px, rough=not is_last),
                 cancel=cancel,
             )
         )
-        _settle(model, result, terms)
+        _settle(mapper, result, terms)
         if is_last:
-            model.readmit()
+            mapper.readmit()
         else:
-            model.complete()
-        observations, points = model.filter(model.config.mapping.filter_error_px)
-        if model.config.mapping.semantic_triangulation:
-            result.road = drop_off_road(model, final=is_last)
-        result.units_dropped += model.drop_unsupported(model.config.mapping.min_pnp_inliers).tolist()
+            mapper.complete()
+        observations, points = mapper.filter(mapper.config.mapping.filter_error_px)
+        if mapper.config.mapping.semantic_triangulation:
+            result.road = drop_off_road(mapper, for_map=is_last)
+        result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points
         if progress is not None:
             progress(done + 1, ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
-    result.certainty = _certainty(model, positions, result)
-    result.directions = _directions(model, result.certainty)
+    result.certainty = _certainty(mapper, positions, result)
+    result.directions = _directions(mapper, result.certainty)
     if result.recalibrated.any() and result.directions is not None:
         if result.calibration.free and result.directions.to_hold.any():
-            _hold_unobserved(model, positions, result, free_units & model.registered, cancel)
+            _hold_unobserved(mapper, positions, result, free_units & mapper.registered, cancel)
         if result.georeferenced and result.directions.scale_only_prior:
-            scale_with_baselines(model, scale_of_baselines(model)[0])
-        known = calibration_prior(model), model.state, result.directions
-        result.wrong_cameras = find_wrong_cameras(*known)
+            scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
+        known = calibration_prior(mapper), mapper.state, result.directions
+        result.miscalibrations = find_miscalibrations(*known)
         result.wrong_pair = find_wrong_pair(*known)
     return result
 
 
 def _wrong_although_held(
-    model: Model,
+    mapper: Mapper,
     free_units: Bools,
     positions: PositionPrior | None,
     result: Refinement,
@@ -166,41 +174,45 @@ def _wrong_although_held(
     A straight street leaves the scale to the calibration, but shows very well that one camera looks elsewhere than the
     others say. It is tried with all cameras free; the result is used for nothing else.
     """
-    cameras = len(model.camera_kind)
+    cameras = len(mapper.camera_kind)
     wrong = np.zeros(cameras, dtype=np.bool_)
-    if cameras <= MIN_OTHERS or not model.config.adjustment.refine_calibration or model.drive.has_single_camera:
+    if (
+        cameras <= MIN_OTHERS
+        or not mapper.config.bundle_adjustment.refine_calibration
+        or mapper.drive.has_single_camera
+    ):
         return wrong
-    problem, _ = model.problem(
+    problem, _ = mapper.problem(
         free_units,
         free_cameras=np.ones(cameras, dtype=np.bool_),
-        terms=[calibration_prior(model), *_terms(model, positions, result)],
-        options=_options(model, result.sigma_px, rough=True),
+        terms=[calibration_prior(mapper), *_terms(mapper, positions, result)],
+        options=_options(mapper, result.sigma_px, rough=True),
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return wrong
     solution, _ = solve(problem, cancel=cancel)
-    directions = _directions(model, covariances(problem, solution))
+    directions = _directions(mapper, covariances(problem, solution))
     if directions is not None:
-        for found in find_wrong_cameras(calibration_prior(model), solution, directions):
+        for found in find_miscalibrations(calibration_prior(mapper), solution, directions):
             wrong[found.camera] = True
     return wrong if (~wrong).sum() >= MIN_OTHERS else np.zeros_like(wrong)
 
 
-def _directions(model: Model, certainty: Covariances | None) -> Observability | None:
-    cameras = len(model.camera_kind)
+def _directions(mapper: Mapper, certainty: Covariances | None) -> Observability | None:
+    cameras = len(mapper.camera_kind)
     if certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
         return None
-    prior = calibration_prior(model)
-    return judge_directions(
+    prior = calibration_prior(mapper)
+    return assess_directions(
         certainty.calibration,
-        position_m=model.state.camera_position_m,
+        position_m=mapper.state.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
     )
 
 
 def _hold_unobserved(
-    model: Model,
+    mapper: Mapper,
     positions: PositionPrior | None,
     result: Refinement,
     free_units: Bools,
@@ -213,58 +225,59 @@ def _hold_unobserved(
     """
     assert result.directions is not None
     result.held = result.directions.to_hold
-    terms = _terms(model, positions, result)
+    terms = _terms(mapper, positions, result)
     result.adjustments.append(
-        model.adjust(
+        adjust_poses(
+            mapper,
             free_units,
-            free_cameras=np.ones(len(model.camera_kind), dtype=np.bool_),
+            free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
             free_focal=result.focal_free,
             terms=terms,
-            options=_options(model, result.sigma_px),
+            options=_options(mapper, result.sigma_px),
             cancel=cancel,
         )
     )
-    _settle(model, result, terms)
+    _settle(mapper, result, terms)
 
 
-def _settle(model: Model, result: Refinement, terms: Sequence[Term]) -> None:
+def _settle(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:
     """Let the priors and the positions say the scale, where the calibration and with it the scale may vary."""
-    several = not model.drive.has_single_camera
-    if result.calibration.free and several and terms and model.config.adjustment.camera_set_adjustment:
-        settle_scale(model, terms)
+    several = not mapper.drive.has_single_camera
+    if result.calibration.free and several and terms and mapper.config.bundle_adjustment.camera_set_adjustment:
+        resolve_scale(mapper, terms)
 
 
-def _options(model: Model, sigma_px: float, *, rough: bool = False) -> SolverOptions:
+def _options(mapper: Mapper, sigma_px: float, *, rough: bool = False) -> SolverOptions:
     return SolverOptions(
         max_iterations=15 if rough else 40,
         function_tolerance=TOLERANCE,
         decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
         initial_damping=INITIAL_DAMPING,
-        loss_scale=model.config.adjustment.loss_scale,
+        loss_scale=mapper.config.bundle_adjustment.loss_scale,
         sigma_px=sigma_px,
-        threads=model.config.threads,
+        threads=mapper.config.threads,
     )
 
 
-def _free_units(model: Model, *, georeferenced: bool) -> Bools:
+def _free_units(mapper: Mapper, *, georeferenced: bool) -> Bools:
     """All registered units; without positions the first one holds the frame."""
-    free = model.registered.copy()
+    free = mapper.registered.copy()
     if not georeferenced:
         free[np.flatnonzero(free)[0]] = False
     return free
 
 
-def _observation_sigma(model: Model) -> float:
+def _observation_sigma(mapper: Mapper) -> float:
     """Standard deviation of an image coordinate, from the median error and the redundancy of the points."""
-    rows = np.flatnonzero(model.kept)
+    rows = np.flatnonzero(mapper.is_inlier)
     if not len(rows):
         raise ReconstructionError(
             "no point of the scene is left after filtering",
             remedy="Check the cameras' intrinsics, and that the images belong to them.",
             code="nothing-left",
         )
-    tracks = model.tracks.of_keypoint[rows]
-    errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, tracks)
+    tracks = mapper.tracks.of_keypoint[rows]
+    errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, tracks)
     points = np.count_nonzero(np.bincount(tracks))
     redundancy = max(0.1, 1.0 - 3.0 * points / (2.0 * len(rows)))
     # The squared length of a 2D normal error has the median 2 ln 2 sigma^2.
@@ -272,22 +285,22 @@ def _observation_sigma(model: Model) -> float:
     return float(np.clip(sigma, *SIGMA_PX_RANGE))
 
 
-def _terms(model: Model, positions: PositionPrior | None, result: Refinement) -> list[Term]:
+def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> list[Term]:
     terms: list[Term] = []
-    if not model.config.adjustment.priors:
+    if not mapper.config.bundle_adjustment.priors:
         return terms
     if result.calibration.free:
-        terms.append(calibration_prior(model, result.held))
+        terms.append(calibration_prior(mapper, result.held))
     elif result.recalibrated.any():
         # The cameras that stay hold the gauge.
-        terms.append(replace(calibration_prior(model), gauge_weights=(~result.recalibrated).astype(np.float64)))
+        terms.append(replace(calibration_prior(mapper), gauge_weights=(~result.recalibrated).astype(np.float64)))
     if result.focal_free:
-        terms.append(_focal_prior(model))
+        terms.append(_focal_prior(mapper))
     if positions is not None:
         terms += [
             positions,
             UprightPrior(
-                unit=np.flatnonzero(model.registered),
+                unit=np.flatnonzero(mapper.registered),
                 sigma_roll_rad=float(SIGMA_ROLL_RAD),
                 sigma_pitch_rad=float(SIGMA_PITCH_RAD),
             ),
@@ -295,33 +308,35 @@ def _terms(model: Model, positions: PositionPrior | None, result: Refinement) ->
     return terms
 
 
-def _focal_prior(model: Model) -> FocalPrior:
-    given = np.array([camera.params[0] for camera in model.drive.cameras])
-    sigma = np.array([camera.sigma_focal_px or np.nan for camera in model.drive.cameras]) / given
-    return FocalPrior(focal_px=given, sigma=np.where(np.isfinite(sigma), sigma, model.config.adjustment.sigma_focal))
+def _focal_prior(mapper: Mapper) -> FocalPrior:
+    given = np.array([camera.params[0] for camera in mapper.drive.cameras])
+    sigma = np.array([camera.sigma_focal_px or np.nan for camera in mapper.drive.cameras]) / given
+    return FocalPrior(
+        focal_px=given, sigma=np.where(np.isfinite(sigma), sigma, mapper.config.bundle_adjustment.sigma_focal)
+    )
 
 
-def _certainty(model: Model, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
+def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
     """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
 
     None where they would not be those of what was adjusted, and where there is too much for an inverse.
     """
-    if not (model.config.adjustment.priors and model.config.adjustment.camera_set_adjustment):
+    if not (mapper.config.bundle_adjustment.priors and mapper.config.bundle_adjustment.camera_set_adjustment):
         return None
-    several = not model.drive.has_single_camera
+    several = not mapper.drive.has_single_camera
     terms = [
         term
-        for term in _terms(model, positions, result)
+        for term in _terms(mapper, positions, result)
         if result.calibration.free or not isinstance(term, CalibrationPrior)
     ]
     if several and not result.calibration.free:
-        terms.append(calibration_prior(model))
-    problem, _ = model.problem(
-        _free_units(model, georeferenced=positions is not None),
-        free_cameras=np.full(len(model.camera_kind), several),
+        terms.append(calibration_prior(mapper))
+    problem, _ = mapper.problem(
+        _free_units(mapper, georeferenced=positions is not None),
+        free_cameras=np.full(len(mapper.camera_kind), several),
         free_focal=result.focal_free,
         terms=terms,
-        options=_options(model, result.sigma_px),
+        options=_options(mapper, result.sigma_px),
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return None

@@ -27,10 +27,10 @@ def resect(
     world_from_rig: Floats,
     xy_px: Floats,
     points_m: Floats,
-    eye: Ints,
-    rig_from_eye: Floats,
-    eye_kind: Ints,
-    eye_params: Floats,
+    view: Ints,
+    rig_from_view: Floats,
+    view_kind: Ints,
+    view_params: Floats,
 ) -> Floats | None:
     """The pose (4, 4) of a rig near an expected one (4, 4) that fits what its eyes see; None where there is none.
 
@@ -42,12 +42,12 @@ def resect(
         Poses (e, 4, 4) of the eyes, and their cameras as `pack_cameras` has them.
     """
     rotation, position = world_from_rig[:3, :3].copy(), world_from_rig[:3, 3].copy()
-    eyes = np.ascontiguousarray(rig_from_eye[:, :3, :3]), np.ascontiguousarray(rig_from_eye[:, :3, 3])
+    views = np.ascontiguousarray(rig_from_view[:, :3, :3]), np.ascontiguousarray(rig_from_view[:, :3, 3])
     square, gradient = np.empty((6, 6)), np.empty(6)
     for sigma_px in SIGMAS_PX:
         for _ in range(STEPS):
             _pose_system(
-                rotation, position, *eyes, eye_kind, eye_params, eye, xy_px, points_m, sigma_px, square, gradient
+                rotation, position, *views, view_kind, view_params, view, xy_px, points_m, sigma_px, square, gradient
             )
             try:
                 step = -np.linalg.solve(square, gradient)
@@ -63,22 +63,22 @@ def resect(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _pose_system(
-    r: Any, t: Any, eye_r: Any, eye_t: Any, kind: Any, params: Any, eye: Any, xy: Any, points: Any, sigma: float,
+    r: Any, t: Any, view_r: Any, view_t: Any, kind: Any, params: Any, view: Any, xy: Any, points: Any, sigma: float,
     square: Any, gradient: Any,
 ) -> None:  # fmt: skip
     """J'WJ (6, 6) and J'Wr (6,) in steps [omega, tau] of the pose, as in `adjustment.normal_equations`."""
     square[:] = 0.0
     gradient[:] = 0.0
     work, proj, d, rig, n, j = np.empty(6), np.empty(8), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
-    for k in range(len(eye)):
-        e = eye[k]
+    for k in range(len(view)):
+        e = view[k]
         for i in range(3):
             d[i] = points[k, i] - t[i]
         for i in range(3):
-            rig[i] = r[0, i] * d[0] + r[1, i] * d[1] + r[2, i] * d[2] - eye_t[e, i]
-        x = eye_r[e, 0, 0] * rig[0] + eye_r[e, 1, 0] * rig[1] + eye_r[e, 2, 0] * rig[2]
-        y = eye_r[e, 0, 1] * rig[0] + eye_r[e, 1, 1] * rig[1] + eye_r[e, 2, 1] * rig[2]
-        z = eye_r[e, 0, 2] * rig[0] + eye_r[e, 1, 2] * rig[1] + eye_r[e, 2, 2] * rig[2]
+            rig[i] = r[0, i] * d[0] + r[1, i] * d[1] + r[2, i] * d[2] - view_t[e, i]
+        x = view_r[e, 0, 0] * rig[0] + view_r[e, 1, 0] * rig[1] + view_r[e, 2, 0] * rig[2]
+        y = view_r[e, 0, 1] * rig[0] + view_r[e, 1, 1] * rig[1] + view_r[e, 2, 1] * rig[2]
+        z = view_r[e, 0, 2] * rig[0] + view_r[e, 1, 2] * rig[1] + view_r[e, 2, 2] * rig[2]
         if z < MIN_DEPTH_M:
             continue
         project(kind[e], params[e], x, y, z, work, proj)
@@ -88,7 +88,7 @@ def _pose_system(
             residual = (r0 if row == 0 else r1) * s
             p0, p1, p2 = proj[2 + 3 * row], proj[3 + 3 * row], proj[4 + 3 * row]
             for i in range(3):
-                rig[i] = (p0 * eye_r[e, i, 0] + p1 * eye_r[e, i, 1] + p2 * eye_r[e, i, 2]) * s / sigma
+                rig[i] = (p0 * view_r[e, i, 0] + p1 * view_r[e, i, 1] + p2 * view_r[e, i, 2]) * s / sigma
             for i in range(3):
                 n[i] = rig[0] * r[i, 0] + rig[1] * r[i, 1] + rig[2] * r[i, 2]
             j[0], j[1], j[2] = n[1] * d[2] - n[2] * d[1], n[2] * d[0] - n[0] * d[2], n[0] * d[1] - n[1] * d[0]

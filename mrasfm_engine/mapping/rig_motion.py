@@ -1,6 +1,6 @@
 """Where the rig stands when an image is taken, relative to its unit's timestamp.
 
-`State.unit_from_shot` comes from the units' own trajectory: the motion around a unit is interpolated from the
+`State.unit_from_band` comes from the units' own trajectory: the motion around a unit is interpolated from the
 registered units before and after it, and follows them when they are adjusted: were it held meanwhile, baselines between
 cameras that are not simultaneous would hold on to the scale that it has, and adjusting and renewing in turns need not
 converge. The same place holds poses that images have of their own, apart from the rig.
@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.problem import ShotMotion
+from mrasfm_engine.bundle_adjustment.problem import RowBandMotion
 from mrasfm_engine.findings import Finding, warning
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.local_motion import MAX_GAP_S, LocalMotion, local_motion, moved, smoothed_velocity
-from mrasfm_engine.scene.row_bands import MAX_BAND_S, Shots
+from mrasfm_engine.scene.row_bands import MAX_BAND_S, RowBands
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -25,36 +25,36 @@ PRIOR_WINDOW_S = 1.0  # over which the velocity of noisy prior poses is averaged
 
 @dataclass(frozen=True, kw_only=True)
 class LargestMotion:
-    """The most that shots are apart from their unit, over the registered units."""
+    """The most that row bands are apart from their unit, over the registered units."""
 
     translation_m: float
     rotation_deg: float
 
 
 class RigMotion:
-    """The motion within units. It changes a state's `unit_from_shot` in place and keeps no poses of units itself.
+    """The motion within units. It changes a state's `unit_from_band` in place and keeps no poses of units itself.
 
     Parameters
     ----------
-    shots
+    row bands
         When every image (or band of its rows) was taken.
     timestamps_us
         The units' times (u,).
     """
 
-    def __init__(self, shots: Shots, timestamps_us: Ints) -> None:
-        self.shots = shots
+    def __init__(self, bands: RowBands, timestamps_us: Ints) -> None:
+        self.bands = bands
         self._time_s = (timestamps_us - timestamps_us[0]) / 1e6
-        self._own = np.zeros(len(shots.middle_of_image), dtype=np.bool_)
+        self._own = np.zeros(len(bands.middle_of_image), dtype=np.bool_)
         self._unit_from_image = np.tile(np.eye(4), (len(self._own), 1, 1))
-        self._shot_range = np.searchsorted(shots.unit, np.arange(len(timestamps_us) + 1))
+        self._band_range = np.searchsorted(bands.unit, np.arange(len(timestamps_us) + 1))
         # Of units without registered neighbours; zero where it is not known.
         self._prior_velocity = np.zeros((len(timestamps_us), 6))
         self._prior_known = np.zeros(len(timestamps_us), dtype=np.bool_)
 
     def follow_prior(self, world_from_rig: Floats) -> None:
         """Where no registered unit says how the vehicle moves, prior poses (u, 4, 4) do; NaN where unknown."""
-        if not self.shots.simultaneous:
+        if not self.bands.simultaneous:
             velocity = smoothed_velocity(world_from_rig, self._time_s, window_s=PRIOR_WINDOW_S)
             self._prior_known[:] = np.isfinite(velocity).all(axis=1)
             self._prior_velocity = np.nan_to_num(velocity)
@@ -79,10 +79,10 @@ class RigMotion:
     @property
     def needed(self) -> bool:
         """Whether any image is apart from its unit at all."""
-        return bool(self._own.any()) or not self.shots.simultaneous
+        return bool(self._own.any()) or not self.bands.simultaneous
 
     def renew(self, state: State, registered: Bools, units: Ints | None = None) -> float:
-        """Compute `unit_from_shot` anew from the registered units' poses; also says how far it moved, in metres.
+        """Compute `unit_from_band` anew from the registered units' poses; also says how far it moved, in metres.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class RigMotion:
             return 0.0
         motion = self._motion(state, registered)
         chosen = np.flatnonzero(registered) if units is None else _with_neighbours(units, registered)
-        return self._apply(state, motion, self._shots_of(chosen))
+        return self._apply(state, motion, self._bands_of(chosen))
 
     def _motion(self, state: State, registered: Bools) -> LocalMotion:
         motion = local_motion(state.world_from_rig, self._time_s, registered)
@@ -103,28 +103,28 @@ class RigMotion:
         motion.latest_s[:] += gap
         return motion
 
-    def in_adjustment(self, state: State, registered: Bools, free_units: Bools) -> ShotMotion | None:
-        """How shots follow the free units while these are adjusted; images with poses of their own do not."""
+    def in_adjustment(self, state: State, registered: Bools, free_units: Bools) -> RowBandMotion | None:
+        """How row bands follow the free units while these are adjusted; images with poses of their own do not."""
         if state.simultaneous:
             return None
-        rows = self._shots_of(_with_neighbours(np.flatnonzero(free_units & registered), registered))
+        rows = self._bands_of(_with_neighbours(np.flatnonzero(free_units & registered), registered))
         motion = self._motion(state, registered)
-        moving = rows[~self._own[self.shots.image[rows]]]
-        held = ShotMotion.held(self.shots.unit)
-        held.support[moving] = motion.support[self.shots.unit[moving]]
-        held.weight[moving] = motion.weights(self.shots.unit[moving], self.shots.time_offset_s[moving])
+        moving = rows[~self._own[self.bands.image[rows]]]
+        held = RowBandMotion.held(self.bands.unit)
+        held.support[moving] = motion.support[self.bands.unit[moving]]
+        held.weight[moving] = motion.weights(self.bands.unit[moving], self.bands.time_offset_s[moving])
 
-        def follow(after: State) -> State:
+        def place_bands(after: State) -> State:
             after = replace(
-                after, shot_rotation=after.shot_rotation.copy(), shot_position_m=after.shot_position_m.copy()
+                after, band_rotation=after.band_rotation.copy(), band_position_m=after.band_position_m.copy()
             )
             self._apply(after, self._motion(after, registered), rows)
             return after
 
-        return ShotMotion(support=held.support, weight=held.weight, follow=follow)
+        return RowBandMotion(support=held.support, weight=held.weight, place_bands=place_bands)
 
     def predict(self, state: State, registered: Bools, unit: int) -> None:
-        """Set `unit_from_shot` of a unit that has no pose yet: it moves as its registered neighbours do."""
+        """Set `unit_from_band` of a unit that has no pose yet: it moves as its registered neighbours do."""
         if state.simultaneous:
             return
         velocity = self._prior_velocity[unit]
@@ -135,9 +135,9 @@ class RigMotion:
             around = local_motion(state.world_from_rig_of(pair), self._time_s[pair], np.ones(2, dtype=np.bool_))
             if around.known.all():
                 velocity = around.velocity[0]
-        rows = self._shots_of(np.array([unit]))
-        at_shot = moved(self.shots.time_offset_s[rows, None] * velocity)
-        self._write(state, rows, at_shot, moved(self._offset_of_image(rows)[:, None] * velocity))
+        rows = self._bands_of(np.array([unit]))
+        at_band = moved(self.bands.time_offset_s[rows, None] * velocity)
+        self._write(state, rows, at_band, moved(self._offset_of_image(rows)[:, None] * velocity))
 
     def expected_pose(self, state: State, registered: Bools, unit: int) -> Floats | None:
         """Where a unit (4, 4) is if it moves as the two registered nearest in time do; None where these are far."""
@@ -159,7 +159,7 @@ class RigMotion:
         """The rig's poses (images, 4, 4) at the images' own timestamps, relative to their units'."""
         if state.simultaneous:
             return np.tile(np.eye(4), (len(self._own), 1, 1))
-        return state.unit_from_shot[self.shots.middle_of_image]
+        return state.unit_from_band[self.bands.middle_of_image]
 
     def scale(self, state: State, factor: float, mean_camera_m: Floats) -> None:
         """Follow a scaling of units and points, and of the cameras about their mean place in the rig (3,).
@@ -169,54 +169,54 @@ class RigMotion:
         """
         if state.simultaneous:
             return
-        turned = state.shot_rotation @ mean_camera_m - mean_camera_m
-        state.shot_position_m[:] = factor * state.shot_position_m + (factor - 1.0) * turned
+        turned = state.band_rotation @ mean_camera_m - mean_camera_m
+        state.band_position_m[:] = factor * state.band_position_m + (factor - 1.0) * turned
         own = np.flatnonzero(self._own)
         self._unit_from_image[own] = self.unit_from_image(state)[own]
 
     def largest(self, state: State, registered: Bools) -> LargestMotion:
         """How far apart images and units are."""
-        rows = np.flatnonzero(registered[self.shots.unit])
+        rows = np.flatnonzero(registered[self.bands.unit])
         if state.simultaneous or not len(rows):
             return LargestMotion(translation_m=0.0, rotation_deg=0.0)
         return LargestMotion(
-            translation_m=float(np.linalg.norm(state.shot_position_m[rows], axis=1).max()),
-            rotation_deg=float(se3.rotation_angle_deg(state.shot_rotation[rows]).max()),
+            translation_m=float(np.linalg.norm(state.band_position_m[rows], axis=1).max()),
+            rotation_deg=float(se3.rotation_angle_deg(state.band_rotation[rows]).max()),
         )
 
     def not_compensated(self, state: State, registered: Bools) -> Ints:
-        """Registered units whose shots are apart in time although nothing says how the vehicle moved meanwhile.
+        """Registered units whose row bands are apart in time although nothing says how the vehicle moved meanwhile.
 
-        Their shots stand where the unit does, as if all had been taken at once.
+        Their row bands stand where the unit does, as if all had been taken at once.
         """
         # Where an image has a pose of its own, only its rows are apart from it.
-        own = self._own[self.shots.image]
-        apart_s = self.shots.time_offset_s - np.where(own, self._offset_of_image(np.arange(len(self.shots))), 0.0)
+        own = self._own[self.bands.image]
+        apart_s = self.bands.time_offset_s - np.where(own, self._offset_of_image(np.arange(len(self.bands))), 0.0)
         unknown = ~local_motion(state.world_from_rig, self._time_s, registered).known & ~self._prior_known
-        return np.intersect1d(self.shots.unit[np.abs(apart_s) > MAX_BAND_S], np.flatnonzero(registered & unknown))
+        return np.intersect1d(self.bands.unit[np.abs(apart_s) > MAX_BAND_S], np.flatnonzero(registered & unknown))
 
-    def _shots_of(self, units: Ints) -> Ints:
-        first, last = self._shot_range[units], self._shot_range[units + 1]
+    def _bands_of(self, units: Ints) -> Ints:
+        first, last = self._band_range[units], self._band_range[units + 1]
         rows = [np.arange(lo, hi) for lo, hi in zip(first, last, strict=True)]
         return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
 
     def _offset_of_image(self, rows: Ints) -> Floats:
-        result: Floats = self.shots.time_offset_s[self.shots.middle_of_image[self.shots.image[rows]]]
+        result: Floats = self.bands.time_offset_s[self.bands.middle_of_image[self.bands.image[rows]]]
         return result
 
     def _apply(self, state: State, motion: LocalMotion, rows: Ints) -> float:
-        unit, before = self.shots.unit[rows], state.shot_position_m[rows]
-        at_shot = motion.at(unit, self.shots.time_offset_s[rows])
-        self._write(state, rows, at_shot, None if not self._own.any() else motion.at(unit, self._offset_of_image(rows)))
-        return float(np.linalg.norm(state.shot_position_m[rows] - before, axis=1).max(initial=0.0))
+        unit, before = self.bands.unit[rows], state.band_position_m[rows]
+        at_band = motion.at(unit, self.bands.time_offset_s[rows])
+        self._write(state, rows, at_band, None if not self._own.any() else motion.at(unit, self._offset_of_image(rows)))
+        return float(np.linalg.norm(state.band_position_m[rows] - before, axis=1).max(initial=0.0))
 
-    def _write(self, state: State, rows: Ints, at_shot: Floats, at_image: Floats | None) -> None:
-        own = self._own[self.shots.image[rows]]
+    def _write(self, state: State, rows: Ints, at_band: Floats, at_image: Floats | None) -> None:
+        own = self._own[self.bands.image[rows]]
         if at_image is not None and own.any():
-            at_shot = at_shot.copy()
-            own_pose = self._unit_from_image[self.shots.image[rows[own]]]
-            at_shot[own] = own_pose @ se3.inverse(at_image[own]) @ at_shot[own]
-        state.shot_rotation[rows], state.shot_position_m[rows] = at_shot[:, :3, :3], at_shot[:, :3, 3]
+            at_band = at_band.copy()
+            own_pose = self._unit_from_image[self.bands.image[rows[own]]]
+            at_band[own] = own_pose @ se3.inverse(at_image[own]) @ at_band[own]
+        state.band_rotation[rows], state.band_position_m[rows] = at_band[:, :3, :3], at_band[:, :3, 3]
 
 
 def finding(not_compensated: int, units: int) -> Finding:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from mrasfm_engine.triangulation.road_prior import points_below_the_way, standing_is_impossible
@@ -25,7 +25,7 @@ SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoadJudgement:
+class RoadAssessment:
     """Points that were taken for the road's, and which of them are on it. All arrays are by such a point."""
 
     source: RoadSource
@@ -35,7 +35,7 @@ class RoadJudgement:
     distance_m: Floats  # signed, to the surface; NaN where there is none
     patch: Ints  # -1 where there is none
     limit_m: Floats  # how far from the surface a point of its uncertainty may be
-    kept: Bools
+    is_inlier: Bools
 
     @property
     def road(self) -> Road:
@@ -45,11 +45,11 @@ class RoadJudgement:
             surface=self.fitted.surface,
             roughness_m=self.fitted.roughness_m,
             rig_height_m=self.fitted.rig_height_m,
-            before=RoadPoints(points_m=self.points_m, distance_m=self.distance_m, kept=self.kept),
+            before=RoadPoints(points_m=self.points_m, distance_m=self.distance_m, is_inlier=self.is_inlier),
         )
 
 
-def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
+def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
     """Fit the road's surface to the model's points and judge each that is taken for the road's; else why not.
 
     Parameters
@@ -57,35 +57,35 @@ def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
     final
         Whether the points are for the map. Before, only those are off that are by their own uncertainty.
     """
-    config = model.config.mapping
-    world_from_rig = model.state.world_from_rig[model.registered]
-    source, tracks = RoadSource.MASKS, np.flatnonzero(model.solved & (model.track_class == ROAD))
-    if not (model.track_class == ROAD).any():
-        if _all_images_are_masked(model):
+    config = mapper.config.mapping
+    world_from_rig = mapper.state.world_from_rig[mapper.registered]
+    source, tracks = RoadSource.MASKS, np.flatnonzero(mapper.triangulated & (mapper.track_class == ROAD))
+    if not (mapper.track_class == ROAD).any():
+        if _all_images_are_masked(mapper):
             return "no keypoint lies on the road of the masks"
-        if not final:
+        if not for_map:
             return "without masks, the road is judged in the finished scene only: too unsure to bear on poses"
         source = RoadSource.GEOMETRY
-        tracks = np.flatnonzero(model.solved & (model.track_class == UNKNOWN))
-        below = points_below_the_way(model.state.points_m[tracks], world_from_rig, _lowest_camera_m(model))
+        tracks = np.flatnonzero(mapper.triangulated & (mapper.track_class == UNKNOWN))
+        below = points_below_the_way(mapper.state.points_m[tracks], world_from_rig, _lowest_camera_m(mapper))
         if below is None:
             return "without masks, no points lie on one level below the vehicle's way"
         tracks = tracks[below]
-    points = model.state.points_m[tracks]
-    sigma = height_sigmas_m(model, tracks, world_from_rig)
+    points = mapper.state.points_m[tracks]
+    sigma = height_sigmas_m(mapper, tracks, world_from_rig)
     fitted = fit_road(
         points,
         sigma,
         world_from_rig,
         radius_m=config.road_patch_m,
-        rng=np.random.default_rng(model.config.seed),
-        rounds=2 if final else 1,
+        rng=np.random.default_rng(mapper.config.seed),
+        rounds=2 if for_map else 1,
     )
     if fitted is None:
         return f"{len(tracks)} points of the road are too few, or lie on no surface"
     distance, patch = fitted.surface.locate(points)
     limit = config.road_sigmas * np.hypot(sigma, fitted.roughness_m)
-    if final:
+    if for_map:
         # In the map, what is off the road is wrong however uncertain it is; to poses, weak rays do no harm.
         limit = np.minimum(limit, max(config.road_max_offset_m, config.road_sigmas * fitted.roughness_m))
     off = np.abs(distance) > limit
@@ -95,7 +95,7 @@ def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
     off[alone] = np.abs(offset) > limit[alone] + MAX_SLOPE_CHANGE * beyond
     if source is RoadSource.GEOMETRY:
         off &= standing_is_impossible(points, distance, world_from_rig)
-    return RoadJudgement(
+    return RoadAssessment(
         source=source,
         fitted=fitted,
         tracks=tracks,
@@ -103,35 +103,35 @@ def judge_road(model: Model, *, final: bool) -> RoadJudgement | str:
         distance_m=distance,
         patch=patch,
         limit_m=limit,
-        kept=~off,
+        is_inlier=~off,
     )
 
 
-def drop_off_road(model: Model, *, final: bool = False) -> RoadJudgement | str:
-    """Judge the road's points and drop those off its surface; they wait until `Model.complete` or `Model.readmit`."""
-    judgement = judge_road(model, final=final)
-    if isinstance(judgement, RoadJudgement):
-        model.drop(judgement.tracks[~judgement.kept])
+def drop_off_road(mapper: Mapper, *, for_map: bool = False) -> RoadAssessment | str:
+    """Judge the road's points and drop those off its surface; they wait until `Mapper.complete` or `Mapper.readmit`."""
+    judgement = assess_road(mapper, for_map=for_map)
+    if isinstance(judgement, RoadAssessment):
+        mapper.drop(judgement.tracks[~judgement.is_inlier])
     return judgement
 
 
-def height_sigmas_m(model: Model, tracks: Ints, world_from_rig: Floats) -> Floats:
+def height_sigmas_m(mapper: Mapper, tracks: Ints, world_from_rig: Floats) -> Floats:
     """Standard deviations (n,) of the heights of points, from the noise of their observations and their rays."""
-    rows = model.observation_rows(tracks)
-    place = np.full(len(model.tracks), -1, dtype=np.int64)
+    rows = mapper.observation_rows(tracks)
+    place = np.full(len(mapper.tracks), -1, dtype=np.int64)
     place[tracks] = np.arange(len(tracks))
-    owner = model.tracks.of_keypoint[rows]
-    errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, owner)
+    owner = mapper.tracks.of_keypoint[rows]
+    errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, owner)
     # The squared length of a 2D normal error has the median 2 ln 2 sigma^2; a point has used up three of its numbers.
     redundancy = max(0.1, 1.0 - 1.5 * len(tracks) / max(len(rows), 1))
     noise = float(np.sqrt(np.median(errors**2) / (2 * np.log(2)) / redundancy)) if len(rows) else 1.0
-    r, t = cam_from_world(model.state, model.image_unit, model.image_camera)
+    r, t = cam_from_world(mapper.state, mapper.image_unit, mapper.image_camera)
     centre = -np.einsum("nji,nj->ni", r, t)
     covariance = point_covariances(
-        model.state.points_m[tracks],
+        mapper.state.points_m[tracks],
         place[owner],
-        centre[model.keypoints.image[rows]],
-        model.state.camera_params[model.keypoints.camera[rows], :2].mean(1),
+        centre[mapper.keypoints.image[rows]],
+        mapper.state.camera_params[mapper.keypoints.camera[rows], :2].mean(1),
         sigma_px=float(np.clip(noise, *SIGMA_PX_RANGE)),
     )
     up = world_from_rig[:, :3, 2].mean(0)
@@ -141,12 +141,12 @@ def height_sigmas_m(model: Model, tracks: Ints, world_from_rig: Floats) -> Float
     return result
 
 
-def _all_images_are_masked(model: Model) -> bool:
+def _all_images_are_masked(mapper: Mapper) -> bool:
     """Whether every image with keypoints has some of a known class: an image without a mask has none."""
-    image, classes = model.keypoints.image, model.keypoints.classes
+    image, classes = mapper.keypoints.image, mapper.keypoints.classes
     return len(np.unique(image[classes != UNKNOWN])) == len(np.unique(image))
 
 
-def _lowest_camera_m(model: Model) -> float:
+def _lowest_camera_m(mapper: Mapper) -> float:
     """Height of the lowest camera over the rig's origin."""
-    return float(model.state.camera_position_m[:, 2].min())
+    return float(mapper.state.camera_position_m[:, 2].min())

@@ -10,16 +10,16 @@ from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.keyframes import nearest_keyframes
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import Refinement
-from mrasfm_engine.mapping.road import RoadJudgement
+from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibration, ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import majority_class
 
 
 def build_scene(
-    model: Model,
+    mapper: Mapper,
     refinement: Refinement,
     features: Sequence[ImageFeatures],
     pairs: Sequence[PairMatches],
@@ -29,55 +29,55 @@ def build_scene(
 ) -> Scene:
     """Everything that is exported, as arrays. All images of a registered unit are part of the scene, unless
     images were registered one by one or left out."""
-    rows = model.observation_rows()
-    tracks, point = np.unique(model.tracks.of_keypoint[rows], return_inverse=True)
-    errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
+    rows = mapper.observation_rows()
+    tracks, point = np.unique(mapper.tracks.of_keypoint[rows], return_inverse=True)
+    errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, mapper.tracks.of_keypoint[rows])
     counts = np.bincount(point, minlength=len(tracks)).clip(1)
     colors = np.concatenate([f.colors for f in features]).astype(np.float64)
     mean_color = np.stack([np.bincount(point, colors[rows, k], minlength=len(tracks)) for k in range(3)], 1)
     left_out = np.array([f.left_out is not None for f in features])
-    units = len(model.registered)
-    poses = model.state.world_from_rig.copy()
-    poses[~model.registered] = np.nan
+    units = len(mapper.registered)
+    poses = mapper.state.world_from_rig.copy()
+    poses[~mapper.registered] = np.nan
     sigma = np.full((units, 3), np.nan)
     if refinement.certainty is not None:
         sigma = refinement.certainty.sigma_unit_position_m.copy()
-        between = ~model.keyframe & model.registered
-        sigma[between] = sigma[nearest_keyframes(model)[between]]
+        between = ~mapper.keyframe & mapper.registered
+        sigma[between] = sigma[nearest_keyframes(mapper)[between]]
     georeferenced = refinement.georeferenced
-    patches, judged = np.full(len(model.tracks), -1, dtype=np.int32), refinement.road
-    if isinstance(judged, RoadJudgement):
-        on_surface = judged.kept & (np.abs(judged.distance_m) <= judged.limit_m)
+    patches, judged = np.full(len(mapper.tracks), -1, dtype=np.int32), refinement.road
+    if isinstance(judged, RoadAssessment):
+        on_surface = judged.is_inlier & (np.abs(judged.distance_m) <= judged.limit_m)
         patches[judged.tracks[on_surface]] = judged.patch[on_surface]
     return Scene(
-        drive=model.drive,
-        unit_registered=model.registered.copy(),
-        image_registered=model.registered[model.image_unit] & ~model.missing & ~left_out,
+        drive=mapper.drive,
+        unit_registered=mapper.registered.copy(),
+        image_registered=mapper.registered[mapper.image_unit] & ~mapper.missing & ~left_out,
         world_from_rig=poses,
         sigma_position_m=sigma,
-        calibration=_calibrations(model, refinement),
-        calibration_verdict=_verdict(refinement),
-        points_m=model.state.points_m[tracks],
+        calibration=_calibrations(mapper, refinement),
+        calibration_observability=_observability(refinement),
+        points_m=mapper.state.points_m[tracks],
         point_colors=np.round(mean_color / counts[:, None]).astype(np.uint8),
         point_error_px=np.bincount(point, errors, minlength=len(tracks)) / counts,
         observation_point=point.astype(np.int64),
-        observation_image=model.keypoints.image[rows],
-        observation_keypoint=rows - model.keypoints.first[model.keypoints.image[rows]],
+        observation_image=mapper.keypoints.image[rows],
+        observation_keypoint=rows - mapper.keypoints.first[mapper.keypoints.image[rows]],
         features=list(features),
         pairs=list(pairs),
         georeference=prior.georeference if georeferenced else None,
         rough_world_from_local=prior.rough_world_from_local if refinement.placed_by_rough_poses else None,
         notes=list(notes),
-        unit_from_image=None if model.state.simultaneous else model.motion.unit_from_image(model.state),
-        point_classes=majority_class(model.keypoints.classes[rows], point.astype(np.int64), len(tracks)),
+        unit_from_image=None if mapper.state.simultaneous else mapper.motion.unit_from_image(mapper.state),
+        point_classes=majority_class(mapper.keypoints.classes[rows], point.astype(np.int64), len(tracks)),
         point_patches=patches[tracks],
-        road=judged.road if isinstance(judged, RoadJudgement) else None,
+        road=judged.road if isinstance(judged, RoadAssessment) else None,
     )
 
 
-def _verdict(refinement: Refinement) -> CalibrationVerdict:
+def _observability(refinement: Refinement) -> CalibrationObservability:
     directions = refinement.directions
-    return CalibrationVerdict(
+    return CalibrationObservability(
         adjusted=refinement.calibration.free,
         reason=refinement.calibration.reason,
         scale_observed=refinement.calibration.free and directions is not None and directions.scale_observed,
@@ -88,27 +88,27 @@ def _verdict(refinement: Refinement) -> CalibrationVerdict:
     )
 
 
-def _calibrations(model: Model, refinement: Refinement) -> list[CameraCalibration]:
-    prior: CalibrationPrior = calibration_prior(model)
+def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibration]:
+    prior: CalibrationPrior = calibration_prior(mapper)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    focal = np.array([c.sigma_focal_px or np.nan for c in model.drive.cameras])
+    focal = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
         sigma = refinement.certainty.sigma_camera[:, :6]
         if refinement.focal_free:
-            focal = refinement.certainty.sigma_camera[:, 6] * model.state.camera_params[:, 0]
+            focal = refinement.certainty.sigma_camera[:, 6] * mapper.state.camera_params[:, 0]
     if refinement.directions is not None:
         observed = refinement.directions.observed & refinement.recalibrated[:, None]
-    wrong = {w.camera for w in refinement.wrong_cameras}
+    wrong = {w.camera for w in refinement.miscalibrations}
     return [
         CameraCalibration(
-            rig_from_cam=model.state.rig_from_cam[c],
-            params=unpack_camera(camera.model, model.state.camera_params[c]),
+            rig_from_cam=mapper.state.rig_from_cam[c],
+            params=unpack_camera(camera.model, mapper.state.camera_params[c]),
             sigma_rotation_deg=np.degrees(sigma[c, :3]),
             sigma_translation_m=sigma[c, 3:],
             sigma_focal_px=float(focal[c]),
             observed=observed[c],
             is_wrong=c in wrong,
         )
-        for c, camera in enumerate(model.drive.cameras)
+        for c, camera in enumerate(mapper.drive.cameras)
     ]

@@ -32,7 +32,7 @@ class _Views:
     size_px: Ints
 
     @staticmethod
-    def of(drive: Drive) -> _Views:
+    def from_drive(drive: Drive) -> _Views:
         kind, params = pack_cameras(drive.cameras)
         return _Views(
             unit=np.array([image.unit for image in drive.images], dtype=np.int64),
@@ -53,7 +53,7 @@ def pairs_from_window(drive: Drive, config: PairConfig) -> Ints:
     """Pairs (n, 2) within a window of units, without any prior: the same camera, and cameras that can see the same
     things if the car stands or goes some way forward or back.
     """
-    views = _Views.of(drive)
+    views = _Views.from_drive(drive)
     cameras = len(drive.cameras)
     index = {(int(u), int(c)): i for i, (u, c) in enumerate(zip(views.unit, views.camera, strict=True))}
     gaps = range(max(config.window_units, config.cross_window_units) + 1)
@@ -110,7 +110,7 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     known = np.isfinite(world_from_rig[:, 0, 3])
     if not known.all():
         return _pairs_where_known(drive, world_from_rig, known, config)
-    views = _Views.of(drive)
+    views = _Views.from_drive(drive)
     world_from_cam = world_from_rig[views.unit] @ drive.rig_from_cam[views.camera]
     # Frustums meet half way at the latest; poses far apart need no look.
     centres = world_from_cam[:, :3, 3] + 0.4 * config.max_depth_m * world_from_cam[:, :3, 2]

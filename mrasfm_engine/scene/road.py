@@ -86,7 +86,7 @@ class Thickness:
     spread_m: float  # 1.4826 times the median absolute deviation: the standard deviation, were they normal
 
     @staticmethod
-    def of(distance_m: Floats) -> Thickness:
+    def from_distances(distance_m: Floats) -> Thickness:
         """Compute from signed distances (n,) without the NaN ones; NaN for none."""
         known = distance_m[np.isfinite(distance_m)]
         if not len(known):
@@ -101,7 +101,7 @@ class RoadPoints:
 
     points_m: Floats  # (n, 3)
     distance_m: Floats  # (n,) signed, to the surface; NaN where there is none
-    kept: Bools  # (n,)
+    is_inlier: Bools  # (n,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,9 +117,9 @@ class Road:
     @property
     def thickness_before(self) -> Thickness:
         """Thickness of all points taken for the road."""
-        return Thickness.of(self.before.distance_m)
+        return Thickness.from_distances(self.before.distance_m)
 
     @property
     def thickness_after(self) -> Thickness:
         """Thickness of the inliers."""
-        return Thickness.of(self.before.distance_m[self.before.kept])
+        return Thickness.from_distances(self.before.distance_m[self.before.is_inlier])

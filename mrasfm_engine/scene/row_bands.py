@@ -1,7 +1,7 @@
 """The instants at which images were taken: cameras of a unit need not be simultaneous, nor rows of an image.
 
-A *shot* is a band of rows of one image: so short a time that the vehicle stands still in it. An image without a
-declared readout time is one shot, and then shots and images have the same numbers.
+A *row band* is a band of rows of one image: so short a time that the vehicle stands still in it. An image without a
+declared readout time is one row band, and then row bands and images have the same numbers.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ MAX_BANDS = 65  # an image, which makes 33 ms of bands that short
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shots:
-    """All shots of a drive, by image and then from the first row to the last."""
+class RowBands:
+    """All row bands of a drive, by image and then from the first row to the last."""
 
     image: Ints  # (s,) index into Drive.images
     unit: Ints  # (s,)
     camera: Ints  # (s,)
-    time_offset_s: Floats  # (s,) when the shot's middle row was taken, from its unit's timestamp on
-    first_of_image: Ints  # (images + 1,) shots of image i: first[i]:first[i + 1]
+    time_offset_s: Floats  # (s,) when the row band's middle row was taken, from its unit's timestamp on
+    first_of_image: Ints  # (images + 1,) row bands of image i: first[i]:first[i + 1]
     height_px: Ints  # (cameras,)
 
     @staticmethod
-    def of(drive: Drive, *, compensate: bool = True) -> Shots:
-        """The shots of a drive. Without `compensate` all are taken as if at their unit's timestamp."""
+    def from_drive(drive: Drive, *, compensate: bool = True) -> RowBands:
+        """The row bands of a drive. Without `compensate` all are taken as if at their unit's timestamp."""
         bands = np.array([_bands(camera.readout_us) if compensate else 1 for camera in drive.cameras], dtype=np.int64)
         readout_s = np.array([(camera.readout_us or 0) / 1e6 for camera in drive.cameras])
         camera_of_image = np.array([image.camera for image in drive.images], dtype=np.int64)
@@ -48,7 +48,7 @@ class Shots:
             offset_s = of_image_s[image] + place * readout_s[camera]
             if np.abs(offset_s).max(initial=0.0) <= MAX_BAND_S:
                 offset_s[:] = 0.0  # clocks that jitter are no motion
-        return Shots(
+        return RowBands(
             image=image,
             unit=unit_of_image[image],
             camera=camera_of_image[image],
@@ -62,17 +62,17 @@ class Shots:
 
     @property
     def simultaneous(self) -> bool:
-        """Whether every shot is at its unit's timestamp."""
+        """Whether every row band is at its unit's timestamp."""
         return not self.time_offset_s.any()
 
     @property
     def middle_of_image(self) -> Ints:
-        """The shot (images,) that is at its image's timestamp."""
+        """The row band (images,) that is at its image's timestamp."""
         result: Ints = (self.first_of_image[:-1] + self.first_of_image[1:]) // 2
         return result
 
     def of_rows(self, image: Ints, y_px: Floats) -> Ints:
-        """The shots (n,) that keypoints at heights y_px (n,) of images (n,) belong to."""
+        """The row bands (n,) that keypoints at heights y_px (n,) of images (n,) belong to."""
         first, count = self.first_of_image[image], np.diff(self.first_of_image)[image]
         camera = self.camera[first] if len(first) else first
         band = np.floor(y_px / self.height_px[camera] * count).astype(np.int64)

@@ -76,7 +76,7 @@ class CameraCalibration:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationVerdict:
+class CalibrationObservability:
     """Observability of the relative poses of all cameras in the drive."""
 
     adjusted: bool  # whether `rig_from_cam` varied at all
@@ -99,7 +99,7 @@ class Scene:
     world_from_rig: Floats  # (units, 4, 4); rows of units that are not registered are NaN
     sigma_position_m: Floats  # (units, 3), NaN where not known
     calibration: list[CameraCalibration]  # by camera
-    calibration_verdict: CalibrationVerdict | None = None
+    calibration_observability: CalibrationObservability | None = None
     points_m: Floats  # (p, 3)
     point_colors: Bytes  # (p, 3)
     point_error_px: Floats  # (p,) mean reprojection error

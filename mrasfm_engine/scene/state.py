@@ -14,8 +14,8 @@ from mrasfm_engine.types import Floats, Ints
 class State:
     """A value of all variables, free or not, and the units' motion, which follows from them.
 
-    The camera of a shot (see `scene.shots`) stands at world_from_rig * unit_from_shot * rig_from_cam. Without shots all
-    images are taken at their unit's timestamp.
+    The camera of a row band (see `scene.row_bands`) stands at world_from_rig * unit_from_band * rig_from_cam. Without
+    row bands all images are taken at their unit's timestamp.
     """
 
     unit_rotation: Floats  # (u, 3, 3) of world_from_rig
@@ -24,8 +24,8 @@ class State:
     camera_position_m: Floats  # (c, 3)
     camera_params: Floats  # (c, 8), see geometry.camera_model
     points_m: Floats  # (p, 3)
-    shot_rotation: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (s, 3, 3) of unit_from_shot
-    shot_position_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (s, 3)
+    band_rotation: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (s, 3, 3) of unit_from_band
+    band_position_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (s, 3)
 
     @property
     def world_from_rig(self) -> Floats:
@@ -44,9 +44,9 @@ class State:
     @property
     def simultaneous(self) -> bool:
         """Whether all images are taken at their unit's timestamp."""
-        return len(self.shot_rotation) == 0
+        return len(self.band_rotation) == 0
 
     @property
-    def unit_from_shot(self) -> Floats:
-        """The rig's poses at the shots, relative to its pose at their unit's timestamp (s, 4, 4)."""
-        return se3.transform(self.shot_rotation, self.shot_position_m)
+    def unit_from_band(self) -> Floats:
+        """The rig's poses at the row bands, relative to its pose at their unit's timestamp (s, 4, 4)."""
+        return se3.transform(self.band_rotation, self.band_position_m)

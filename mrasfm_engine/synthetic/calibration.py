@@ -37,8 +37,8 @@ def given_cameras(options: SynthOptions, cameras: list[TrueCamera], rng: np.rand
         given = camera.rig_from_cam.copy()
         given[:3, :3] = given[:3, :3] @ se3.exp_so3(rotation)
         given[:3, 3] += translation
-        wrong = np.radians(options.wrong_by_deg) * _direction(rng)
-        if camera.name == options.wrong_camera:
+        wrong = np.radians(options.miscalibrated_by_deg) * _direction(rng)
+        if camera.name == options.miscalibrated_camera:
             given[:3, :3] = given[:3, :3] @ se3.exp_so3(wrong)
         result.append(
             Camera(

@@ -83,8 +83,8 @@ class SynthOptions:
     perturb_translation_m: float = 0.0  # norm of each given extrinsic translation's error, in a random direction
     declare_sigmas: bool = False  # the manifest says how well the extrinsics are known
     tight: bool = False  # the manifest declares 0.01 degrees and 1 mm
-    wrong_camera: str | None = None
-    wrong_by_deg: float = 3.0  # additional rotation of the wrong camera about a random axis
+    miscalibrated_camera: str | None = None
+    miscalibrated_by_deg: float = 3.0  # additional rotation of the wrong camera about a random axis
 
     def __post_init__(self) -> None:
         def refuse(what: str, remedy: str) -> None:
@@ -139,7 +139,7 @@ class SynthOptions:
                 f"--standing {self.standing_units} is more than half of {self.units} units", "Stand still for fewer."
             )
         names = [mount.name for mount in mounts(self.cameras)]
-        for name in (*self.occluded_cameras, *([self.wrong_camera] if self.wrong_camera else [])):
+        for name in (*self.occluded_cameras, *([self.miscalibrated_camera] if self.miscalibrated_camera else [])):
             if name not in names:
                 refuse(f"camera {name!r} is not on this vehicle", f"Its cameras are {', '.join(names)}.")
         for name in ("biased_drive", "dusk_drive"):

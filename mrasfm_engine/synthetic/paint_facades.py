@@ -60,7 +60,7 @@ def wall(size: int, rng: np.random.Generator, *, material: str, colour: Floats32
                 for r in range(rows):
                     x = int(xs[c] + (r % 2) * shift)
                     cv2.line(relief, (x, int(ys[r])), (x, int(ys[r + 1])), -0.25, 2)
-    noise = fractal(size, rng, coarsest=4, persistence=0.75)
+    noise = fractal(size, rng, coarsest=4, octave_gain=0.75)
     relief += 0.055 * noise + 0.6 * cracks(size, rng, count=10, length_px=size / 5, strength=0.3)
     relief += spots(size, rng, count=size // 2, radius_px=(2.0, 9.0), strength=0.1)
     return (1.0 + relief)[..., None] * colour
@@ -200,7 +200,7 @@ def facade(size: int, rng: np.random.Generator) -> Bytes:
         px, py = int(rng.integers(0, 940)), int(rng.integers(ground + 30, 960))
         cv2.rectangle(image, (px, py), (px + 46, py + 58), _tone(rng.uniform(40, 240, 3)), -1)
         write_text(image, rng, box=(px + 2, py + 6, 42, 18), letters=4)
-    weather = 0.08 * fractal(1024, rng, coarsest=4, persistence=0.8)
+    weather = 0.08 * fractal(1024, rng, coarsest=4, octave_gain=0.8)
     streaks = cv2.resize(weather[:16], (1024, 1024), interpolation=cv2.INTER_CUBIC)
     image *= (1 + weather + 0.4 * np.asarray(streaks, np.float32))[..., None]
     if k != 1:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from mrasfm_engine.types import Bools, Bytes, Floats32
 
 
-def fractal(size: int, rng: np.random.Generator, *, coarsest: int = 4, persistence: float = 0.6) -> Floats32:
+def fractal(size: int, rng: np.random.Generator, *, coarsest: int = 4, octave_gain: float = 0.6) -> Floats32:
     """Noise (size, size) of standard deviation 1 with octaves from `size / coarsest` pixels down to single pixels."""
     cells = coarsest
     total = rng.standard_normal((cells, cells), dtype=np.float32)
@@ -19,7 +19,7 @@ def fractal(size: int, rng: np.random.Generator, *, coarsest: int = 4, persisten
         pad = np.pad(total, 2, mode="wrap")
         wide = np.asarray(cv2.resize(pad, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.float32)
         cells *= 2
-        amplitude *= persistence
+        amplitude *= octave_gain
         total = wide[4 : 4 + cells, 4 : 4 + cells] + np.float32(amplitude) * rng.standard_normal(
             (cells, cells), dtype=np.float32
         )

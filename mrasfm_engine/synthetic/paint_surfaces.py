@@ -15,7 +15,7 @@ LETTERS = np.array(list(string.ascii_uppercase + string.digits))
 
 def detail(size: int, rng: np.random.Generator) -> Bytes:
     """Grey structure at all scales around 128 that multiplies other textures: dirt, pits, scratches, stains."""
-    value = 0.06 * fractal(size, rng, coarsest=4, persistence=0.85)
+    value = 0.06 * fractal(size, rng, coarsest=4, octave_gain=0.85)
     value += spots(size, rng, count=size * 2, radius_px=(1.5, 12.0), strength=0.13)
     value += spots(size, rng, count=size // 16, radius_px=(10.0, 45.0), strength=0.09)
     value += cracks(size, rng, count=size // 24, length_px=size / 6, strength=0.2)
@@ -24,7 +24,7 @@ def detail(size: int, rng: np.random.Generator) -> Bytes:
 
 def asphalt(size: int, rng: np.random.Generator) -> Bytes:
     """Grey road surface with coarse stones, tar patches and cracks."""
-    value = 0.07 * fractal(size, rng, coarsest=4, persistence=0.9)
+    value = 0.07 * fractal(size, rng, coarsest=4, octave_gain=0.9)
     value += spots(size, rng, count=size * 3, radius_px=(1.2, 5.0), strength=0.2)
     value += spots(size, rng, count=24, radius_px=(15.0, 70.0), strength=0.1)
     value += cracks(size, rng, count=14, length_px=size / 3, strength=0.35)
@@ -42,16 +42,16 @@ def paving(size: int, rng: np.random.Generator, *, slabs: int = 8, colour: tuple
             for x in (col * slab + shift, col * slab + shift - size):
                 cv2.rectangle(image, (x, row * slab), (x + slab - 1, (row + 1) * slab - 1), float(shade), -1)
                 cv2.rectangle(image, (x, row * slab), (x + slab - 1, (row + 1) * slab - 1), -0.45, max(1, slab // 28))
-    image += 0.05 * fractal(size, rng, coarsest=8, persistence=0.9)
+    image += 0.05 * fractal(size, rng, coarsest=8, octave_gain=0.9)
     image += spots(size, rng, count=size // 2, radius_px=(1.5, 7.0), strength=0.2)
     return to_bytes(colourise(image, colour))
 
 
 def grass(size: int, rng: np.random.Generator) -> Bytes:
     """Lawn with tufts, bare earth and fallen leaves."""
-    value = 0.16 * fractal(size, rng, coarsest=8, persistence=0.95)
+    value = 0.16 * fractal(size, rng, coarsest=8, octave_gain=0.95)
     image = colourise(value, (88.0, 118.0, 58.0))
-    earth = fractal(size, rng, coarsest=4, persistence=0.7) > 1.1
+    earth = fractal(size, rng, coarsest=4, octave_gain=0.7) > 1.1
     image[earth] = image[earth] * np.array([1.25, 0.9, 0.95], np.float32)
     image += spots(size, rng, count=size, radius_px=(1.5, 6.0), strength=28.0)[..., None] * np.array(
         [1.2, 0.9, 0.5], np.float32
@@ -80,14 +80,14 @@ def leaves(size: int, rng: np.random.Generator, *, colour: tuple[float, float, f
 
 def bark(size: int, rng: np.random.Generator) -> Bytes:
     """Vertical furrows."""
-    noise = fractal(size, rng, coarsest=8, persistence=0.9)
+    noise = fractal(size, rng, coarsest=8, octave_gain=0.9)
     furrows = cv2.resize(noise[: size // 8], (size, size), interpolation=cv2.INTER_LINEAR)
     return to_bytes(colourise(0.25 * np.asarray(furrows, np.float32) + 0.1 * noise, (92.0, 78.0, 66.0)))
 
 
 def metal(size: int, rng: np.random.Generator) -> Bytes:
     """Painted metal with scratches, rust and stickers."""
-    value = 0.05 * fractal(size, rng, coarsest=4, persistence=0.8)
+    value = 0.05 * fractal(size, rng, coarsest=4, octave_gain=0.8)
     image = colourise(value, (125.0, 128.0, 130.0))
     for _ in range(26):
         x, y = rng.integers(0, size, 2)
@@ -164,7 +164,7 @@ def car_side(rng: np.random.Generator) -> Bytes:
         for k in range(5):
             a = 2 * np.pi * k / 5 + rng.uniform(0, 1)
             cv2.line(image, (x, 210), (int(x + 26 * np.cos(a)), int(210 + 26 * np.sin(a))), (60.0, 60.0, 64.0), 5)
-    image *= 1 + 0.03 * fractal(512, rng, coarsest=16, persistence=0.8)[:256, :, None]
+    image *= 1 + 0.03 * fractal(512, rng, coarsest=16, octave_gain=0.8)[:256, :, None]
     return with_alpha(to_bytes(image), alpha)
 
 
@@ -182,13 +182,13 @@ def car_face(rng: np.random.Generator, *, front: bool) -> Bytes:
     cv2.rectangle(image, (0, 96), (256, 128), (48.0, 48.0, 50.0), -1)
     cv2.rectangle(image, (84, 68), (172, 90), (235.0, 235.0, 228.0), -1)
     write_text(image, rng, box=(86, 69, 84, 20), letters=7)
-    image *= 1 + 0.03 * fractal(256, rng, coarsest=8, persistence=0.8)[:128, :, None]
+    image *= 1 + 0.03 * fractal(256, rng, coarsest=8, octave_gain=0.8)[:128, :, None]
     return to_bytes(image)
 
 
 def glass(size: int, rng: np.random.Generator) -> Bytes:
     """A dark pane with reflections."""
-    value = 0.25 * fractal(size, rng, coarsest=2, persistence=0.5)
+    value = 0.25 * fractal(size, rng, coarsest=2, octave_gain=0.5)
     return to_bytes(colourise(value, (58.0, 68.0, 78.0)))
 
 
@@ -201,7 +201,7 @@ def truck_side(rng: np.random.Generator) -> Bytes:
         cv2.rectangle(image, (int(x), int(y)), (int(x + w), int(y + h)), tuple(rng.uniform(20, 240, 3).tolist()), -1)
     for row in range(3):
         write_text(image, rng, box=(20, 30 + 160 * row, 980, 140), letters=int(rng.integers(6, 11)))
-    noise: Floats32 = fractal(1024, rng, coarsest=8, persistence=0.85)[:512]
+    noise: Floats32 = fractal(1024, rng, coarsest=8, octave_gain=0.85)[:512]
     image *= (
         1 + 0.1 * noise[..., None] + spots(1024, rng, count=900, radius_px=(2.0, 14.0), strength=0.18)[:512, :, None]
     )
@@ -210,7 +210,7 @@ def truck_side(rng: np.random.Generator) -> Bytes:
 
 def clouds(size: int, rng: np.random.Generator) -> Bytes:
     """Soft clouds: 0 is clear sky."""
-    value = np.clip(fractal(size, rng, coarsest=4, persistence=0.5) * 0.6 - 0.1, 0, 1)
+    value = np.clip(fractal(size, rng, coarsest=4, octave_gain=0.5) * 0.6 - 0.1, 0, 1)
     return to_bytes(colourise(value - 1.0, (255.0, 255.0, 255.0)))
 
 
@@ -218,7 +218,7 @@ def skyline(rng: np.random.Generator) -> Bytes:
     """Far wooded hills with buildings, 1024x256, holes above."""
     image = np.zeros((256, 1024, 3), np.float32)
     alpha = np.zeros((256, 1024), np.uint8)
-    noise = fractal(1024, rng, coarsest=8, persistence=0.8)
+    noise = fractal(1024, rng, coarsest=8, octave_gain=0.8)
     ridge = 110 + 26 * noise[0] + 8 * noise[500]
     rows = np.arange(256)[:, None]
     alpha[rows > ridge[None]] = 255
@@ -253,7 +253,7 @@ def patch_decal(size: int, rng: np.random.Generator) -> Bytes:
     angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
     outline = size / 2 + size * rng.uniform(0.28, 0.49, (corners, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
     cv2.fillPoly(alpha, [np.round(outline).astype(np.int32)], 255)
-    value = 0.1 * fractal(size, rng, persistence=0.9) + spots(size, rng, count=90, radius_px=(1.5, 8), strength=0.2)
+    value = 0.1 * fractal(size, rng, octave_gain=0.9) + spots(size, rng, count=90, radius_px=(1.5, 8), strength=0.2)
     return with_alpha(to_bytes(colourise(value, np.full(3, rng.uniform(62, 150)))), alpha)
 
 
@@ -262,7 +262,7 @@ def manhole(size: int, rng: np.random.Generator) -> Bytes:
     alpha = np.zeros((size, size), np.uint8)
     half = size // 2
     cv2.circle(alpha, (half, half), half - 2, 255, -1)
-    image = colourise(0.1 * fractal(size, rng, persistence=0.9), (84.0, 80.0, 77.0))
+    image = colourise(0.1 * fractal(size, rng, octave_gain=0.9), (84.0, 80.0, 77.0))
     for radius in (0.95, 0.75, 0.4):
         cv2.circle(image, (half, half), int(half * radius), (38.0, 37.0, 36.0), max(2, size // 40))
     for k in range(12):
@@ -276,6 +276,6 @@ def manhole(size: int, rng: np.random.Generator) -> Bytes:
 
 def paint_line(size: int, rng: np.random.Generator) -> Bytes:
     """White road paint, worn through in places."""
-    worn = fractal(size, rng, coarsest=8, persistence=0.9)
+    worn = fractal(size, rng, coarsest=8, octave_gain=0.9)
     image = colourise(0.06 * worn, (212.0, 212.0, 206.0))
     return with_alpha(to_bytes(image), worn < 1.25)

@@ -11,7 +11,7 @@ from numba import njit
 
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.scene.drive import Drive
-from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import majority_class
 from mrasfm_engine.types import Bools, Bytes, Floats, Ints
@@ -25,7 +25,7 @@ class Keypoints:
     image: Ints  # (n,)
     unit: Ints  # (n,)
     camera: Ints  # (n,)
-    shot: Ints  # (n,) index into the drive's shots, see `scene.shots`
+    band: Ints  # (n,) index into the drive's row bands, see `scene.row_bands`
     xy_px: Floats  # (n, 2)
     rays: Floats  # (n, 3) unit viewing rays in camera axes under the given intrinsics
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
@@ -36,7 +36,7 @@ class Keypoints:
             object.__setattr__(self, "classes", np.zeros(len(self.image), np.uint8))
 
     @staticmethod
-    def of(drive: Drive, features: Sequence[ImageFeatures], shots: Shots | None = None) -> Keypoints:
+    def from_features(drive: Drive, features: Sequence[ImageFeatures], bands: RowBands | None = None) -> Keypoints:
         """Line up the features of all images of a drive; by default every image is one instant."""
         counts = np.array([len(f.xy_px) for f in features], dtype=np.int64)
         image = np.repeat(np.arange(len(features), dtype=np.int64), counts)
@@ -54,7 +54,7 @@ class Keypoints:
             image=image,
             unit=unit_of_image[image],
             camera=camera,
-            shot=image if shots is None else shots.of_rows(image, xy[:, 1]),
+            band=image if bands is None else bands.of_rows(image, xy[:, 1]),
             xy_px=xy,
             rays=rays,
             classes=np.concatenate([f.classes for f in features]),
@@ -93,9 +93,9 @@ class Tracks:
         return len(self.first) - 1
 
 
-def kept_members(tracks: Tracks, which: Ints, kept: Bools) -> Ints:
+def inlier_members(tracks: Tracks, which: Ints, is_inlier: Bools) -> Ints:
     """Keypoints (m,) of some tracks that are kept (keypoints,), track by track."""
-    result: Ints = _kept_members(tracks.first, tracks.keypoints, which, kept)
+    result: Ints = _inlier_members(tracks.first, tracks.keypoints, which, is_inlier)
     return result
 
 
@@ -105,7 +105,7 @@ def count_members(tracks: Tracks, which: Ints, more: Bools, unit: Ints, counts: 
 
 
 @njit(cache=True, nogil=True)
-def _kept_members(first: Any, members: Any, which: Any, kept: Any) -> Any:
+def _inlier_members(first: Any, members: Any, which: Any, is_inlier: Any) -> Any:
     total = 0
     for t in which:
         total += first[t + 1] - first[t]
@@ -113,7 +113,7 @@ def _kept_members(first: Any, members: Any, which: Any, kept: Any) -> Any:
     end = 0
     for t in which:
         for m in range(first[t], first[t + 1]):
-            if kept[members[m]]:
+            if is_inlier[members[m]]:
                 out[end] = members[m]
                 end += 1
     return out[:end].copy()

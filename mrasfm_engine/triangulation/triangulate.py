@@ -38,7 +38,7 @@ def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, w
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _refine(
-    count: int, use: Any, members: Any, shot: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any,
+    count: int, use: Any, members: Any, band: Any, camera: Any, xy: Any, cfw_r: Any, cfw_t: Any, kind: Any,
     params: Any, x: Any, scale2: float, cam: Any, work: Any, proj: Any, h: Any, g: Any,
 ) -> None:  # fmt: skip
     """A few Gauss-Newton steps on a point with Cauchy weights over the observations in use."""
@@ -49,9 +49,9 @@ def _refine(
             if not use[m]:
                 continue
             k = members[m]
-            r = cfw_r[shot[k]]
+            r = cfw_r[band[k]]
             c = camera[k]
-            e2 = _error2(r, cfw_t[shot[k]], kind[c], params[c], x, xy[k], cam, work, proj)
+            e2 = _error2(r, cfw_t[band[k]], kind[c], params[c], x, xy[k], cam, work, proj)
             if e2 > 1e11:
                 continue
             w = 1.0 / (1.0 + e2 / scale2)
@@ -84,9 +84,9 @@ def _refine(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _triangulate(
-    which: Any, first: Any, track_keypoints: Any, shot: Any, camera: Any, xy: Any, rays: Any, usable: Any,
+    which: Any, first: Any, track_keypoints: Any, band: Any, camera: Any, xy: Any, rays: Any, usable: Any,
     cfw_r: Any, cfw_t: Any, kind: Any, params: Any, max_error2: float, min_angle: float,
-    points: Any, solved: Any, kept: Any,
+    points: Any, triangulated: Any, is_inlier: Any,
 ) -> None:  # fmt: skip
     members, use = np.empty(MAX_OBSERVATIONS, np.int64), np.empty(MAX_OBSERVATIONS, np.bool_)
     origin, direction = np.empty((MAX_OBSERVATIONS, 3)), np.empty((MAX_OBSERVATIONS, 3))
@@ -95,13 +95,13 @@ def _triangulate(
     cos_limit = math.cos(min_angle)
     for n in range(len(which)):
         track = which[n]
-        solved[track] = False
+        triangulated[track] = False
         count = 0
         for s in range(first[track], first[track + 1]):
             k = track_keypoints[s]
-            kept[k] = False
-            if count < MAX_OBSERVATIONS and usable[shot[k]]:
-                r, t = cfw_r[shot[k]], cfw_t[shot[k]]
+            is_inlier[k] = False
+            if count < MAX_OBSERVATIONS and usable[band[k]]:
+                r, t = cfw_r[band[k]], cfw_t[band[k]]
                 for i in range(3):
                     origin[count, i] = -(r[0, i] * t[0] + r[1, i] * t[1] + r[2, i] * t[2])
                     direction[count, i] = r[0, i] * rays[k, 0] + r[1, i] * rays[k, 1] + r[2, i] * rays[k, 2]
@@ -143,7 +143,7 @@ def _triangulate(
                 for m in range(count):
                     k = members[m]
                     e2 = _error2(
-                        cfw_r[shot[k]], cfw_t[shot[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+                        cfw_r[band[k]], cfw_t[band[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
                     )
                     if e2 < max_error2:
                         score += max_error2 - e2
@@ -158,7 +158,7 @@ def _triangulate(
             for m in range(count):
                 k = members[m]
                 e2 = _error2(
-                    cfw_r[shot[k]], cfw_t[shot[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
+                    cfw_r[band[k]], cfw_t[band[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj
                 )
                 use[m] = e2 < max_error2
                 inliers += use[m]
@@ -168,7 +168,7 @@ def _triangulate(
                 count,
                 use,
                 members,
-                shot,
+                band,
                 camera,
                 xy,
                 cfw_r,
@@ -186,7 +186,7 @@ def _triangulate(
         inliers = 0
         for m in range(count):
             k = members[m]
-            e2 = _error2(cfw_r[shot[k]], cfw_t[shot[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj)
+            e2 = _error2(cfw_r[band[k]], cfw_t[band[k]], kind[camera[k]], params[camera[k]], x, xy[k], cam, work, proj)
             use[m] = e2 < max_error2
             inliers += use[m]
         if inliers < 2:
@@ -208,19 +208,19 @@ def _triangulate(
                             break
         if not wide:
             continue
-        solved[track] = True
+        triangulated[track] = True
         for i in range(3):
             points[track, i] = x[i]
         for m in range(count):
             if use[m]:
-                kept[members[m]] = True
+                is_inlier[members[m]] = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _errors(
     rows: Any,
     point: Any,
-    shot: Any,
+    band: Any,
     camera: Any,
     xy: Any,
     cfw_r: Any,
@@ -234,7 +234,7 @@ def _errors(
     for n in range(len(rows)):
         k = rows[n]
         c = camera[k]
-        out[n] = _error2(cfw_r[shot[k]], cfw_t[shot[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj)
+        out[n] = _error2(cfw_r[band[k]], cfw_t[band[k]], kind[c], params[c], points[point[n]], xy[k], cam, work, proj)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -242,8 +242,8 @@ def _has_angle(
     which: Any,
     first: Any,
     track_keypoints: Any,
-    kept: Any,
-    shot: Any,
+    is_inlier: Any,
+    band: Any,
     rays: Any,
     cfw_r: Any,
     cos_limit: float,
@@ -256,8 +256,8 @@ def _has_angle(
         out[n] = False
         for s in range(first[which[n]], first[which[n] + 1]):
             k = track_keypoints[s]
-            if kept[k] and count < MAX_OBSERVATIONS and not out[n]:
-                r = cfw_r[shot[k]]
+            if is_inlier[k] and count < MAX_OBSERVATIONS and not out[n]:
+                r = cfw_r[band[k]]
                 for i in range(3):
                     direction[count, i] = r[0, i] * rays[k, 0] + r[1, i] * rays[k, 1] + r[2, i] * rays[k, 2]
                 for m in range(count):
@@ -269,13 +269,13 @@ def _has_angle(
                 count += 1
 
 
-def cam_from_world(state: State, units: Ints, cameras: Ints, shots: Ints | None = None) -> tuple[Floats, Floats]:
-    """Rotations (n, 3, 3) and translations (n, 3) of images of the given units and cameras, at the given shots."""
+def cam_from_world(state: State, units: Ints, cameras: Ints, bands: Ints | None = None) -> tuple[Floats, Floats]:
+    """Rotations (n, 3, 3) and translations (n, 3) of images of the given units and cameras, at the given row bands."""
     rotation, centre = state.camera_rotation[cameras], state.camera_position_m[cameras]
-    if shots is not None and not state.simultaneous:
-        turn = state.shot_rotation[shots]
+    if bands is not None and not state.simultaneous:
+        turn = state.band_rotation[bands]
         rotation = turn @ rotation
-        centre = np.einsum("nij,nj->ni", turn, centre) + state.shot_position_m[shots]
+        centre = np.einsum("nij,nj->ni", turn, centre) + state.band_position_m[bands]
     world_from_cam = state.unit_rotation[units] @ rotation
     centre = np.einsum("nij,nj->ni", state.unit_rotation[units], centre) + state.unit_position_m[units]
     rotation = np.ascontiguousarray(np.swapaxes(world_from_cam, 1, 2))
@@ -288,8 +288,8 @@ class Triangulator:
     def __init__(
         self,
         keypoints: Keypoints,
-        shot_unit: Ints,
-        shot_camera: Ints,
+        band_unit: Ints,
+        band_camera: Ints,
         camera_kind: Ints,
         *,
         max_error_px: float,
@@ -297,22 +297,22 @@ class Triangulator:
         threads: int = 1,
     ) -> None:
         self._keypoints, self._threads = keypoints, threads
-        self._shot_unit, self._shot_camera, self._kind = shot_unit, shot_camera, camera_kind
-        self._few_shots = len(shot_unit) <= ALL_SHOTS
+        self._band_unit, self._band_camera, self._kind = band_unit, band_camera, camera_kind
+        self._few_bands = len(band_unit) <= ALL_SHOTS
         self.max_error_px = max_error_px
         self._min_angle = math.radians(min_angle_deg)
 
     def _cam_from_world(self, state: State, keypoints: Ints | None) -> tuple[Floats, Floats]:
-        """Poses of all shots; where there are many, only those of some keypoints' shots are filled in."""
-        if self._few_shots or keypoints is None:
-            every = None if state.simultaneous else np.arange(len(self._shot_unit))
-            return cam_from_world(state, self._shot_unit, self._shot_camera, every)
-        needed = np.zeros(len(self._shot_unit), dtype=np.bool_)
-        needed[self._keypoints.shot[keypoints]] = True
-        shots = np.flatnonzero(needed)
+        """Poses of all row bands; where there are many, only those of some keypoints' row bands are filled in."""
+        if self._few_bands or keypoints is None:
+            every = None if state.simultaneous else np.arange(len(self._band_unit))
+            return cam_from_world(state, self._band_unit, self._band_camera, every)
+        needed = np.zeros(len(self._band_unit), dtype=np.bool_)
+        needed[self._keypoints.band[keypoints]] = True
+        bands = np.flatnonzero(needed)
         rotation, translation = np.empty((len(needed), 3, 3)), np.empty((len(needed), 3))
-        rotation[shots], translation[shots] = cam_from_world(
-            state, self._shot_unit[shots], self._shot_camera[shots], shots
+        rotation[bands], translation[bands] = cam_from_world(
+            state, self._band_unit[bands], self._band_camera[bands], bands
         )
         return rotation, translation
 
@@ -324,10 +324,10 @@ class Triangulator:
         *,
         which: Ints,
         points_m: Floats,
-        solved: Bools,
-        kept: Bools,
+        triangulated: Bools,
+        is_inlier: Bools,
     ) -> None:
-        """Triangulate the tracks `which` from their observations in usable shots (s,), those that have a pose.
+        """Triangulate the tracks `which` from their observations in usable row bands (s,), those that have a pose.
 
         Writes the points into points_m (tracks, 3), whether there is one into solved (tracks,), and which keypoints are
         its observations into kept (keypoints,).
@@ -338,12 +338,13 @@ class Triangulator:
             self._threads,
             len(which),
             lambda lo, hi, _: _triangulate(
-                which[lo:hi], tracks.first, tracks.keypoints, k.shot, k.camera, k.xy_px, k.rays, usable, r, t,
-                self._kind, state.camera_params, self.max_error_px**2, self._min_angle, points_m, solved, kept,
+                which[lo:hi], tracks.first, tracks.keypoints, k.band, k.camera, k.xy_px, k.rays, usable, r, t,
+                self._kind, state.camera_params, self.max_error_px**2, self._min_angle, points_m, triangulated,
+                is_inlier,
             ),
         )  # fmt: skip
 
-    def has_angle(self, state: State, tracks: Tracks, kept: Bools, which: Ints) -> Bools:
+    def has_angle(self, state: State, tracks: Tracks, is_inlier: Bools, which: Ints) -> Bools:
         """Which of the tracks `which` are still seen under an angle that gives depth by their kept observations."""
         r, _ = self._cam_from_world(state, _members(tracks, which))
         out, k = np.empty(len(which), dtype=np.bool_), self._keypoints
@@ -351,7 +352,7 @@ class Triangulator:
             self._threads,
             len(which),
             lambda lo, hi, _: _has_angle(
-                which[lo:hi], tracks.first, tracks.keypoints, kept, k.shot, k.rays, r, math.cos(self._min_angle),
+                which[lo:hi], tracks.first, tracks.keypoints, is_inlier, k.band, k.rays, r, math.cos(self._min_angle),
                 out[lo:hi],
             ),
         )  # fmt: skip
@@ -365,7 +366,7 @@ class Triangulator:
             self._threads,
             len(rows),
             lambda lo, hi, _: _errors(
-                rows[lo:hi], point[lo:hi], k.shot, k.camera, k.xy_px, r, t, self._kind, state.camera_params, points_m,
+                rows[lo:hi], point[lo:hi], k.band, k.camera, k.xy_px, r, t, self._kind, state.camera_params, points_m,
                 out[lo:hi],
             ),
         )  # fmt: skip

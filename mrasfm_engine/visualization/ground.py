@@ -50,13 +50,13 @@ class GroundPatches:
     plane: Floats  # (k, 3) height at the centre in metres, and two slopes
 
     @cached_property
-    def _tree(self) -> cKDTree:
+    def _kd_tree(self) -> cKDTree:
         return cKDTree(self.centre_m)
 
     def height_m(self, xy_m: Floats) -> Floats:
         """See `GroundHeights`; takes as long for a long way as for a short one."""
         count = min(BLENDED_PATCHES, len(self.centre_m))
-        distance, nearest = (np.reshape(a, (len(xy_m), count)) for a in self._tree.query(xy_m, k=count))
+        distance, nearest = (np.reshape(a, (len(xy_m), count)) for a in self._kd_tree.query(xy_m, k=count))
         offset, plane = xy_m[:, None] - self.centre_m[nearest], self.plane[nearest]
         weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / BLEND_SIGMA_M**2)
         height = plane[..., 0] + (offset * plane[..., 1:]).sum(-1)

@@ -91,8 +91,8 @@ def road_points(scene: Scene) -> dict[str, Bytes]:
         return {}
     road, way = scene.road, scene.world_from_rig[scene.unit_registered]
     views = _views(road, way)
-    everything = np.ones(len(road.before.kept), dtype=np.bool_)
-    shown = zip(NAMES, (everything, road.before.kept), ("before", "after"), strict=True)
+    everything = np.ones(len(road.before.is_inlier), dtype=np.bool_)
+    shown = zip(NAMES, (everything, road.before.is_inlier), ("before", "after"), strict=True)
     return {name: np.ascontiguousarray(_draw(road, views, points, what)[..., ::-1]) for name, points, what in shown}
 
 
@@ -108,7 +108,7 @@ def _views(road: Road, world_from_rig: Floats) -> _Views:
     # The way's own height: where a patch is, the surface's.
     offset, _ = road.surface.locate(np.column_stack([way[:, :2], ground]) @ axes)
     surface = np.column_stack([travelled, np.where(np.isfinite(offset), ground - offset, ground) - zero])
-    kept = before.kept & np.isfinite(before.distance_m)
+    kept = before.is_inlier & np.isfinite(before.distance_m)
     shown = np.concatenate([points[kept, 2] - zero, surface[:, 1]])
     reach = np.percentile(along[kept], [0.5, 99.5]) if kept.any() else np.array([0.0, 1.0])
     low = (float(min(reach[0], 0.0)) - 1.0, float(np.percentile(shown, 0.5)) - MARGIN_M)
@@ -166,7 +166,7 @@ def _exaggeration(panel: _Panel) -> float:
 def _draw(road: Road, views: _Views, shown: Bools, what: str) -> Bytes:
     image: Bytes = np.full((SIZE_PX[1], SIZE_PX[0], 3), 255, np.uint8)
     distance = road.before.distance_m
-    thickness = Thickness.of(distance[shown])
+    thickness = Thickness.from_distances(distance[shown])
     write_text(image, f"Road points {what} those off the surface were dropped", (90, 34), size=0.8)
     write_text(
         image,

@@ -1,6 +1,6 @@
 """Kills a supervisor's process groups when the supervisor is gone.
 
-A program of its own, `python -I -S process_guard.py`, because only another process outlives a SIGKILL. Its standard
+A program of its own, `python -I -S orphan_reaper.py`, because only another process outlives a SIGKILL. Its standard
 input is a pipe that the supervisor alone writes to: `+PGID` and `-PGID`, one a line. The kernel closes the pipe when
 the supervisor ends, however it ends. Knows nothing but the standard library and starts in a few milliseconds.
 """

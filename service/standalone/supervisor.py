@@ -335,7 +335,7 @@ class _Child:
 
 
 class _Guard:
-    """The process of `process_guard`, started again with what it has to know should it die."""
+    """The process of `orphan_reaper`, started again with what it has to know should it die."""
 
     def __init__(self, kept_descriptors: Sequence[int]) -> None:
         self._kept_descriptors = tuple(kept_descriptors)

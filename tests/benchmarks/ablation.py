@@ -13,7 +13,7 @@ from tests.benchmarks.recalibration import AS_DECLARED, CAMERAS, SIZE, UNITS
 from tests.benchmarks.table import Figure, exactly
 
 SEED = 1
-FULL, CSBA = "full", "adjustment.camera_set_adjustment"
+FULL, CSBA = "full", "bundle_adjustment.camera_set_adjustment"
 TIMEOUT_S = 3600.0
 WORSE = 1.0  # without a part, an error is more than this many times as large,
 FAR_WORSE = 1000.0  # and not so large that something else must have gone wrong

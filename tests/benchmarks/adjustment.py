@@ -98,7 +98,7 @@ def long_problem() -> Problem:
             xy_px=sim.xy_px[kept][order],
             num_points=len(points),
         ),
-        layout=Layout.of(free_units, free_cameras),
+        layout=Layout.from_free(free_units, free_cameras),
         options=SolverOptions(
             max_iterations=MAX_ITERATIONS, function_tolerance=TOLERANCE, decrement_tolerance=0.0, threads=THREADS
         ),

@@ -18,7 +18,7 @@ DRIVES, DUSK, BIASED, FAR = 7, 1, 2, 6
 CROSSING_UNITS, SURROUND_UNITS, LOOP_UNITS, REPEATED_UNITS = 30, 40, 37, 24
 LOOP_DRIVES = 4
 UNTRUSTED_POSITIONS = "[aggregation]\nposition_error_m = 80.0\n"  # so that a street 60 m away comes into question
-CHAIN = '[aggregation]\njoint = false\nfinal_adjustment = "none"\n'
+CHAIN = '[aggregation]\nmulti_scene_adjustment = false\nfinal_adjustment = "none"\n'
 
 
 def kitti(data: Path, work: Path) -> Iterator[Figure]:
@@ -87,7 +87,7 @@ def repeated(work: Path, seed: int) -> Iterator[Figure]:
     scenes = [_scene(drive) for drive in drives]
     for title, text, expected in (
         ("with the consensus", UNTRUSTED_POSITIONS, 0),
-        ("without it", UNTRUSTED_POSITIONS + "consensus = false\n", 1),
+        ("without it", UNTRUSTED_POSITIONS + "agreeing_units = false\n", 1),
     ):
         errors = _aggregated(scenes, drives, folder / title, settings=text)
         yield exactly("20b", f"two streets alike {seed}: seams {title}", len(errors["seams"]), expected)

@@ -15,7 +15,7 @@ from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.pair_selection import pairs_from_window
 from mrasfm_engine.preflight.drive_reader import read_drive
-from mrasfm_engine.registry import load_plugins
+from mrasfm_engine.registry import load_components
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import THREADS, imported, reconstructed
 from tests.benchmarks.table import Figure, exactly
@@ -69,10 +69,10 @@ def changing_light(data: Path, work: Path, models: Path) -> Iterator[Figure]:
     units = np.array([image.unit for image in drive.images])
     for name, settings in (("SIFT and nearest neighbours", {}), ("XFeat and LighterGlue", LEARNED)):
         config = EngineConfig.model_validate({**settings, "models": {"folder": models}})
-        plugins = load_plugins(config, None)
-        features = extract_features(drive, plugins.extractor, threads=THREADS)
+        components = load_components(config, None)
+        features = extract_features(drive, components.extractor, threads=THREADS)
         pairs = pairs_from_window(drive, config.pairs)
-        found = match_pairs(drive, features, pairs, plugins.matcher, config.matching, threads=THREADS)
+        found = match_pairs(drive, features, pairs, components.matcher, config.matching, threads=THREADS)
         inliers = {(p.image_a, p.image_b): int(p.inliers.sum()) for p in found.pairs}
         for kind, parity in (("bright with dark", 1), ("dark with dark, bright with bright", 0)):
             of_kind = [(int(a), int(b)) for a, b in pairs if (units[a] - units[b]) % 2 == parity]

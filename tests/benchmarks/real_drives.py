@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mrasfm_engine.benchmark.baselines import Mapper, run_peer
+from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
 from mrasfm_engine.evaluation.cameras import compare_camera_poses
 from mrasfm_engine.io.read_scene import read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
@@ -62,7 +62,7 @@ def accuracy(data: Path, work: Path) -> Iterator[Figure]:
             scene = reconstructed(drive, work / f"{bounds.name} {title}", *options)
             yield from _stereo_figures(f"{bounds.name} {title}", evaluate(scene, drive), bounds.images, most)
     yield from _ddad(data, work)
-    yield from _peers(data, work)
+    yield from _baselines(data, work)
 
 
 def _stereo_figures(title: str, errors: dict, images: int, most: float) -> Iterator[Figure]:  # type: ignore[type-arg]
@@ -88,13 +88,13 @@ def _ddad(data: Path, work: Path) -> Iterator[Figure]:
     yield Figure(line="1", what="ddad: camera rotation, median", value=errors.rotation_median_deg, unit="deg")
 
 
-def _peers(data: Path, work: Path) -> Iterator[Figure]:
+def _baselines(data: Path, work: Path) -> Iterator[Figure]:
     """COLMAP on the matches of kitti06 without GNSS, for comparison."""
     drive = imported(data, "kitti06", work)
     scene = reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
     truth = read_tum(drive / "truth.tum").world_from_rig
-    for mapper in (Mapper.GLOBAL, Mapper.GLOBAL_FIXED_CALIBRATION, Mapper.INCREMENTAL_FIXED_CALIBRATION):
-        result = run_peer(scene / "features.db", mapper, threads=THREADS)
+    for mapper in (Baseline.GLOBAL, Baseline.GLOBAL_FIXED_CALIBRATION, Baseline.INCREMENTAL_FIXED_CALIBRATION):
+        result = run_baseline(scene / "features.db", mapper, threads=THREADS)
         title = f"kitti06 without GNSS, COLMAP {mapper}"
         yield Figure(line="1", what=f"{title}: mapping", value=result.seconds, unit="s", remark=result.failure)
         yield Figure(line="1", what=f"{title}: images registered", value=result.registered_images)

@@ -44,7 +44,7 @@ def recalibration(work: Path, seed: int) -> Iterator[Figure]:
     name = WRONG[seed % len(WRONG)]
     mrasfm(
         "synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", seed, "--no-masks", *SIZE,
-        "--wrong-camera", name, "--wrong-by-deg", WRONG_BY_DEG, "--out", drive,
+        "--miscalibrated-camera", name, "--miscalibrated-by-deg", WRONG_BY_DEG, "--out", drive,
     )  # fmt: skip
     yield from wrong_camera(drive, work / "with a wrong camera, scene", name, seed)
 

@@ -34,8 +34,8 @@ from mrasfm_engine.geometry.alignment import align_rigid
 from mrasfm_engine.geometry.camera_model import pack_cameras, project_points, unproject_pixels
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
-from mrasfm_engine.mapping.mapper import Model
-from mrasfm_engine.mapping.road import RoadJudgement, judge_road
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.road import RoadAssessment, assess_road
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.road import Thickness
 from mrasfm_engine.scene.semantics import ROAD
@@ -144,9 +144,9 @@ def road_errors_m(drive: Path, scene: Path) -> RoadErrors:
     points = read_ply(scene / "points.ply")
     road = np.flatnonzero(points["class"] == ROAD)
     xyz = se3.apply(truth_from_scene, np.stack([points[name][road] for name in "xyz"], -1).astype(np.float64))
-    model = pycolmap.Reconstruction(str(scene / "model"))
+    mapper = pycolmap.Reconstruction(str(scene / "model"))
     observations = [
-        frozenset((e.image_id, e.point2D_idx) for e in model.points3D[int(p) + 1].track.elements) for p in road
+        frozenset((e.image_id, e.point2D_idx) for e in mapper.points3D[int(p) + 1].track.elements) for p in road
     ]
     ground = Ground.of(drive)
     slope = np.gradient(ground.heights_m, ground.at_m)
@@ -211,9 +211,9 @@ def held_out(drive: Path, work: Path) -> Iterator[Figure]:
         above=0.5,
         most=1.05,
     )
-    model = finished_model(drive, with_it)
+    mapper = finished_model(drive, with_it)
     for title, parity in (("even units judge, odd are measured", 0), ("odd units judge, even are measured", 1)):
-        everything, kept = held_out_thickness(model, parity)
+        everything, kept = held_out_thickness(mapper, parity)
         yield Figure(line="6b", what=f"kitti02, {title}: thickness, all", value=everything.range90_m, unit="m")
         yield Figure(line="6b", what=f"kitti02, {title}: thickness, kept", value=kept.range90_m, unit="m")
         yield Figure(
@@ -224,7 +224,7 @@ def held_out(drive: Path, work: Path) -> Iterator[Figure]:
         )
 
 
-def finished_model(drive: Path, scene: Path) -> Model:
+def finished_model(drive: Path, scene: Path) -> Mapper:
     """The refined model of a scene, from its kept stages."""
     config = EngineConfig(use_gnss=False)
     run = stages.Run(read_drive(drive), config, stages.store_of(scene), lambda *_: None, lambda: False)
@@ -232,30 +232,32 @@ def finished_model(drive: Path, scene: Path) -> Model:
     prior = stages.prior(run)
     features = stages.features(run)
     matches = stages.matches(run, features, prior)
-    model = stages.mapping(run, features, matches, prior)
-    stages.scene(run, model, features, matches, prior)
+    mapper = stages.mapping(run, features, matches, prior)
+    stages.scene(run, mapper, features, matches, prior)
     assert all(stage["reused"] for stage in run.report["stages"][:3]), "the scene's stages were to be used again"
-    return model
+    return mapper
 
 
-def held_out_thickness(model: Model, parity: int) -> tuple[Thickness, Thickness]:
+def held_out_thickness(mapper: Mapper, parity: int) -> tuple[Thickness, Thickness]:
     """Of road points that units of the other parity see: all that this parity judges too, and those that it keeps."""
-    judging, measured = _seen_by(model, parity), _seen_by(model, 1 - parity)
-    judgement = judge_road(judging, final=True)
-    assert isinstance(judgement, RoadJudgement), judgement
-    both = measured.solved[judgement.tracks]
+    judging, measured = _seen_by(mapper, parity), _seen_by(mapper, 1 - parity)
+    judgement = assess_road(judging, for_map=True)
+    assert isinstance(judgement, RoadAssessment), judgement
+    both = measured.triangulated[judgement.tracks]
     distance, _ = judgement.fitted.surface.locate(measured.state.points_m[judgement.tracks])
-    return Thickness.of(distance[both]), Thickness.of(distance[both & judgement.kept])
+    return Thickness.from_distances(distance[both]), Thickness.from_distances(distance[both & judgement.is_inlier])
 
 
-def _seen_by(model: Model, parity: int) -> Model:
+def _seen_by(mapper: Mapper, parity: int) -> Mapper:
     """The model with points from units of one parity only."""
-    half = copy.copy(model)
-    half.registered = model.registered & (np.arange(len(model.registered)) % 2 == parity)
-    half.state = replace(model.state, points_m=np.zeros_like(model.state.points_m))
-    half.solved, half.kept, half.barred = (np.zeros_like(a) for a in (model.solved, model.kept, model.barred))
+    half = copy.copy(mapper)
+    half.registered = mapper.registered & (np.arange(len(mapper.registered)) % 2 == parity)
+    half.state = replace(mapper.state, points_m=np.zeros_like(mapper.state.points_m))
+    half.triangulated, half.is_inlier, half.rejected = (
+        np.zeros_like(a) for a in (mapper.triangulated, mapper.is_inlier, mapper.rejected)
+    )
     half.triangulate()
-    half.filter(model.config.mapping.filter_error_px)
+    half.filter(mapper.config.mapping.filter_error_px)
     return half
 
 

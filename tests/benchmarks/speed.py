@@ -23,8 +23,8 @@ TIMES_AS_FAST = {
 MAX_KITTI_RMSE_M = 0.10
 MAX_SHARE_OF_WHOLE_WAY = 1 / 3
 SURROUND_UNITS = 60
-ALONE = 2  # runs of ours without peers
-PATIENCE = 1.25  # a peer is given so many times what would do: it need not come to its end to be slower
+ALONE = 2  # runs of ours without baselines
+PATIENCE = 1.25  # a baseline is given so many times what would do: it need not come to its end to be slower
 ROUTES = (500, 1000, 2000, 4541)
 MAX_GROWTH, MAX_MEMORY_GB, MAX_ERROR_PERCENT = 1.5, 8.0, 0.1
 
@@ -32,7 +32,7 @@ MAX_GROWTH, MAX_MEMORY_GB, MAX_ERROR_PERCENT = 1.5, 8.0, 0.1
 def speed(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 2: a real drive; mapping after matching, and the whole way from images."""
     drive = imported(data, "kitti06", work)
-    yield from _beside_peers("2", "kitti06", drive, work / "bench kitti06", repeat)
+    yield from _beside_baselines("2", "kitti06", drive, work / "bench kitti06", repeat)
     yield from _whole_way(drive, data, work, repeat)
 
 
@@ -40,7 +40,7 @@ def surround_speed(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 14: a rendered drive of six cameras."""
     drive = work / "surround for speed"
     mrasfm("synth", "--out", drive, "--units", SURROUND_UNITS, "--cameras", 6, "--seed", 1)
-    yield from _beside_peers("14", "surround", drive, work / "bench surround", repeat)
+    yield from _beside_baselines("14", "surround", drive, work / "bench surround", repeat)
 
 
 def long_routes(data: Path, work: Path) -> Iterator[Figure]:
@@ -71,26 +71,26 @@ def long_routes(data: Path, work: Path) -> Iterator[Figure]:
     )
 
 
-def _beside_peers(line: str, name: str, drive: Path, out: Path, repeat: int) -> Iterator[Figure]:
+def _beside_baselines(line: str, name: str, drive: Path, out: Path, repeat: int) -> Iterator[Figure]:
     wanted = TIMES_AS_FAST[name]
-    # Ours takes so much less time that a moment's load weighs on it most: it is measured before the peers, too.
+    # Ours takes so much less time that a moment's load weighs on it most: it is measured before the baselines, too.
     alone = _row(_bench(drive, "--out", out, "--repeat", ALONE), "mrasfm")
     patience_s = PATIENCE * max(wanted.values()) * alone["whole_s"]
     result = _bench(
-        drive, "--out", out, "--peers", ",".join(wanted), "--repeat", repeat, "--timeout-s", f"{patience_s:.0f}"
+        drive, "--out", out, "--baselines", ",".join(wanted), "--repeat", repeat, "--timeout-s", f"{patience_s:.0f}"
     )
     ours = _row(result, "mrasfm")
     ours_s = statistics.median([*alone["runs_s"], *ours["runs_s"]])
     yield Figure(line=line, what=f"{name}: mapping and refinement", value=ours_s, unit="s")
     errors = ours["errors"]
     yield Figure(line=line, what=f"{name}: metric RMSE", value=errors["metric_rmse_m"], unit="m", most=MAX_KITTI_RMSE_M)
-    for peer, times in wanted.items():
-        row = _row(result, peer)
+    for baseline, times in wanted.items():
+        row = _row(result, baseline)
         seconds = row["whole_s"] if row["whole_s"] is not None else patience_s
         remark = row["failure"] or f"{row['registered_images']} images"
-        yield Figure(line=line, what=f"{name}: {peer} on the same matches", value=seconds, unit="s", remark=remark)
+        yield Figure(line=line, what=f"{name}: {baseline} on the same matches", value=seconds, unit="s", remark=remark)
         ratio = seconds / ours_s
-        yield Figure(line=line, what=f"{name}: times as fast as {peer}", value=ratio, above=times, most=1e4)
+        yield Figure(line=line, what=f"{name}: times as fast as {baseline}", value=ratio, above=times, most=1e4)
 
 
 def _whole_way(drive: Path, data: Path, work: Path, repeat: int) -> Iterator[Figure]:
@@ -100,8 +100,8 @@ def _whole_way(drive: Path, data: Path, work: Path, repeat: int) -> Iterator[Fig
         started = time.perf_counter()
         mrasfm("reconstruct", drive, "--out", work / f"whole way {repetition}")
         ours.append(time.perf_counter() - started)
-    peer = data.parent / "tools" / "peers.py"
-    command = [sys.executable, str(peer), str(data / "kitti06"), "global"]
+    baseline = data.parent / "tools" / "peers.py"
+    command = [sys.executable, str(baseline), str(data / "kitti06"), "global"]
     printed = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=True).stdout
     theirs = sum(step["seconds"] for step in map(json.loads, printed.splitlines()))
     figure, whole_s = partial(Figure, line="2"), statistics.median(ours)

@@ -90,16 +90,16 @@ def camera_information(scene: ExactScene, antenna_m: np.ndarray, sigma_gnss_m: n
         np.concatenate([by_unit, by_camera], 2)[good], [6 * u[good], 6 * units + 6 * c[good]], 6, 6 * (units + cameras)
     )
     depth = _sparse(by_point[good], [3 * scene.point[good]], 3, 3 * len(points))
-    reduced = _without_points(poses, depth)
+    system = _without_points(poses, depth)
     for k in range(units):
         lever = scene.world_from_rig[k, :3, :3] @ antenna_m
         j = np.concatenate([-se3.skew(lever), np.eye(3)], 1) / sigma_gnss_m[:, None]
-        reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += j.T @ j
+        system[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += j.T @ j
     split = 6 * units
     # Positions on a line leave the roll about it; how the whole scene is turned says nothing of the cameras.
-    own = reduced[:split, :split] + np.diag(np.tile([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], units)) / SIGMA_TURN_RAD**2
-    across = reduced[split:, :split]
-    result: np.ndarray = reduced[split:, split:] - across @ np.linalg.solve(own, across.T)
+    own = system[:split, :split] + np.diag(np.tile([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], units)) / SIGMA_TURN_RAD**2
+    across = system[split:, :split]
+    result: np.ndarray = system[split:, split:] - across @ np.linalg.solve(own, across.T)
     return result
 
 

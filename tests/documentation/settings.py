@@ -36,7 +36,7 @@ keyframe_motion_px = 2.0   # units that moved less are registered in the finishe
 motion_compensation = true # cameras that are not simultaneous, and rolling shutters
 pose_observations = 400    # of an image, for its pose while the scene grows; 0: all
 
-[adjustment]
+[bundle_adjustment]
 refine_calibration = true  # where motion or GNSS make it observable
 sigma_rotation_deg = 2.0   # prior of rig_from_cam where the manifest declares none
 sigma_translation_m = 0.05

@@ -1,8 +1,8 @@
 """Camera set bundle adjustment by Ceres, through pycolmap: slower, by other people, and therefore the reference.
 
-It takes a `Problem` and returns what `solver.solve` returns. What COLMAP has no words for is refused: shots apart from
-their unit's timestamp, and one focal factor for fx and fy where they differ or where the distortion has more terms than
-COLMAP's models of one focal length. Terms besides the observations are handed over by `ceres_terms`, with pyceres.
+It takes a `Problem` and returns what `solver.solve` returns. What COLMAP has no words for is refused: row bands apart
+from their unit's timestamp, and one focal factor for fx and fy where they differ or where the distortion has more
+terms than COLMAP's models of one focal length. `ceres_terms` hands over the terms besides observations, with pyceres.
 
 A rig of COLMAP's stands where one of its cameras does, which is held: the first that is fixed. Where all are free, a
 sensor without images stands at the rig's origin. (A rig whose reference sees nothing keeps all of its cameras where

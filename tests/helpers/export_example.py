@@ -167,7 +167,7 @@ def scene_with_road(*, far: bool = False) -> Scene:
         surface=surface,
         roughness_m=0.01,
         rig_height_m=float(way[0, 2] + 1.5),
-        before=RoadPoints(points_m=before, distance_m=distance, kept=np.arange(60) < 20),
+        before=RoadPoints(points_m=before, distance_m=distance, is_inlier=np.arange(60) < 20),
     )
     classes = np.where(np.arange(len(points)) < 20, ROAD, 1).astype(np.uint8)
     patches = np.full(len(points), -1, np.int32)

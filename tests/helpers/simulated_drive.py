@@ -11,9 +11,9 @@ import numpy as np
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
-from mrasfm_engine.scene.row_bands import Shots
+from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.synthetic.rigs import mounts
 from mrasfm_engine.synthetic.simulate import SimulatedObservations, simulate_observations
@@ -212,33 +212,33 @@ def true_matches(
 
 def make_model(
     simulated: SimulatedDrive, pairs: list[PairMatches] | None = None, config: EngineConfig | None = None
-) -> Model:
+) -> Mapper:
     """A model of the drive without any pose, one thread."""
     config = config or EngineConfig(threads=1)
     keypoints = keypoints_of(simulated, config)
     tracks = build_tracks(keypoints, true_matches(simulated) if pairs is None else pairs)
-    return Model(simulated.drive, keypoints, tracks, config)
+    return Mapper(simulated.drive, keypoints, tracks, config)
 
 
 def keypoints_of(simulated: SimulatedDrive, config: EngineConfig) -> Keypoints:
     """The drive's keypoints at the times that the settings give them."""
-    shots = Shots.of(simulated.drive, compensate=config.mapping.motion_compensation)
-    return Keypoints.of(simulated.drive, simulated.features, shots)
+    bands = RowBands.from_drive(simulated.drive, compensate=config.mapping.motion_compensation)
+    return Keypoints.from_features(simulated.drive, simulated.features, bands)
 
 
-def with_true_poses(model: Model, simulated: SimulatedDrive, units: Iterable[int]) -> Model:
+def with_true_poses(mapper: Mapper, simulated: SimulatedDrive, units: Iterable[int]) -> Mapper:
     """The model with some units at their true poses, and the points these see."""
     for u in units:
-        model.set_pose(u, simulated.world_from_rig[u])
-    model.renew_motion()
-    model.triangulate()
-    return model
+        mapper.set_pose(u, simulated.world_from_rig[u])
+    mapper.renew_motion()
+    mapper.triangulate()
+    return mapper
 
 
-def metric_errors_m(model: Model, simulated: SimulatedDrive) -> np.ndarray:
+def metric_errors_m(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
     """Distances (registered units,) after a rigid alignment, without scale, by positions and rotations."""
-    units = np.flatnonzero(model.registered)
-    own, true = model.state.world_from_rig[units], simulated.world_from_rig[units]
+    units = np.flatnonzero(mapper.registered)
+    own, true = mapper.state.world_from_rig[units], simulated.world_from_rig[units]
     turn = se3.mean_rotation(true[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
     moved = own[:, :3, 3] @ turn.T
     moved = moved + (true[:, :3, 3] - moved).mean(0)

@@ -77,7 +77,7 @@ def make_case(
         state=truth,
         camera_kind=kind,
         observations=Observations(unit=unit, camera=camera, point=point, xy_px=xy, num_points=len(sim.points_m)),
-        layout=Layout.of(
+        layout=Layout.from_free(
             np.array(first_fixed if free_units is None else free_units, dtype=np.bool_),
             np.array([False] * cameras if free_cameras is None else free_cameras, dtype=np.bool_),
             free_focal=free_focal,
@@ -87,11 +87,11 @@ def make_case(
     return Case(truth=truth, problem=problem, simulation=sim)
 
 
-def project(state: State, kind: Any, unit: Any, camera: Any, point: Any, shot: Any = None) -> np.ndarray:
+def project(state: State, kind: Any, unit: Any, camera: Any, point: Any, band: Any = None) -> np.ndarray:
     """Pixels (n, 2) of points in images, one at a time: slow and plain."""
     world_from_rig = state.world_from_rig[unit]
-    if shot is not None:
-        world_from_rig = world_from_rig @ state.unit_from_shot[shot]
+    if band is not None:
+        world_from_rig = world_from_rig @ state.unit_from_band[band]
     cam_from_world = se3.inverse(world_from_rig @ state.rig_from_cam[camera])
     in_camera = se3.apply(cam_from_world, state.points_m[point][:, None, :])[:, 0]
     pixels = np.empty((len(unit), 2))
@@ -144,7 +144,7 @@ def moved(problem: Problem, state: State, step: np.ndarray) -> State:
 def weighted_residuals(problem: Problem, state: State) -> np.ndarray:
     """Residuals (2 n,) over sigma, without the loss."""
     o = problem.observations
-    pixels = project(state, problem.camera_kind, o.unit, o.camera, o.point, o.shot)
+    pixels = project(state, problem.camera_kind, o.unit, o.camera, o.point, o.band)
     return ((pixels - o.xy_px) / problem.options.sigma_px).ravel()
 
 

@@ -17,7 +17,7 @@ from mrasfm_engine.export.calibration import ONLY_PRIOR
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
-from mrasfm_engine.scene.scene import CalibrationVerdict, CameraCalibration, Georeference, ImageFeatures, Scene
+from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.synthetic.rigs import mounts, true_cameras
 from mrasfm_engine.synthetic.simulate import poses_along, simulate_observations
 from schemas import Gnss, GnssSample, RoughPose, RoughTrajectory
@@ -100,7 +100,7 @@ def drive_along(
     speed = np.gradient(way_m)  # a unit's time
     offsets = np.zeros(cameras) if offset_ms is None else np.array(offset_ms) * 1e3 / STEP_US
     then = (way_m[:, None] + speed[:, None] * offsets).ravel()
-    street_from_shot = (poses_along(then) @ aside).reshape(units, cameras, 4, 4)
+    street_from_band = (poses_along(then) @ aside).reshape(units, cameras, 4, 4)
 
     middle = street_from_rig[units // 2, :3, 3] + bias_m
     biased = geodesy.geodetic_from_local(middle, street.ecef_from_street)
@@ -111,7 +111,7 @@ def drive_along(
     street_from_scene = se3.transform(np.eye(3), -np.asarray(bias_m)) @ believed
     scene_from_street = se3.inverse(street_from_scene)
 
-    street_from_cam = (street_from_shot @ rig_from_cam).reshape(-1, 4, 4)
+    street_from_cam = (street_from_band @ rig_from_cam).reshape(-1, 4, 4)
     seen, xy = _projected(street.points_m, street_from_cam, np.tile(params, (units, 1)))
     registered = ~np.isin(np.arange(units), list(missing_units))
     seen &= np.repeat(registered, cameras)[:, None]
@@ -128,7 +128,7 @@ def drive_along(
     poses[:, :3, 3] *= scale
     rig_in_scene = rig_from_cam.copy()
     rig_in_scene[:, :3, 3] *= scale
-    unit_from_image = (se3.inverse(street_from_rig)[:, None] @ street_from_shot).reshape(-1, 4, 4)
+    unit_from_image = (se3.inverse(street_from_rig)[:, None] @ street_from_band).reshape(-1, 4, 4)
     unit_from_image[:, :3, 3] *= scale
     poses[~registered] = np.nan
 
@@ -171,7 +171,7 @@ def drive_along(
             for pose, p in zip(rig_in_scene, params, strict=True)
         ],
         points_m=scale * points,
-        calibration_verdict=CalibrationVerdict(
+        calibration_observability=CalibrationObservability(
             adjusted=cameras_off_deg is not None,
             reason="",
             scale_observed=False,

@@ -22,7 +22,7 @@ SMALL = ("--width", "480", "--height", "270", "--texture-px", "256")
 
 
 @dataclass
-class Ran:
+class CommandResult:
     """What a command did."""
 
     code: int
@@ -116,14 +116,14 @@ def variant(surround_drive: Path, variant_of: Callable[[Path], Variant]) -> Vari
 
 
 @pytest.fixture
-def mrasfm(capfd: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+def mrasfm(capfd: pytest.CaptureFixture[str]) -> Callable[..., CommandResult]:
     """A function that runs the command in this process and returns what it printed."""
 
-    def run(*arguments: object) -> Ran:
+    def run(*arguments: object) -> CommandResult:
         capfd.readouterr()
         code = main([str(argument) for argument in arguments])
         printed = capfd.readouterr()
-        return Ran(code, printed.out, printed.err)
+        return CommandResult(code, printed.out, printed.err)
 
     return run
 

@@ -13,10 +13,10 @@ from mrasfm_engine import ablation
 from mrasfm_engine.ablation import FULL, SWITCHES, Row, _remark, switches_named
 from mrasfm_engine.config import EngineConfig, SemanticsConfig
 from mrasfm_engine.preflight.drive_reader import read_drive
-from tests.integration.conftest import Ran, Variant
+from tests.integration.conftest import CommandResult, Variant
 
-Run = Callable[..., Ran]
-CSBA, SELECTION, PRIORS = "adjustment.camera_set_adjustment", "pairs.selection", "adjustment.priors"
+Run = Callable[..., CommandResult]
+CSBA, SELECTION, PRIORS = "bundle_adjustment.camera_set_adjustment", "pairs.selection", "bundle_adjustment.priors"
 
 
 @pytest.fixture

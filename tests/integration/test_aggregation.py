@@ -13,9 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.cli import main
-from tests.integration.conftest import Ran, leftovers, read_report, synth
+from tests.integration.conftest import CommandResult, leftovers, read_report, synth
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 UNITS = 12
 pytestmark = pytest.mark.slow
 

@@ -13,9 +13,9 @@ from mrasfm_engine.cli import EXIT_BAD_INPUT
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import Pose
-from tests.integration.conftest import Document, Ran, Variant
+from tests.integration.conftest import CommandResult, Document, Variant
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 FILE = "images/front/000002.jpg"
 
 

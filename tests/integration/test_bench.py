@@ -15,9 +15,9 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
-from tests.integration.conftest import Ran, Variant, synth
+from tests.integration.conftest import CommandResult, Variant, synth
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 UNITS = 6
 
 
@@ -40,20 +40,20 @@ def test_a_simulated_route(mrasfm: Run) -> None:
 def test_a_drive_beside_colmap(variant: Variant, mrasfm: Run, tmp_path: Path) -> None:
     drive = variant.keep(cameras=["front", "left"], units=UNITS).save().root
     out = tmp_path / "bench"
-    ran = mrasfm("bench", drive, "--peers", "colmap-global", "--out", out, "--json")
+    ran = mrasfm("bench", drive, "--baselines", "colmap-global", "--out", out, "--json")
     assert ran.code == 0, ran.err
     document = json.loads(ran.out)
     assert json.loads((out / "bench.json").read_text()) == document
     assert document["features_and_matches"]["features_s"] > 0
-    ours, peer = document["mappers"]
-    assert (ours["mapper"], peer["mapper"]) == ("mrasfm", "colmap-global")
-    for mapper in (ours, peer):
+    ours, baseline = document["mappers"]
+    assert (ours["mapper"], baseline["mapper"]) == ("mrasfm", "colmap-global")
+    for mapper in (ours, baseline):
         assert mapper["failure"] == ""
         assert mapper["registered_images"] == 2 * UNITS
         assert 50e6 < mapper["start_memory_bytes"] <= mapper["peak_memory_bytes"] < 2e9
         assert 0 < mapper["errors"]["similarity_rmse_m"] < 0.05
         assert mapper["mapping_s"] > 0
-    assert peer["refinement_s"] is None
+    assert baseline["refinement_s"] is None
     assert 0 < ours["errors"]["metric_rmse_m"] < 0.3
 
 

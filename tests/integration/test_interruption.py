@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
-from tests.integration.conftest import Ran, Variant, leftovers, mrasfm_process, read_report
+from tests.integration.conftest import CommandResult, Variant, leftovers, mrasfm_process, read_report
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 
 
 def _wait_for(path: Path, seconds: float = 120.0) -> None:

@@ -16,9 +16,9 @@ from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.synthetic.streets import lay_out
-from tests.integration.conftest import Ran, Variant, read_report, synth
+from tests.integration.conftest import CommandResult, Variant, read_report, synth
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 SEED = 3  # of all these drives
 
 

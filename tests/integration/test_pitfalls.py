@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.integration.conftest import Ran, Variant, read_report, synth
+from tests.integration.conftest import CommandResult, Variant, read_report, synth
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 
 
 def reconstructed(run: Run, drive: Path, scene: Path, *options: str) -> dict:  # type: ignore[type-arg]

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine.cli import main
-from tests.integration.conftest import Ran, Variant, read_report
+from tests.integration.conftest import CommandResult, Variant, read_report
 
 pytestmark = pytest.mark.real
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from tests.integration.conftest import Ran, Variant, leftovers, read_report
+from tests.integration.conftest import CommandResult, Variant, leftovers, read_report
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 UNITS, IMAGES = 8, 32
 
 

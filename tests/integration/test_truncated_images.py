@@ -13,9 +13,9 @@ import pytest
 from mrasfm_engine.export.feature_database import pycolmap
 from mrasfm_engine.visualization import birds_eye
 from tests.helpers.damaged_images import cut
-from tests.integration.conftest import Document, Ran, Variant, read_report
+from tests.integration.conftest import CommandResult, Document, Variant, read_report
 
-Run = Callable[..., Ran]
+Run = Callable[..., CommandResult]
 CAMERAS = ["front", "left"]
 
 

@@ -166,7 +166,7 @@ CHECKER = ("python", "-P", "-m", "worker", "worker", "--queues", "checks", "--co
 @pytest.mark.parametrize(
     ("parent", "command", "role"),
     [
-        (process(Role.SUPERVISOR, "a"), ("python", "-I", "-S", "/x/process_guard.py"), Role.GUARD),
+        (process(Role.SUPERVISOR, "a"), ("python", "-I", "-S", "/x/orphan_reaper.py"), Role.GUARD),
         (process(Role.SUPERVISOR, "a"), ("valkey-server 127.0.0.1:20000",), Role.BROKER),
         (process(Role.SUPERVISOR, "a"), ("python", "-P", "-m", "service", "api"), Role.API),
         (process(Role.SUPERVISOR, "a"), WORKER, Role.WORKER),

@@ -101,7 +101,7 @@ def is_gone(pid: int) -> bool:
 
 
 def guards_of(pid: int) -> list[psutil.Process]:
-    return children_of(pid, "process_guard")
+    return children_of(pid, "orphan_reaper")
 
 
 @dataclass
@@ -363,7 +363,7 @@ def test_a_passing_lack_of_processes_ends_nothing(tmp_path: Path, monkeypatch: p
     real, refused, said = subprocess.Popen, [], []
 
     def scarce(argv: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        if "process_guard" in argv[-1] and len(refused) < 2:
+        if "orphan_reaper" in argv[-1] and len(refused) < 2:
             refused.append(argv)
             raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         return real(argv, **options)
@@ -372,8 +372,10 @@ def test_a_passing_lack_of_processes_ends_nothing(tmp_path: Path, monkeypatch: p
     spec = ChildSpec(name="worker", argv=[sys.executable, "-I", "-S", "-c", "import time; time.sleep(600)"])
 
     def end() -> None:
-        wait_for(lambda: len(guards_of(os.getpid())) == 1)
-        os.kill(os.getpid(), signal.SIGTERM)
+        try:
+            wait_for(lambda: len(guards_of(os.getpid())) == 1)
+        finally:  # else the supervisor would run on
+            os.kill(os.getpid(), signal.SIGTERM)
 
     ending = threading.Thread(target=end)
     Supervisor([spec], log_folder=tmp_path, say=said.append, on_ready=ending.start).run()

@@ -17,7 +17,7 @@ from mrasfm_engine.matching.learned_matchers import (
     SuperGlueMatcher,
 )
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
-from mrasfm_engine.registry import Plugins, load_plugins
+from mrasfm_engine.registry import Components, load_components
 from tests.helpers import learned_graphs
 
 GRAPHS = {
@@ -41,17 +41,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return work / "models"
 
 
-def load(folder: Path, **sections: dict[str, object]) -> Plugins:
-    return load_plugins(EngineConfig.model_validate({"models": {"folder": folder}, **sections}), None)
+def load(folder: Path, **sections: dict[str, object]) -> Components:
+    return load_components(EngineConfig.model_validate({"models": {"folder": folder}, **sections}), None)
 
 
 def test_without_settings_nothing_is_learned_and_no_folder_is_needed(tmp_path: Path) -> None:
-    plugins = load(tmp_path / "nowhere")
-    assert isinstance(plugins.extractor, SiftExtractor)
-    assert isinstance(plugins.matcher, NearestNeighbourMatcher)
-    assert plugins.segmenter is None
-    assert plugins.describe() == {}
-    assert plugins.fingerprint_of("extractor", "matcher") == {}
+    components = load(tmp_path / "nowhere")
+    assert isinstance(components.extractor, SiftExtractor)
+    assert isinstance(components.matcher, NearestNeighbourMatcher)
+    assert components.segmenter is None
+    assert components.describe() == {}
+    assert components.fingerprint_of("extractor", "matcher") == {}
 
 
 @pytest.mark.parametrize(
@@ -69,18 +69,18 @@ def test_without_settings_nothing_is_learned_and_no_folder_is_needed(tmp_path: P
 def test_what_goes_together_is_loaded(
     folder: Path, extractor: str, model: str | None, matcher: str, matching_model: str | None, expected: type
 ) -> None:
-    plugins = load(
+    components = load(
         folder,
         features={"extractor": extractor, "model": model},
         matching={"matcher": matcher, "model": matching_model},
     )
-    assert isinstance(plugins.extractor, LearnedExtractor)
-    assert isinstance(plugins.matcher, expected)
+    assert isinstance(components.extractor, LearnedExtractor)
+    assert isinstance(components.matcher, expected)
     name = model or extractor
-    assert plugins.fingerprint_of("extractor") == {"extractor": sha256_of(GRAPHS[name]())}
-    assert plugins.describe()["extractor"]["name"] == name
-    assert plugins.describe()["extractor"]["provider"].endswith("ExecutionProvider")
-    assert ("matcher" in plugins.models) == (matcher != "nearest")
+    assert components.fingerprint_of("extractor") == {"extractor": sha256_of(GRAPHS[name]())}
+    assert components.describe()["extractor"]["name"] == name
+    assert components.describe()["extractor"]["provider"].endswith("ExecutionProvider")
+    assert ("matcher" in components.models) == (matcher != "nearest")
 
 
 @pytest.mark.parametrize(
@@ -135,6 +135,6 @@ def test_a_missing_model_is_refused_with_how_to_get_it(tmp_path: Path) -> None:
 
 
 def test_a_segmenter_is_loaded(folder: Path) -> None:
-    plugins = load(folder, semantics={"model": "segmenter"})
-    assert plugins.segmenter is not None
-    assert plugins.fingerprint_of("extractor", "segmenter") == {"segmenter": sha256_of(learned_graphs.segmenter())}
+    components = load(folder, semantics={"model": "segmenter"})
+    assert components.segmenter is not None
+    assert components.fingerprint_of("extractor", "segmenter") == {"segmenter": sha256_of(learned_graphs.segmenter())}

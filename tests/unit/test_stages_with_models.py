@@ -65,7 +65,7 @@ def test_features_depend_on_the_models_and_matches_too(
     add(models, "superpoint", learned_graphs.superpoint(threshold=0.3))
     changed = run_of(drive, models, **sections)
     assert changed.feature_settings != first.feature_settings
-    assert changed.plugins.fingerprint_of("matcher") == first.plugins.fingerprint_of("matcher")
+    assert changed.components.fingerprint_of("matcher") == first.components.fingerprint_of("matcher")
 
 
 def test_masks_made_by_a_model_are_kept_with_the_features_and_shown(

@@ -176,8 +176,8 @@ def test_every_setting_of_a_request_reaches_the_engine() -> None:
     config = engine_config(asked.model_dump(), threads=3)
     assert (config.use_gnss, config.seed) == (False, 7)
     assert (config.features.max_keypoints, config.features.max_side_px) == (500, 800)
-    assert (config.adjustment.refine_calibration, config.adjustment.refine_focal) == (False, True)
+    assert (config.bundle_adjustment.refine_calibration, config.bundle_adjustment.refine_focal) == (False, True)
     assert (config.features.extractor, config.matching.matcher) == ("xfeat", "lighterglue")
     assert config.semantics.model == "streets"
     assert (config.mapping.semantic_triangulation, config.mapping.motion_compensation) == (False, False)
-    assert (plain.use_gnss, plain.features.max_keypoints, plain.adjustment.refine_focal) == (True, 2048, False)
+    assert (plain.use_gnss, plain.features.max_keypoints, plain.bundle_adjustment.refine_focal) == (True, 2048, False)

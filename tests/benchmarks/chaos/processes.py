@@ -89,7 +89,7 @@ def role_of(command: Sequence[str], parent: Process) -> Role:
 
 
 def _of_supervisor(words: set[str]) -> Role:
-    if any(word.endswith("process_guard.py") for word in words):
+    if any(word.endswith("orphan_reaper.py") for word in words):
         return Role.GUARD
     if {"service", "api"} <= words:
         return Role.API

@@ -14,7 +14,7 @@ from mrasfm_engine.aggregation import calibrations
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
 from mrasfm_engine.aggregation.calibrations import calibration_priors
-from mrasfm_engine.aggregation.map_adjustment import FinalResult, MapModel, adjust_map, all_points
+from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, MapModel, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.rigs import true_cameras
@@ -66,7 +66,7 @@ def owner_of(drives: Sequence[Driven]) -> np.ndarray:
 
 def adjusted(
     drives: Sequence[Driven], which: str, *, positions: bool = True, owner: np.ndarray | None = None
-) -> FinalResult:
+) -> AdjustedMap:
     """From where scenes truly lie; each as bent as it is."""
     config = configured(final_adjustment=which)
     assembly = Assembly(scenes=[d.source for d in drives])
@@ -83,7 +83,7 @@ def adjusted(
     )
 
 
-def errors_m(result: FinalResult, drives: Sequence[Driven]) -> list[np.ndarray]:
+def errors_m(result: AdjustedMap, drives: Sequence[Driven]) -> list[np.ndarray]:
     """Distances between units and where they were, by drive, the whole map where it fits best.
 
     How the whole lies only receivers tell, to centimetres, before and after.
@@ -97,16 +97,16 @@ def errors_m(result: FinalResult, drives: Sequence[Driven]) -> list[np.ndarray]:
     ]
 
 
-def mean_error_m(result: FinalResult, drives: Sequence[Driven]) -> float:
+def mean_error_m(result: AdjustedMap, drives: Sequence[Driven]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(errors_m(result, drives)) ** 2)))
 
 
 @pytest.fixture(scope="module")
-def untouched(two: list[Driven]) -> FinalResult:
+def untouched(two: list[Driven]) -> AdjustedMap:
     return adjusted(two, "none")
 
 
-def test_none_leaves_everything_where_it_is(two: list[Driven], untouched: FinalResult) -> None:
+def test_none_leaves_everything_where_it_is(two: list[Driven], untouched: AdjustedMap) -> None:
     assert untouched.free_units == 0
     assert untouched.reports == ()
     expected = np.concatenate([d.street_from_scene @ d.source.world_from_rig for d in two])
@@ -115,7 +115,7 @@ def test_none_leaves_everything_where_it_is(two: list[Driven], untouched: FinalR
 
 
 @pytest.mark.parametrize("which", ["overlap", "all"])
-def test_bent_scenes_settle_nearer_to_the_truth(two: list[Driven], untouched: FinalResult, which: str) -> None:
+def test_bent_scenes_settle_nearer_to_the_truth(two: list[Driven], untouched: AdjustedMap, which: str) -> None:
     result = adjusted(two, which)
     before, after = mean_error_m(untouched, two), mean_error_m(result, two)
     assert 0.0005 < after < 0.7 * before
@@ -151,7 +151,7 @@ def test_units_out_of_the_overlap_stay_with_overlap_only(street: Street, folder:
     assert moved.max() < 0.5
 
 
-def test_all_without_any_positions(two: list[Driven], untouched: FinalResult) -> None:
+def test_all_without_any_positions(two: list[Driven], untouched: AdjustedMap) -> None:
     """Nothing holds the whole then, and it stays about where it is."""
     result = adjusted(two, "all", positions=False)
     assert result.positions == {}
@@ -161,7 +161,7 @@ def test_all_without_any_positions(two: list[Driven], untouched: FinalResult) ->
 
 @pytest.mark.parametrize("which", ["none", "overlap", "all"])
 def test_every_drive_has_its_calibration_and_points_that_are_one_become_one(
-    two: list[Driven], untouched: FinalResult, which: str
+    two: list[Driven], untouched: AdjustedMap, which: str
 ) -> None:
     result = untouched if which == "none" else adjusted(two, which)
     state, model = result.model.state, result.model
@@ -205,7 +205,7 @@ def test_a_point_whose_other_scene_does_not_fit_is_no_joined_one(two: list[Drive
 
 
 def test_images_that_are_not_simultaneous_stay_where_they_are_in_their_units(
-    street: Street, folder: Path, untouched: FinalResult, two: list[Driven]
+    street: Street, folder: Path, untouched: AdjustedMap, two: list[Driven]
 ) -> None:
     moving = drive_along(
         street, folder / "moving", WAYS[1], bend_m=-BEND_M, bias_m=BIAS_M[1], offset_ms=[0, 12, -15, 30], seed=7
@@ -216,12 +216,12 @@ def test_images_that_are_not_simultaneous_stay_where_they_are_in_their_units(
     for which in ("overlap", "all"):
         result = adjusted(drives, which)
         assert 0.0005 < mean_error_m(result, drives) < 0.8 * before
-        shots = result.model.state.unit_from_shot
-        np.testing.assert_allclose(shots[: len(two[0].source.image_unit)], np.tile(np.eye(4), (28, 1, 1)), atol=1e-12)
-        np.testing.assert_allclose(shots[28:], moving.source.unit_from_image, atol=1e-12)
+        bands = result.model.state.unit_from_band
+        np.testing.assert_allclose(bands[: len(two[0].source.image_unit)], np.tile(np.eye(4), (28, 1, 1)), atol=1e-12)
+        np.testing.assert_allclose(bands[28:], moving.source.unit_from_image, atol=1e-12)
 
 
-def camera_errors_deg(result: FinalResult, drives: Sequence[Driven]) -> np.ndarray:
+def camera_errors_deg(result: AdjustedMap, drives: Sequence[Driven]) -> np.ndarray:
     """How far every camera is turned from its true pose, all of a drive together where they fit best."""
     found, errors = result.model.state.camera_rotation.reshape(len(drives), -1, 3, 3), []
     for k in range(len(drives)):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrasfm_engine.aggregation.relocalization import Consensus, Relocaliser, Sightings, sightings
+from mrasfm_engine.aggregation.relocalization import Relocaliser, Relocalization, Sightings, sightings
 from mrasfm_engine.geometry import se3
 from tests.helpers.small_scenes import (
     CONFIG,
@@ -51,7 +51,7 @@ def seen(two: tuple[Driven, Driven]) -> Sightings:
 def some(seen: Sightings, counts: list[int], rng: np.random.Generator) -> Sightings:
     """So many sightings of every unit."""
     rows = [rng.choice(np.flatnonzero(seen.unit == u), count, replace=False) for u, count in enumerate(counts)]
-    return seen.of(np.sort(np.concatenate(rows)))
+    return seen.select(np.sort(np.concatenate(rows)))
 
 
 def displaced(seen: Sightings, units: list[int], street_from_a: np.ndarray) -> Sightings:
@@ -60,8 +60,8 @@ def displaced(seen: Sightings, units: list[int], street_from_a: np.ndarray) -> S
     return replace(seen, points_m=seen.points_m + np.isin(seen.unit, units)[:, None] * by)
 
 
-def asked(two: tuple[Driven, Driven], seen: Sightings, **aggregation: object) -> Consensus:
-    return Relocaliser(two[1].source, configured(**aggregation).aggregation, seed=0).consensus(seen)
+def asked(two: tuple[Driven, Driven], seen: Sightings, **aggregation: object) -> Relocalization:
+    return Relocaliser(two[1].source, configured(**aggregation).aggregation, seed=0).relocalise(seen)
 
 
 def place(b: Driven) -> np.ndarray:

@@ -13,7 +13,7 @@ import pytest
 from mrasfm_engine.benchmark.datasets import SceneResult
 from mrasfm_engine.benchmark.mapping import Prepared
 from mrasfm_engine.benchmark.scaling import Growth, GrowthRow
-from mrasfm_engine.benchmark.side_by_side import Comparison, Row, peers_named
+from mrasfm_engine.benchmark.side_by_side import Comparison, Row, baselines_named
 from mrasfm_engine.commands import bench
 from mrasfm_engine.commands.bench_datasets_output import KittiOutput, NuScenesOutput
 from mrasfm_engine.commands.bench_output import DriveOutput, GrowthOutput
@@ -120,9 +120,12 @@ def test_nuscenes_has_plane_and_space_apart(capsys: pytest.CaptureFixture[str]) 
     assert document["published_rmse_m"]["MGSfM"] == 0.134
 
 
-def test_lists_of_peers() -> None:
-    assert peers_named("colmap-global, colmap-incremental,colmap-global,") == ["colmap-global", "colmap-incremental"]
-    assert peers_named("") == []
+def test_lists_of_baselines() -> None:
+    assert baselines_named("colmap-global, colmap-incremental,colmap-global,") == [
+        "colmap-global",
+        "colmap-incremental",
+    ]
+    assert baselines_named("") == []
 
 
 @pytest.mark.parametrize(
@@ -137,7 +140,7 @@ def test_lists_of_peers() -> None:
         (["--simulate", "stereo", "--frames", "0:10"], "--frames does not go with --simulate"),
         (["--simulate", "stereo", "--units", "many"], "--units 'many'"),
         (["--simulate", "bicycle", "--units", "30"], "no simulated rig 'bicycle'"),
-        (["drive", "--peers", "openmvg"], "no mapper 'openmvg'"),
+        (["drive", "--baselines", "openmvg"], "no mapper 'openmvg'"),
         (["nowhere"], "drive nowhere does not exist"),
     ],
 )

@@ -21,7 +21,7 @@ def test_routes_that_make_no_sense_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"peers": ["colmap-global", "openmvg"]}, "no mapper 'openmvg'"),
+        ({"baselines": ["colmap-global", "openmvg"]}, "no mapper 'openmvg'"),
         ({"repeat": 0}, "map 0 times"),
         ({"timeout_s": 0.0}, "within 0 s"),
         ({"timeout_s": float("nan")}, "within nan s"),

@@ -43,7 +43,7 @@ CHAINS = [(1, 0, 0), (2, 1, 0), (40, 3, 0), (40, 3, 12), (25, 24, 0), (60, 0, 0)
 def test_solutions_and_inverse(columns: int, band: int, loops: int) -> None:
     pattern, blocks = chain(columns, band, loops)
     matrix = dense(pattern, blocks)
-    factor = BlockFactor.of(Elimination.of(pattern), blocks)
+    factor = BlockFactor.from_blocks(Elimination.from_pattern(pattern), blocks)
     assert factor is not None
     right = np.random.default_rng(1).normal(size=(BLOCK * columns, 4))
     np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix, right), rtol=1e-10, atol=1e-13)
@@ -55,12 +55,12 @@ def test_solutions_and_inverse(columns: int, band: int, loops: int) -> None:
 
 def test_only_the_lower_triangle_of_diagonal_blocks_is_read() -> None:
     pattern, blocks = chain(10, 2, 3)
-    order = Elimination.of(pattern)
+    order = Elimination.from_pattern(pattern)
     right = np.ones(60)
-    whole = BlockFactor.of(order, blocks)
+    whole = BlockFactor.from_blocks(order, blocks)
     lower = blocks.copy()
     lower[pattern.first[:-1]] = np.tril(lower[pattern.first[:-1]])
-    half = BlockFactor.of(order, lower)
+    half = BlockFactor.from_blocks(order, lower)
     assert whole is not None
     assert half is not None
     np.testing.assert_array_equal(half.solve(right), whole.solve(right))
@@ -69,9 +69,9 @@ def test_only_the_lower_triangle_of_diagonal_blocks_is_read() -> None:
 def test_not_positive_definite() -> None:
     pattern, blocks = chain(12, 2, 0)
     blocks[pattern.first[5], 3, 3] = -1.0
-    assert BlockFactor.of(Elimination.of(pattern), blocks) is None
+    assert BlockFactor.from_blocks(Elimination.from_pattern(pattern), blocks) is None
     blocks[pattern.first[5], 3, 3] = np.nan
-    assert BlockFactor.of(Elimination.of(pattern), blocks) is None
+    assert BlockFactor.from_blocks(Elimination.from_pattern(pattern), blocks) is None
 
 
 def test_a_chain_of_units_stays_sparse() -> None:
@@ -86,13 +86,13 @@ def test_a_chain_of_units_stays_sparse() -> None:
             i.append(np.arange(a + 10, a + 30))
             j.append(np.arange(b + 10, b + 30) + d)
     pattern = BlockPattern.of_pairs(n, np.concatenate(i), np.concatenate(j))
-    blocks = len(Elimination.of(pattern).factor.row)
+    blocks = len(Elimination.from_pattern(pattern).factor.row)
     assert len(pattern.row) < blocks < 2.5 * len(pattern.row)
 
 
 def test_an_empty_matrix() -> None:
     none = np.zeros(0, dtype=np.int64)
     pattern = BlockPattern.of_pairs(0, none, none)
-    factor = BlockFactor.of(Elimination.of(pattern), np.zeros((0, BLOCK, BLOCK)))
+    factor = BlockFactor.from_blocks(Elimination.from_pattern(pattern), np.zeros((0, BLOCK, BLOCK)))
     assert factor is not None
     assert factor.solve(np.zeros(0)).shape == (0,)

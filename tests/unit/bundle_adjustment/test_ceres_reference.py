@@ -18,7 +18,7 @@ from mrasfm_engine.bundle_adjustment.priors import (
     Term,
     UprightPrior,
 )
-from mrasfm_engine.bundle_adjustment.problem import Layout, ShotMotion
+from mrasfm_engine.bundle_adjustment.problem import Layout, RowBandMotion
 from mrasfm_engine.bundle_adjustment.rigid_groups import UnitSets
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
@@ -304,7 +304,7 @@ def test_what_is_fixed_is_as_it_was_given() -> None:
 def test_what_colmap_cannot_say_is_refused() -> None:
     problem = everything(np.random.default_rng(0))
     with pytest.raises(ValueError, match="unit's timestamp"):
-        CeresProblem.of(replace(problem, motion=ShotMotion.held(np.zeros(1, dtype=np.int64))))
+        CeresProblem.of(replace(problem, motion=RowBandMotion.held(np.zeros(1, dtype=np.int64))))
     with pytest.raises(ValueError, match="fixed calibration"):
         CeresProblem.of(replace(problem, sets=UnitSets(of_unit=np.zeros(UNITS, dtype=np.int64), count=1)))
     params = problem.state.camera_params.copy()
@@ -318,7 +318,7 @@ def test_what_colmap_cannot_say_is_refused() -> None:
             replace(problem, state=replace(problem.state, camera_params=params), camera_kind=np.full(3, RADIAL))
         )
     # Held, they are as good as any.
-    held = Layout.of(np.ones(UNITS, dtype=np.bool_), np.ones(CAMERAS, dtype=np.bool_))
+    held = Layout.from_free(np.ones(UNITS, dtype=np.bool_), np.ones(CAMERAS, dtype=np.bool_))
     CeresProblem.of(replace(problem, state=replace(problem.state, camera_params=params), layout=held))
 
 

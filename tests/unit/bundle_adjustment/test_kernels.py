@@ -7,7 +7,7 @@ import pytest
 
 from mrasfm_engine.bundle_adjustment.kernels import BEHIND_PX
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, UprightPrior
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, ShotMotion
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, RowBandMotion
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
@@ -53,19 +53,19 @@ def case_of_all_kinds(seed: int = 0) -> tuple[Case, State]:
     return case, state
 
 
-def with_shots(case: Case, state: State, seed: int = 0) -> tuple[Problem, State]:
+def with_bands(case: Case, state: State, seed: int = 0) -> tuple[Problem, State]:
     """Every image of the case at a time of its own, the rig somewhere else for each; observed is what follows."""
     rng, cameras = np.random.default_rng(seed), len(case.problem.camera_kind)
     count = len(state.unit_rotation) * cameras
     motion = {
-        "shot_rotation": se3.exp_so3(0.05 * rng.normal(size=(count, 3))),
-        "shot_position_m": 0.4 * rng.normal(size=(count, 3)),
+        "band_rotation": se3.exp_so3(0.05 * rng.normal(size=(count, 3))),
+        "band_position_m": 0.4 * rng.normal(size=(count, 3)),
     }
     o, truth = case.problem.observations, replace(case.truth, **motion)
-    shot = o.unit * cameras + o.camera
-    seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, shot)
-    observations = replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), shot=shot)
-    held = ShotMotion.held(np.repeat(np.arange(len(state.unit_rotation)), cameras))
+    band = o.unit * cameras + o.camera
+    seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, band)
+    observations = replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), band=band)
+    held = RowBandMotion.held(np.repeat(np.arange(len(state.unit_rotation)), cameras))
     return replace(case.problem, observations=observations, motion=held), replace(state, **motion)
 
 
@@ -91,8 +91,8 @@ def all_terms(case: Case) -> list[CalibrationPrior | PositionPrior | UprightPrio
 
 def schur(h: np.ndarray, g: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """The reduced system of a dense one of which n unknowns are not points."""
-    coupling = h[:n, n:] @ np.linalg.inv(h[n:, n:])
-    return h[:n, :n] - coupling @ h[n:, :n], g[:n] - coupling @ g[n:]
+    structure = h[:n, n:] @ np.linalg.inv(h[n:, n:])
+    return h[:n, :n] - structure @ h[n:, :n], g[:n] - structure @ g[n:]
 
 
 def test_the_cost_has_the_gradient_of_all_camera_kinds_and_terms() -> None:
@@ -102,8 +102,8 @@ def test_the_cost_has_the_gradient_of_all_camera_kinds_and_terms() -> None:
     numeric = numeric_gradient(problem, state, range(len(g)))
     np.testing.assert_allclose(g, numeric, rtol=1e-4, atol=1e-4 * np.abs(g).max())
     # The points' part and, after elimination, the rest, as the compiled code has them.
-    reduced = problem.normal_equations(state, 0.0)
-    np.testing.assert_allclose(reduced.v_gradient.ravel(), numeric[problem.layout.size :], rtol=1e-4, atol=0.05)
+    system = problem.normal_equations(state, 0.0)
+    np.testing.assert_allclose(system.v_gradient.ravel(), numeric[problem.layout.size :], rtol=1e-4, atol=0.05)
 
 
 @pytest.mark.parametrize("with_terms", [False, True])
@@ -114,12 +114,12 @@ def test_the_reduced_system_is_the_schur_complement_of_the_full_one(seed: int, w
     h, g = dense_normal_equations(problem, state)
     n = problem.layout.size
     matrix, gradient = schur(h, g, n)
-    reduced = problem.normal_equations(state, 0.0)
+    system = problem.normal_equations(state, 0.0)
     scale = np.sqrt(np.diagonal(h)[:n])
-    np.testing.assert_allclose(reduced.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
-    np.testing.assert_allclose(reduced.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
-    np.testing.assert_allclose(reduced.diagonal, np.diagonal(h)[:n], rtol=1e-5)
-    np.testing.assert_array_equal(reduced.matrix, reduced.matrix.T)
+    np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
+    np.testing.assert_allclose(system.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
+    np.testing.assert_allclose(system.diagonal, np.diagonal(h)[:n], rtol=1e-5)
+    np.testing.assert_array_equal(system.matrix, system.matrix.T)
 
 
 def test_the_step_equals_that_of_the_dense_full_system() -> None:
@@ -129,29 +129,29 @@ def test_the_step_equals_that_of_the_dense_full_system() -> None:
     h, g = dense_normal_equations(problem, state)
     h[np.diag_indices(len(h))] *= 1 + damping
     expected = -np.linalg.solve(h, g)
-    reduced = problem.normal_equations(state, damping)
-    step = reduced.step(damping)
+    system = problem.normal_equations(state, damping)
+    step = system.step(damping)
     assert step is not None
     np.testing.assert_allclose(step, expected[:n], atol=1e-5 * np.abs(expected[:n]).max())
-    points = problem.points_after(state, reduced, step)
+    points = problem.points_after(state, system, step)
     np.testing.assert_allclose(points, moved(problem, state, expected).points_m, atol=1e-5)
     assert np.abs(points - state.points_m).max() > 1e-3
 
 
 def test_derivatives_are_right_where_images_are_not_simultaneous() -> None:
-    problem, state = with_shots(*case_of_all_kinds())
+    problem, state = with_bands(*case_of_all_kinds())
     n = problem.layout.size
-    reduced = problem.normal_equations(state, 0.0)
+    system = problem.normal_equations(state, 0.0)
     numeric = numeric_gradient(problem, state, range(n + state.points_m.size))
     h, g = dense_normal_equations(problem, state)
     np.testing.assert_allclose(g, numeric, rtol=1e-4, atol=1e-4 * np.abs(g).max())
-    np.testing.assert_allclose(reduced.v_gradient.ravel(), numeric[n:], rtol=1e-4, atol=0.05)
+    np.testing.assert_allclose(system.v_gradient.ravel(), numeric[n:], rtol=1e-4, atol=0.05)
     matrix, gradient = schur(h, g, n)
     scale = np.sqrt(np.diagonal(h)[:n])
-    np.testing.assert_allclose(reduced.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
-    np.testing.assert_allclose(reduced.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
-    still = replace(problem, observations=replace(problem.observations, shot=None))
-    alone = replace(state, shot_rotation=np.zeros((0, 3, 3)), shot_position_m=np.zeros((0, 3)))
+    np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
+    np.testing.assert_allclose(system.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
+    still = replace(problem, observations=replace(problem.observations, band=None))
+    alone = replace(state, band_rotation=np.zeros((0, 3, 3)), band_position_m=np.zeros((0, 3)))
     assert problem.cost(state) < 0.5 * still.cost(alone)
 
 
@@ -164,33 +164,33 @@ def following(case: Case) -> tuple[Problem, State]:
     def follow(state: State) -> State:
         motion = local_motion(state.world_from_rig, time_s, np.ones(units, dtype=np.bool_))
         moved = motion.at(unit, offset_s)
-        return replace(state, shot_rotation=moved[:, :3, :3].copy(), shot_position_m=moved[:, :3, 3].copy())
+        return replace(state, band_rotation=moved[:, :3, :3].copy(), band_position_m=moved[:, :3, 3].copy())
 
     motion = local_motion(case.truth.world_from_rig, time_s, np.ones(units, dtype=np.bool_))
     o, truth = case.problem.observations, follow(case.truth)
-    shot = o.unit * cameras + o.camera
-    seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, shot)
+    band = o.unit * cameras + o.camera
+    seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, band)
     problem = replace(
         case.problem,
-        observations=replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), shot=shot),
-        motion=ShotMotion(support=motion.support[unit], weight=motion.weights(unit, offset_s), follow=follow),
+        observations=replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), band=band),
+        motion=RowBandMotion(support=motion.support[unit], weight=motion.weights(unit, offset_s), place_bands=follow),
         state=truth,
     )
     return problem, follow(perturbed(truth, np.random.default_rng(0), units=range(1, units), unit_m=0.02, point_m=0.05))
 
 
-def test_pitfall_1_derivatives_follow_the_trajectory_that_moves_the_shots() -> None:
+def test_pitfall_1_derivatives_follow_the_trajectory_that_moves_the_bands() -> None:
     free = {"free_units": [False] + [True] * 4, "free_cameras": [True] * 3}
     problem, state = following(make_case(units=5, cameras=3, points=120, **free))  # type: ignore[arg-type]
     n = problem.layout.size
-    reduced = problem.normal_equations(state, 0.0)
+    system = problem.normal_equations(state, 0.0)
     h, g = dense_normal_equations(problem, state)
     matrix, gradient = schur(h, g, n)
     # That a unit's rotation bends the way to its neighbours is left out: some percent of a rotation's effect.
     scale = np.sqrt(np.diagonal(h)[:n]) + 1e-9
-    np.testing.assert_allclose(reduced.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=0.1)
-    held = replace(problem, motion=ShotMotion.held(np.repeat(np.arange(5), 3))).normal_equations(state, 0.0)
-    error, if_held = (np.abs((r.gradient - gradient) / scale).max() for r in (reduced, held))
+    np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=0.1)
+    held = replace(problem, motion=RowBandMotion.held(np.repeat(np.arange(5), 3))).normal_equations(state, 0.0)
+    error, if_held = (np.abs((r.gradient - gradient) / scale).max() for r in (system, held))
     assert 0 < error < 0.1 * np.abs(gradient / scale).max()
     assert if_held > 2 * error
 
@@ -206,12 +206,12 @@ def test_a_drive_that_is_not_simultaneous_is_solved_in_few_steps() -> None:
     assert 0 < error_m < 1e-3
 
 
-def test_shots_that_stand_at_their_unit_change_nothing() -> None:
+def test_bands_that_stand_at_their_unit_change_nothing() -> None:
     case, state = case_of_all_kinds()
-    problem, moving = with_shots(case, state)
-    problem = replace(problem, observations=replace(case.problem.observations, shot=problem.observations.shot))
-    count = len(moving.shot_rotation)
-    identity = replace(moving, shot_rotation=np.tile(np.eye(3), (count, 1, 1)), shot_position_m=np.zeros((count, 3)))
+    problem, moving = with_bands(case, state)
+    problem = replace(problem, observations=replace(case.problem.observations, band=problem.observations.band))
+    count = len(moving.band_rotation)
+    identity = replace(moving, band_rotation=np.tile(np.eye(3), (count, 1, 1)), band_position_m=np.zeros((count, 3)))
     np.testing.assert_allclose(problem.errors_px2(identity), case.problem.errors_px2(state), rtol=1e-9, atol=1e-12)
     a, b = problem.normal_equations(identity, 1e-3), case.problem.normal_equations(state, 1e-3)
     np.testing.assert_allclose(a.matrix, b.matrix, rtol=1e-9, atol=1e-9 * np.abs(b.matrix).max())
@@ -229,13 +229,13 @@ def test_threads_share_the_work_without_changing_it() -> None:
 
 
 def test_fixed_units_and_cameras_have_no_place_in_the_system() -> None:
-    layout = Layout.of(np.array([False, True, False, True]), np.array([True, False]), free_focal=False)
+    layout = Layout.from_free(np.array([False, True, False, True]), np.array([True, False]), free_focal=False)
     assert layout.size == 2 * UNIT_DOF + CAMERA_DOF
     assert layout.unit_slot.tolist() == [-1, 0, -1, 1]
     assert layout.unit_offsets(np.array([1, 3])).tolist() == [0, 6]
     assert layout.camera_offsets(np.array([0])).tolist() == [12]
     assert layout.held().tolist() == [18]
-    assert not len(Layout.of(np.array([True]), np.array([True]), free_focal=True).held())
+    assert not len(Layout.from_free(np.array([True]), np.array([True]), free_focal=True).held())
 
 
 def test_an_observation_behind_its_camera_costs_and_pulls_nothing() -> None:
@@ -246,11 +246,11 @@ def test_an_observation_behind_its_camera_costs_and_pulls_nothing() -> None:
     rows = case.problem.observations.point == 0
     np.testing.assert_array_equal(case.problem.errors_px2(state)[rows], BEHIND_PX**2)
     assert case.problem.cost(state) > case.problem.cost(case.truth) + 1
-    reduced = case.problem.normal_equations(state, 1e-4)
-    assert not reduced.v_gradient[0].any()
-    assert np.isfinite(reduced.matrix).all()
+    system = case.problem.normal_equations(state, 1e-4)
+    assert not system.v_gradient[0].any()
+    assert np.isfinite(system.matrix).all()
     step = np.zeros(case.problem.layout.size)
-    np.testing.assert_array_equal(case.problem.points_after(state, reduced, step)[0], state.points_m[0])
+    np.testing.assert_array_equal(case.problem.points_after(state, system, step)[0], state.points_m[0])
 
 
 def test_a_point_without_depth_stays_where_it_is() -> None:
@@ -270,8 +270,8 @@ def test_a_point_without_depth_stays_where_it_is() -> None:
         ),
         layout=problem.layout,
     )
-    reduced = single.normal_equations(state, 0.0)
-    after = single.points_after(state, reduced, np.zeros(single.layout.size))
+    system = single.normal_equations(state, 0.0)
+    after = single.points_after(state, system, np.zeros(single.layout.size))
     assert np.isfinite(after).all()
     np.testing.assert_allclose(after, state.points_m, atol=1e-9)
 
@@ -297,12 +297,12 @@ def test_a_point_of_very_many_units_is_still_right() -> None:
         observations=Observations(
             unit=index, camera=index * 0, point=index * 0, xy_px=np.full((units, 2), 300.0), num_points=1
         ),
-        layout=Layout.of(np.ones(units, np.bool_), np.zeros(1, np.bool_)),
+        layout=Layout.from_free(np.ones(units, np.bool_), np.zeros(1, np.bool_)),
     )
-    reduced = problem.normal_equations(state, 1e-3)
-    assert np.isfinite(reduced.matrix).all()
-    assert (reduced.diagonal > 0).all()
-    assert np.abs(reduced.gradient[-6:]).max() > 0
+    system = problem.normal_equations(state, 1e-3)
+    assert np.isfinite(system.matrix).all()
+    assert (system.diagonal > 0).all()
+    assert np.abs(system.gradient[-6:]).max() > 0
 
 
 def test_retract_turns_about_the_axes_of_the_fixed_frame() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
-from mrasfm_engine.bundle_adjustment.observability_analysis import judge_directions
+from mrasfm_engine.bundle_adjustment.observability_analysis import assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
 from mrasfm_engine.geometry.alignment import align_similarity
@@ -128,7 +128,7 @@ def test_pitfall_9_the_common_motion_and_the_scale_of_the_cameras_are_not_observ
     found = covariances(replace(case.problem, terms=[prior]), case.truth)
     assert found.calibration.shape == (24, 24)
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.calibration)).reshape(4, 6), found.sigma_camera[:, :6])
-    verdict = judge_directions(
+    verdict = assess_directions(
         found.calibration,
         position_m=case.truth.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,

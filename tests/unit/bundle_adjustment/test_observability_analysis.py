@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrasfm_engine.bundle_adjustment.observability_analysis import judge_directions
+from mrasfm_engine.bundle_adjustment.observability_analysis import assess_directions
 
 PLACES = np.array([[1.7, 0.0, 1.5], [1.5, 0.5, 1.5], [1.5, -0.5, 1.5], [0.0, 0.0, 1.6]])
 SIGMA_RAD, SIGMA_M = np.full(4, np.radians(0.5)), np.full(4, 0.02)
@@ -38,7 +38,7 @@ def axis(camera: int, direction: int) -> np.ndarray:
 
 
 def judge(covariance: np.ndarray, cameras: int = 4):  # type: ignore[no-untyped-def]
-    return judge_directions(
+    return assess_directions(
         covariance,
         position_m=PLACES[:cameras],
         sigma_rotation_rad=SIGMA_RAD[:cameras],
@@ -83,7 +83,7 @@ def test_the_one_direction_that_is_not_observed_is_named(camera: int, direction:
 def test_the_baseline_of_two_cameras_is_their_scale() -> None:
     hidden = growth(PLACES[[1, 2]])
     covariance = posterior(everything_but(hidden, cameras=2), cameras=2)
-    found = judge_directions(
+    found = assess_directions(
         covariance,
         position_m=PLACES[[1, 2]],
         sigma_rotation_rad=SIGMA_RAD[:2],

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrasfm_engine.bundle_adjustment.rigid_groups import UnitSets
+from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
@@ -22,7 +22,7 @@ def case() -> Case:
 
 
 def with_sets(case: Case, **changes: object) -> Problem:
-    return replace(case.problem, sets=UnitSets(of_unit=OF_UNIT, count=2), **changes)
+    return replace(case.problem, sets=RigidGroups(of_unit=OF_UNIT, count=2), **changes)
 
 
 def moved(problem: Problem, state: State, step: np.ndarray) -> State:
@@ -51,14 +51,14 @@ def test_gradient_is_that_of_the_cost(case: Case) -> None:
 
 def test_condensed_matrix_is_the_units_matrix_between_the_maps(case: Case) -> None:
     problem = with_sets(case)
-    reduced = problem.normal_equations(case.truth, 0.0)
+    system = problem.normal_equations(case.truth, 0.0)
     assert problem.sets is not None
     of, maps = problem.sets.unit_from_set_steps(case.truth, problem.layout)
     whole = np.zeros((6 * len(of), 12))
     for k, (s, m) in enumerate(zip(of, maps, strict=True)):
         whole[6 * k : 6 * k + 6, 6 * s : 6 * s + 6] = m
-    matrix, _, _ = problem.sets.condense(reduced, case.truth)
-    assert np.allclose(matrix, whole.T @ reduced.matrix @ whole, rtol=1e-9, atol=1e-6)
+    matrix, _, _ = problem.sets.condense(system, case.truth)
+    assert np.allclose(matrix, whole.T @ system.matrix @ whole, rtol=1e-9, atol=1e-6)
 
 
 def test_sets_find_back_and_stay_rigid(case: Case) -> None:

@@ -185,7 +185,7 @@ def test_nothing_free_is_said() -> None:
         state=replace(case.truth, points_m=np.zeros((0, 3))),
         camera_kind=case.problem.camera_kind,
         observations=Observations(unit=empty, camera=empty, point=empty, xy_px=np.zeros((0, 2)), num_points=0),
-        layout=Layout.of(np.zeros(2, np.bool_), np.zeros(1, np.bool_)),
+        layout=Layout.from_free(np.zeros(2, np.bool_), np.zeros(1, np.bool_)),
     )
     _, report = solve(problem)
     assert report.termination is Termination.NOTHING_FREE
@@ -243,7 +243,7 @@ def test_fixed_points_stay_and_hold_the_poses() -> None:
     case = drive()
     o = replace(case.problem.observations, fixed=np.ones(case.problem.observations.num_points, dtype=np.bool_))
     start = perturbed(case.truth, np.random.default_rng(4), units=range(8), unit_m=0.1, unit_deg=0.5, point_m=0.0)
-    layout = Layout.of(np.ones(8, dtype=np.bool_), np.zeros(6, dtype=np.bool_))
+    layout = Layout.from_free(np.ones(8, dtype=np.bool_), np.zeros(6, dtype=np.bool_))
     solution, report = solve(replace(case.problem, state=start, observations=o, layout=layout))
     np.testing.assert_array_equal(solution.points_m, case.truth.points_m)
     assert report.parameters == report.pose_parameters == 48
@@ -257,7 +257,7 @@ def test_points_follow_a_step_by_themselves_and_never_for_the_worse() -> None:
     moved = perturbed(case.truth, np.random.default_rng(3), units=range(1, 5), unit_m=0.02, unit_deg=0.1, point_m=0.3)
     there = problem.point_costs(replace(moved, points_m=before.points_m))
     thrown = problem.point_costs(moved)
-    costs, total = problem.settle(moved, before, np.zeros_like(there))
+    costs, total = problem.refine_points(moved, before, np.zeros_like(there))
     assert (costs <= np.minimum(there, thrown) + 1e-9).all()
     assert costs.sum() < 0.97 * np.minimum(there, thrown).sum()
     np.testing.assert_allclose(costs, problem.point_costs(moved), rtol=1e-9, atol=1e-12)

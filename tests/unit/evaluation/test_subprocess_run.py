@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.evaluation.subprocess_run import memory_bytes, peak_memory_bytes, run_apart
+from mrasfm_engine.evaluation.subprocess_run import memory_bytes, peak_memory_bytes, run_in_subprocess
 
 MEGABYTE = 1_000_000
 linux = pytest.mark.skipif(sys.platform != "linux", reason="/proc tells the memory of a process")
@@ -46,8 +46,8 @@ def test_result_progress_and_peak_memory() -> None:
     # What the parent has is not the child's: `ru_maxrss` would count it.
     mine = np.ones(150 * MEGABYTE, dtype=np.uint8)
     seen: list[tuple[str, int, int]] = []
-    small = run_apart(allocate, 1)
-    large = run_apart(allocate, 100, progress=lambda *step: seen.append(step))
+    small = run_in_subprocess(allocate, 1)
+    large = run_in_subprocess(allocate, 100, progress=lambda *step: seen.append(step))
     assert (small.result, large.result, large.failure) == (2, 101, "")
     assert seen == [("allocating", 1, 2), ("allocating", 2, 2)]
     assert small.peak_memory_bytes is not None
@@ -62,7 +62,7 @@ def test_result_progress_and_peak_memory() -> None:
 
 def test_what_the_work_refuses_is_raised_here() -> None:
     with pytest.raises(InputError) as caught:
-        run_apart(refuse)
+        run_in_subprocess(refuse)
     assert (caught.value.what, caught.value.remedy, caught.value.code) == (
         "the file is bad",
         "Write it again.",
@@ -79,14 +79,14 @@ def test_what_the_work_refuses_is_raised_here() -> None:
     ],
 )
 def test_a_process_that_dies_is_told(work: Any, argument: int, failure: str) -> None:
-    ran = run_apart(work, argument)
+    ran = run_in_subprocess(work, argument)
     assert ran.result is None
     assert failure in ran.failure
 
 
 def test_timeout() -> None:
     started = time.monotonic()
-    ran = run_apart(sleep, timeout_s=0.5)
+    ran = run_in_subprocess(sleep, timeout_s=0.5)
     assert ran.result is None
     assert ran.failure == "not finished within 0.5 s"
     assert time.monotonic() - started < 60
@@ -95,5 +95,5 @@ def test_timeout() -> None:
 def test_cancel_kills_the_process() -> None:
     seen: list[str] = []
     with pytest.raises(CancelledError):
-        run_apart(sleep, progress=lambda stage, done, total: seen.append(stage), cancel=lambda: bool(seen))
+        run_in_subprocess(sleep, progress=lambda stage, done, total: seen.append(stage), cancel=lambda: bool(seen))
     assert seen == ["sleeping"]

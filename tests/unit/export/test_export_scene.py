@@ -18,7 +18,7 @@ import pytest
 
 from mrasfm_engine.errors import MrasfmError, StorageError
 from mrasfm_engine.export import feature_database, picture_files, ply, publishing
-from mrasfm_engine.export.calibration import calibration_document, settled_document
+from mrasfm_engine.export.calibration import calibration_document, document_in_map
 from mrasfm_engine.export.check import check_features
 from mrasfm_engine.export.feature_database import write_features, write_matches
 from mrasfm_engine.export.scene import write_scene
@@ -26,7 +26,7 @@ from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.scene.drive import matrix_from_pose
-from mrasfm_engine.scene.scene import CalibrationVerdict, ImageFeatures, Scene
+from mrasfm_engine.scene.scene import CalibrationObservability, ImageFeatures, Scene
 from schemas import Pose
 from schemas.drive import MAX_IMAGE_SIDE_PX
 from tests.helpers.export_example import (
@@ -269,14 +269,14 @@ def test_calibration(scene: Scene, written: Path) -> None:
 
 
 def test_what_all_cameras_share_is_never_called_observed(scene: Scene) -> None:
-    verdict = CalibrationVerdict(
+    observability = CalibrationObservability(
         adjusted=True, reason="GNSS", scale_observed=True, scale_rests_on="observed by positions", sigma_scale=0.004
     )
-    common = calibration_document(replace(scene, calibration_verdict=verdict))["common"]
+    common = calibration_document(replace(scene, calibration_observability=observability))["common"]
     assert common["rotation"]["observed"] == common["translation"]["observed"] == [False] * 3
     assert common["scale"] == {"observed": True, "sigma_relative": 0.004, "verdict": "observed by positions"}
-    unknown = replace(verdict, scale_observed=False, sigma_scale=float("nan"), scale_rests_on="what was given")
-    common = calibration_document(replace(scene, calibration_verdict=unknown))["common"]
+    unknown = replace(observability, scale_observed=False, sigma_scale=float("nan"), scale_rests_on="what was given")
+    common = calibration_document(replace(scene, calibration_observability=unknown))["common"]
     assert common["scale"] == {"observed": False, "verdict": "what was given"}
 
 
@@ -466,10 +466,10 @@ def test_a_calibration_that_settled_in_a_map(scene: Scene) -> None:
     names = list(document["cameras"])
     poses = {name: refined.rig_from_cam.copy() for name, refined in zip(names, scene.calibration, strict=True)}
     found = {name: matrix_from_pose(Pose(**document["cameras"][name]["refined"]["rig_from_cam"])) for name in names}
-    assert settled_document(document, found) == document
+    assert document_in_map(document, found) == document
     turn = se3.exp_so3(np.radians([0.0, 0.3, 0.0]))
     poses[names[0]] = se3.transform(turn @ found[names[0]][:3, :3], found[names[0]][:3, 3] + [0.01, 0.0, 0.0])
-    settled = settled_document(document, found | {names[0]: poses[names[0]]})
+    settled = document_in_map(document, found | {names[0]: poses[names[0]]})
     assert {name for name in names if settled["cameras"][name] != document["cameras"][name]} == {names[0]}
     camera, before = settled["cameras"][names[0]], document["cameras"][names[0]]
     assert camera["since_scene"]["rotation_vector_deg"] == pytest.approx([0.0, 0.3, 0.0], abs=1e-9)

@@ -15,7 +15,7 @@ from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.matching.learned_matchers import LearnedMatcher
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
 from mrasfm_engine.matching.verification import essential_inliers
-from mrasfm_engine.registry import Plugins, load_plugins
+from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.scene import ImageFeatures
 
 pytestmark = pytest.mark.real
@@ -35,9 +35,11 @@ def models(shared_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder.path
 
 
-def plugins(models: Path, **features: object) -> Plugins:
+def components(models: Path, **features: object) -> Components:
     config = {"models": {"folder": models}, "matching": {"matcher": "lighterglue"}}
-    return load_plugins(EngineConfig.model_validate({"features": {"extractor": "xfeat", **features}, **config}), None)
+    return load_components(
+        EngineConfig.model_validate({"features": {"extractor": "xfeat", **features}, **config}), None
+    )
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,7 @@ def image(shared_data: Path) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found(models: Path, image: np.ndarray) -> ImageFeatures:
-    return plugins(models).extractor.extract(image, None)
+    return components(models).extractor.extract(image, None)
 
 
 def offsets(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -71,7 +73,7 @@ def test_many_keypoints_all_over_the_image_none_twice(found: ImageFeatures, imag
 
 
 def test_what_is_matched_covers_the_image(models: Path, image: np.ndarray, found: ImageFeatures) -> None:
-    strongest = plugins(models, spread=False).extractor.extract(image, None)
+    strongest = components(models, spread=False).extractor.extract(image, None)
     cells = [len(np.unique(f.xy_px[:1024] // 32, axis=0)) for f in (strongest, found)]
     assert cells[1] > 1.25 * cells[0]
     # The road before the vehicle, where an image has its nearest points.
@@ -81,7 +83,7 @@ def test_what_is_matched_covers_the_image(models: Path, image: np.ndarray, found
 
 @pytest.mark.parametrize("refine", [True, False])
 def test_a_shifted_image_has_shifted_keypoints_without_bias(models: Path, image: np.ndarray, refine: bool) -> None:
-    extractor = plugins(models, refine=refine).extractor
+    extractor = components(models, refine=refine).extractor
     whole = extractor.extract(image, None).xy_px
     each = []
     for shift in ((3, 5), (18, 13)):
@@ -101,7 +103,7 @@ def test_a_mirrored_image_has_mirrored_keypoints(
 ) -> None:
     """Half a pixel too much to the right would be half a pixel too much to the left here: a whole pixel apart."""
     size = image.shape[1 - axis]
-    mirrored = plugins(models).extractor.extract(np.ascontiguousarray(np.flip(image, 1 - axis)), None).xy_px
+    mirrored = components(models).extractor.extract(np.ascontiguousarray(np.flip(image, 1 - axis)), None).xy_px
     mirrored[:, axis] = size - mirrored[:, axis]
     off = offsets(found.xy_px, mirrored)
     assert len(off) > 500
@@ -112,7 +114,7 @@ def test_an_image_at_half_size_has_keypoints_at_the_same_places(
     models: Path, image: np.ndarray, found: ImageFeatures
 ) -> None:
     """Wrong pixel centres would be off by half a pixel of the smaller image, one of the larger."""
-    half = plugins(models, max_side_px=image.shape[1] // 2).extractor.extract(image, None).xy_px
+    half = components(models, max_side_px=image.shape[1] // 2).extractor.extract(image, None).xy_px
     off = offsets(found.xy_px, half)
     assert len(off) > 80
     assert (np.abs(off.mean(axis=0)) < 0.2).all()
@@ -121,14 +123,14 @@ def test_an_image_at_half_size_has_keypoints_at_the_same_places(
 def test_masked_areas_hold_no_keypoints_and_the_rest_all_that_are_wanted(models: Path, image: np.ndarray) -> None:
     mask = np.ones(image.shape[:2], np.bool_)
     mask[:, 300:] = False
-    masked = plugins(models, max_keypoints=256).extractor.extract(image, mask)
+    masked = components(models, max_keypoints=256).extractor.extract(image, mask)
     assert len(masked.xy_px) == 256
     assert masked.xy_px[:, 0].max() <= 300
 
 
 def test_brightness_may_be_0_to_1_or_0_to_255(models: Path, image: np.ndarray) -> None:
     """The network normalises by itself: the range that we give is no guess that could be wrong."""
-    network = plugins(models).models["extractor"].network
+    network = components(models).models["extractor"].network
     part = np.zeros((1, 3, 640, 360), np.float32)
     part[0, :, :370] = image[:, :360].transpose(2, 0, 1)
     small, large = (network.run({"images": part / scale})["keypoints"] for scale in (255.0, 1.0))
@@ -138,7 +140,7 @@ def test_brightness_may_be_0_to_1_or_0_to_255(models: Path, image: np.ndarray) -
 
 def test_lighterglue_gets_the_units_it_was_trained_with(models: Path, shared_data: Path, found: ImageFeatures) -> None:
     """Six frames on, keypoints in pixels match worse, and nearest neighbours find fewer."""
-    loaded = plugins(models)
+    loaded = components(models)
     later = np.asarray(cv2.imread(str(shared_data / "kitti06" / "image_0" / "000026.png")), dtype=np.uint8)
     pair = [found, loaded.extractor.extract(later, None)]
     rays = [np.concatenate([(f.xy_px - CENTRE_PX) / FOCAL_PX, np.ones((len(f.xy_px), 1))], axis=1) for f in pair]

@@ -6,7 +6,7 @@ from mrasfm_engine.config import EngineConfig, MappingConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.baseline_without_rig import register_images_singly, retry_missing, take_over
 from mrasfm_engine.mapping.incremental_mapping import map_units
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -20,10 +20,10 @@ UNIT, UNITS, LEFT = 4, 8, 3
 ONE_BY_ONE = EngineConfig(threads=1, mapping=MappingConfig(camera_set_registration=False))
 
 
-def scene(**kwargs: object) -> tuple[SimulatedDrive, Model]:
+def scene(**kwargs: object) -> tuple[SimulatedDrive, Mapper]:
     simulated = make_simulated_drive(units=UNITS, points=1200, **kwargs)  # type: ignore[arg-type]
-    model = make_model(simulated, config=ONE_BY_ONE)
-    return simulated, with_true_poses(model, simulated, [u for u in range(UNITS) if u != UNIT])
+    mapper = make_model(simulated, config=ONE_BY_ONE)
+    return simulated, with_true_poses(mapper, simulated, [u for u in range(UNITS) if u != UNIT])
 
 
 def image_of(simulated: SimulatedDrive, camera: int, unit: int = UNIT) -> int:
@@ -31,8 +31,8 @@ def image_of(simulated: SimulatedDrive, camera: int, unit: int = UNIT) -> int:
 
 
 def test_images_that_agree_belong_to_the_set() -> None:
-    simulated, model = scene()
-    found = register_images_singly(model, UNIT)
+    simulated, mapper = scene()
+    found = register_images_singly(mapper, UNIT)
     assert found.method == "single images"
     assert found.missing == ()
     assert found.own_poses == {}
@@ -42,37 +42,37 @@ def test_images_that_agree_belong_to_the_set() -> None:
 
 
 def test_an_image_that_sees_nothing_is_missing_until_it_sees_something() -> None:
-    simulated, model = scene()
-    rows = model.rows_of_unit[UNIT]
-    hidden = rows[model.keypoints.camera[rows] == LEFT]
-    model.rows_of_unit[UNIT] = rows[model.keypoints.camera[rows] != LEFT]
-    found = register_images_singly(model, UNIT)
+    simulated, mapper = scene()
+    rows = mapper.rows_of_unit[UNIT]
+    hidden = rows[mapper.keypoints.camera[rows] == LEFT]
+    mapper.rows_of_unit[UNIT] = rows[mapper.keypoints.camera[rows] != LEFT]
+    found = register_images_singly(mapper, UNIT)
     assert found.missing == (LEFT,)
     assert found.world_from_rig is not None
-    model.set_pose(UNIT, found.world_from_rig)
-    take_over(model, found)
-    model.rows_of_unit[UNIT] = rows
-    model.extend(UNIT)
-    model.complete()
-    assert model.missing[image_of(simulated, LEFT)]
-    assert not model.kept[hidden].any()
-    retry_missing(model)
-    assert not model.missing.any()
-    assert model.kept[hidden].mean() > 0.5
+    mapper.set_pose(UNIT, found.world_from_rig)
+    take_over(mapper, found)
+    mapper.rows_of_unit[UNIT] = rows
+    mapper.extend(UNIT)
+    mapper.complete()
+    assert mapper.missing[image_of(simulated, LEFT)]
+    assert not mapper.is_inlier[hidden].any()
+    retry_missing(mapper)
+    assert not mapper.missing.any()
+    assert mapper.is_inlier[hidden].mean() > 0.5
 
 
 def test_an_image_with_another_pose_keeps_it() -> None:
-    simulated, model = scene()
+    simulated, mapper = scene()
     wrong = se3.exp_so3(np.radians([0.0, 0.0, 5.0]))
-    model.state.camera_rotation[LEFT] = wrong @ model.state.camera_rotation[LEFT]
-    found = register_images_singly(model, UNIT)
+    mapper.state.camera_rotation[LEFT] = wrong @ mapper.state.camera_rotation[LEFT]
+    found = register_images_singly(mapper, UNIT)
     assert found.world_from_rig is not None
     assert set(found.own_poses) == {LEFT}
     assert found.voted_out == (simulated.drive.cameras[LEFT].name,)
-    model.set_pose(UNIT, found.world_from_rig)
-    take_over(model, found)
-    unit_from_image = model.motion.unit_from_image(model.state)[image_of(simulated, LEFT)]
-    pose = model.state.world_from_rig[UNIT] @ unit_from_image @ model.state.rig_from_cam[LEFT]
+    mapper.set_pose(UNIT, found.world_from_rig)
+    take_over(mapper, found)
+    unit_from_image = mapper.motion.unit_from_image(mapper.state)[image_of(simulated, LEFT)]
+    pose = mapper.state.world_from_rig[UNIT] @ unit_from_image @ mapper.state.rig_from_cam[LEFT]
     true = simulated.world_from_rig[UNIT] @ simulated.truth.rig_from_cam[LEFT]
     assert 1e-5 < float(se3.rotation_angle_deg(pose[:3, :3] @ true[:3, :3].T)) < 0.3
     assert 1e-5 < np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.15
@@ -87,12 +87,12 @@ def test_without_the_set_covered_images_are_lost() -> None:
     simulated = with_lorry(make_simulated_drive(units=UNITS, points=1000), covered, left=0.05)
     off = {}
     for config in (ONE_BY_ONE, EngineConfig(threads=1)):
-        model = make_model(simulated, config=config)
-        model, _ = map_units(simulated.drive, model.keypoints, true_matches(simulated), None, config)
-        poses = model.state.world_from_rig[model.image_unit] @ model.motion.unit_from_image(model.state)
-        good = ~model.missing & model.registered[model.image_unit]
-        true = simulated.world_from_rig[model.image_unit]
-        free = good & (model.image_unit < 2)  # the first units are nobody's problem: the frame is theirs
+        mapper = make_model(simulated, config=config)
+        mapper, _ = map_units(simulated.drive, mapper.keypoints, true_matches(simulated), None, config)
+        poses = mapper.state.world_from_rig[mapper.image_unit] @ mapper.motion.unit_from_image(mapper.state)
+        good = ~mapper.missing & mapper.registered[mapper.image_unit]
+        true = simulated.world_from_rig[mapper.image_unit]
+        free = good & (mapper.image_unit < 2)  # the first units are nobody's problem: the frame is theirs
         turn = se3.mean_rotation(true[free, :3, :3] @ np.swapaxes(poses[free, :3, :3], 1, 2))
         moved = poses[:, :3, 3] @ turn.T
         moved += (true[free, :3, 3] - moved[free]).mean(0)

@@ -8,68 +8,71 @@ from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import (
+    assess_calibration,
     calibration_prior,
-    judge_calibration,
+    resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
-    settle_scale,
 )
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import place_by_rough_poses
+from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.matching.verification import parallax_rad
 from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
 
 UNITS = 10
 
 
-def true_model(*, cameras: int = 6, straight: bool = False, units: int = UNITS) -> Model:
+def true_model(*, cameras: int = 6, straight: bool = False, units: int = UNITS) -> Mapper:
     simulated = make_simulated_drive(units=units, cameras=cameras, points=900, straight=straight)
     return with_true_poses(make_model(simulated), simulated, range(units))
 
 
-def errors_px(model: Model) -> np.ndarray:
-    rows = model.observation_rows()
-    return model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
+def errors_px(mapper: Mapper) -> np.ndarray:
+    rows = mapper.observation_rows()
+    return mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, mapper.tracks.of_keypoint[rows])
 
 
 @pytest.mark.parametrize("cameras", [1, 2, 6])
 def test_scaling_with_the_baselines_changes_no_image(cameras: int) -> None:
-    model = true_model(cameras=cameras)
-    before, mean = errors_px(model), model.state.camera_position_m.mean(0)
-    way = np.linalg.norm(model.state.unit_position_m[0] - model.state.unit_position_m[-1])
-    scale_with_baselines(model, 1.3)
-    np.testing.assert_allclose(errors_px(model), before, atol=1e-6)
-    np.testing.assert_allclose(model.state.camera_position_m.mean(0), mean, atol=1e-12)
-    longer = np.linalg.norm(model.state.unit_position_m[0] - model.state.unit_position_m[-1]) / way
+    mapper = true_model(cameras=cameras)
+    before, mean = errors_px(mapper), mapper.state.camera_position_m.mean(0)
+    way = np.linalg.norm(mapper.state.unit_position_m[0] - mapper.state.unit_position_m[-1])
+    scale_with_baselines(mapper, 1.3)
+    np.testing.assert_allclose(errors_px(mapper), before, atol=1e-6)
+    np.testing.assert_allclose(mapper.state.camera_position_m.mean(0), mean, atol=1e-12)
+    longer = np.linalg.norm(mapper.state.unit_position_m[0] - mapper.state.unit_position_m[-1]) / way
     assert 1.25 < longer < 1.35
 
 
 def test_the_baselines_tell_by_how_much_they_were_scaled() -> None:
-    model = true_model()
-    assert scale_of_baselines(model)[0] == pytest.approx(1.0)
-    scale_with_baselines(model, 1.25)
-    factor, sigma = scale_of_baselines(model)
+    mapper = true_model()
+    assert scale_of_baselines(mapper)[0] == pytest.approx(1.0)
+    scale_with_baselines(mapper, 1.25)
+    factor, sigma = scale_of_baselines(mapper)
     assert factor == pytest.approx(1 / 1.25)
     assert 0.01 < sigma < 0.1  # 5 cm on some metres of baselines
 
 
 def test_cameras_in_one_place_have_no_scale() -> None:
-    model = true_model(cameras=1)
-    assert scale_of_baselines(model) == (1.0, np.inf)
+    mapper = true_model(cameras=1)
+    assert scale_of_baselines(mapper) == (1.0, np.inf)
 
 
 def test_a_single_cameras_scale_is_infinitely_uncertain() -> None:
-    model = true_model(cameras=1)
-    free = model.registered.copy()
+    mapper = true_model(cameras=1)
+    free = mapper.registered.copy()
     free[0] = False
-    problem, _ = model.problem(free, options=SolverOptions())
+    problem, _ = mapper.problem(free, options=SolverOptions())
     assert covariances(problem, problem.state).sigma_scale == np.inf
 
 
-def judge(model: Model, *, georeferenced: bool = False) -> str:
-    free = model.registered.copy()
+def judge(mapper: Mapper, *, georeferenced: bool = False) -> str:
+    free = mapper.registered.copy()
     free[0] = False
-    verdict = judge_calibration(model, free_units=free, terms=(), georeferenced=georeferenced, options=SolverOptions())
+    verdict = assess_calibration(
+        mapper, free_units=free, terms=(), georeferenced=georeferenced, options=SolverOptions()
+    )
     return ("free: " if verdict.free else "held: ") + verdict.reason
 
 
@@ -81,16 +84,16 @@ def test_pitfall_9_calibration_is_freed_only_where_it_is_observed() -> None:
 
 
 def test_a_cancelled_adjustment_is_no_result() -> None:
-    model = true_model()
+    mapper = true_model()
     with pytest.raises(CancelledError):
-        model.adjust(model.registered, options=SolverOptions(), cancel=lambda: True)
+        adjust_poses(mapper, mapper.registered, options=SolverOptions(), cancel=lambda: True)
 
 
 def test_a_unit_that_lost_its_points_loses_its_pose() -> None:
-    model = true_model()
-    model.kept[model.keypoints.unit == 4] = False
-    assert model.drop_unsupported(20).tolist() == [4]
-    assert model.registered.sum() == UNITS - 1
+    mapper = true_model()
+    mapper.is_inlier[mapper.keypoints.unit == 4] = False
+    assert mapper.drop_unsupported(20).tolist() == [4]
+    assert mapper.registered.sum() == UNITS - 1
 
 
 def test_parallax_is_what_rotation_does_not_explain() -> None:
@@ -104,54 +107,54 @@ def test_parallax_is_what_rotation_does_not_explain() -> None:
 
 
 def test_rough_poses_place_the_model_and_a_single_one_does_not() -> None:
-    model = true_model()
+    mapper = true_model()
     rough_from_model = se3.transform(se3.exp_so3([0.0, 0.0, 1.0]), [50.0, -20.0, 3.0])
-    rough = rough_from_model @ model.state.world_from_rig
+    rough = rough_from_model @ mapper.state.world_from_rig
     one = np.full_like(rough, np.nan)
     one[3] = rough[3]
-    assert not place_by_rough_poses(model, one, 0.5)
-    assert place_by_rough_poses(model, rough, 0.5)
-    np.testing.assert_allclose(model.state.world_from_rig, rough, atol=1e-6)
+    assert not place_by_rough_poses(mapper, one, 0.5)
+    assert place_by_rough_poses(mapper, rough, 0.5)
+    np.testing.assert_allclose(mapper.state.world_from_rig, rough, atol=1e-6)
 
 
 def test_one_cameras_scale_comes_from_rough_poses_that_reach_far_enough() -> None:
-    model = true_model(cameras=1)
-    rough = model.state.world_from_rig.copy()
-    scale_with_baselines(model, 0.4)
-    assert not place_by_rough_poses(model, rough, 100.0)
-    assert place_by_rough_poses(model, rough, 0.1)
-    off = np.linalg.norm(model.state.unit_position_m - rough[:, :3, 3], axis=1)
+    mapper = true_model(cameras=1)
+    rough = mapper.state.world_from_rig.copy()
+    scale_with_baselines(mapper, 0.4)
+    assert not place_by_rough_poses(mapper, rough, 100.0)
+    assert place_by_rough_poses(mapper, rough, 0.1)
+    off = np.linalg.norm(mapper.state.unit_position_m - rough[:, :3, 3], axis=1)
     assert 0.0 < off.max() < 0.5
 
 
 def test_points_without_an_angle_are_told_from_those_with_one() -> None:
-    model = true_model()
-    solved = np.flatnonzero(model.solved)
+    mapper = true_model()
+    solved = np.flatnonzero(mapper.triangulated)
     expected = []
     for track in solved:
-        keypoints = model.tracks.keypoints[model.tracks.first[track] : model.tracks.first[track + 1]]
-        keypoints = keypoints[model.kept[keypoints]]
-        turn = model.state.unit_rotation[model.keypoints.unit[keypoints]]
-        camera = model.state.camera_rotation[model.keypoints.camera[keypoints]]
-        rays = (turn @ camera @ model.keypoints.rays[keypoints][..., None])[..., 0]
+        keypoints = mapper.tracks.keypoints[mapper.tracks.first[track] : mapper.tracks.first[track + 1]]
+        keypoints = keypoints[mapper.is_inlier[keypoints]]
+        turn = mapper.state.unit_rotation[mapper.keypoints.unit[keypoints]]
+        camera = mapper.state.camera_rotation[mapper.keypoints.camera[keypoints]]
+        rays = (turn @ camera @ mapper.keypoints.rays[keypoints][..., None])[..., 0]
         expected.append(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1).min())))
     expected = np.array(expected)
     clear = np.abs(expected - 1.0) > 1e-6
-    found = model.triangulator.has_angle(model.state, model.tracks, model.kept, solved)
+    found = mapper.triangulator.has_angle(mapper.state, mapper.tracks, mapper.is_inlier, solved)
     np.testing.assert_array_equal(found[clear], expected[clear] > 1.0)
     # Every point has one; with fewer observations some have not.
     assert found.all()
-    model.kept[model.keypoints.unit > 1] = False
-    fewer = model.triangulator.has_angle(model.state, model.tracks, model.kept, solved)
+    mapper.is_inlier[mapper.keypoints.unit > 1] = False
+    fewer = mapper.triangulator.has_angle(mapper.state, mapper.tracks, mapper.is_inlier, solved)
     assert 0 < fewer.sum() < len(fewer)
 
 
 def test_the_scale_settles_where_the_terms_cost_least() -> None:
-    model = true_model(units=6)
-    terms = [calibration_prior(model)]
-    scale_with_baselines(model, 1.15)
-    assert terms[0].cost(model.state) > 0.1
-    before = model.state.points_m.copy()
-    settle_scale(model, terms)
-    assert scale_of_baselines(model)[0] == pytest.approx(1.0, abs=1e-4)
-    assert np.abs(model.state.points_m - before).max() > 0.1
+    mapper = true_model(units=6)
+    terms = [calibration_prior(mapper)]
+    scale_with_baselines(mapper, 1.15)
+    assert terms[0].cost(mapper.state) > 0.1
+    before = mapper.state.points_m.copy()
+    resolve_scale(mapper, terms)
+    assert scale_of_baselines(mapper)[0] == pytest.approx(1.0, abs=1e-4)
+    assert np.abs(mapper.state.points_m - before).max() > 0.1

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.mapping.incremental_mapping import grow
+from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.keyframes import nearest_keyframes, register_between_keyframes, select_keyframes
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -18,7 +18,7 @@ from tests.helpers.simulated_drive import (
 
 STEP_M = 1.1
 HELD = EngineConfig(threads=1).model_copy(
-    update={"adjustment": EngineConfig().adjustment.model_copy(update={"refine_calibration": False})}
+    update={"bundle_adjustment": EngineConfig().bundle_adjustment.model_copy(update={"refine_calibration": False})}
 )
 # Steps before every unit: units of a stop are where the one before the stop is.
 STOPS = {
@@ -34,36 +34,36 @@ def drive(steps_m: list[float], **options: object) -> SimulatedDrive:
     return make_simulated_drive(**{**values, **options})  # type: ignore[arg-type]
 
 
-def model_of(simulated: SimulatedDrive) -> Model:
-    model = make_model(simulated, config=HELD)
-    model.keyframe = select_keyframes(model)
-    return model
+def model_of(simulated: SimulatedDrive) -> Mapper:
+    mapper = make_model(simulated, config=HELD)
+    mapper.keyframe = select_keyframes(mapper)
+    return mapper
 
 
-def reconstruct(simulated: SimulatedDrive) -> Model:
+def reconstruct(simulated: SimulatedDrive) -> Mapper:
     pairs = true_matches(simulated)
-    model = make_model(simulated, pairs, HELD)
-    model.keyframe = select_keyframes(model)
-    grow(model, pairs, None)
-    assert (model.registered == model.keyframe).all()
-    results = register_between_keyframes(model, max_error_px=3.0)
-    assert len(results) == (~model.keyframe).sum()
-    return model
+    mapper = make_model(simulated, pairs, HELD)
+    mapper.keyframe = select_keyframes(mapper)
+    run_incremental_mapping(mapper, pairs, None)
+    assert (mapper.registered == mapper.keyframe).all()
+    results = register_between_keyframes(mapper, max_error_px=3.0)
+    assert len(results) == (~mapper.keyframe).sum()
+    return mapper
 
 
 @pytest.mark.parametrize("where", STOPS)
 def test_pitfall_6_a_stop_has_one_keyframe_and_all_its_units_have_poses(where: str) -> None:
     simulated = drive(STOPS[where])
-    model = reconstruct(simulated)
+    mapper = reconstruct(simulated)
     stands = np.diff(np.cumsum(STOPS[where]), prepend=-1.0) == 0
-    np.testing.assert_array_equal(model.keyframe, ~stands)
-    assert model.registered.all()
-    errors = metric_errors_m(model, simulated)
+    np.testing.assert_array_equal(mapper.keyframe, ~stands)
+    assert mapper.registered.all()
+    errors = metric_errors_m(mapper, simulated)
     assert 1e-4 < rmse(errors) < 0.02
     # None of them drifts from where the car stood.
-    place = model.state.unit_position_m[stands]
+    place = mapper.state.unit_position_m[stands]
     assert 0 < np.linalg.norm(place - place.mean(0), axis=1).max() < 0.02
-    own = model.keypoints.unit[model.kept]
+    own = mapper.keypoints.unit[mapper.is_inlier]
     assert np.bincount(own, minlength=len(stands))[stands].min() > 100
 
 
@@ -75,21 +75,21 @@ def test_standing_units_do_not_bend_the_scene() -> None:
 
 
 def test_a_moving_drive_has_keyframes_only() -> None:
-    model = model_of(drive([0.0] + [STEP_M] * 8))
-    assert model.keyframe.all()
-    assert register_between_keyframes(model, max_error_px=3.0) == []
-    np.testing.assert_array_equal(nearest_keyframes_of_all(model), np.arange(9))
+    mapper = model_of(drive([0.0] + [STEP_M] * 8))
+    assert mapper.keyframe.all()
+    assert register_between_keyframes(mapper, max_error_px=3.0) == []
+    np.testing.assert_array_equal(nearest_keyframes_of_all(mapper), np.arange(9))
 
 
-def nearest_keyframes_of_all(model: Model) -> np.ndarray:
-    model.registered[:] = True
-    return nearest_keyframes(model)
+def nearest_keyframes_of_all(mapper: Mapper) -> np.ndarray:
+    mapper.registered[:] = True
+    return nearest_keyframes(mapper)
 
 
 def test_a_creeping_car_has_a_keyframe_now_and_then() -> None:
     """Steps of 2 cm: it is measured against the last keyframe, so they add up."""
-    model = model_of(drive([0.0] + [0.02] * 39))
-    gaps = np.diff(np.flatnonzero(model.keyframe))
+    mapper = model_of(drive([0.0] + [0.02] * 39))
+    gaps = np.diff(np.flatnonzero(mapper.keyframe))
     assert gaps.min() >= 2
     assert gaps.max() < 20
 
@@ -104,9 +104,9 @@ def test_others_that_drive_past_do_not_make_a_standing_car_move() -> None:
     ):
         rows = (point >= 0) & on_cars[np.maximum(point, 0)]
         features.xy_px[rows] += [12.0 * image.unit, 1.0]
-    model = model_of(simulated)
+    mapper = model_of(simulated)
     stands = np.diff(np.cumsum(steps), prepend=-1.0) == 0
-    np.testing.assert_array_equal(model.keyframe, ~stands)
+    np.testing.assert_array_equal(mapper.keyframe, ~stands)
 
 
 def test_a_drive_that_only_stands_keeps_all_its_units() -> None:
@@ -115,14 +115,14 @@ def test_a_drive_that_only_stands_keeps_all_its_units() -> None:
 
 def test_zero_makes_every_unit_a_keyframe() -> None:
     off = HELD.model_copy(update={"mapping": HELD.mapping.model_copy(update={"keyframe_motion_px": 0.0})})
-    model = make_model(drive(STOPS["at the end"]), config=off)
-    assert select_keyframes(model).all()
+    mapper = make_model(drive(STOPS["at the end"]), config=off)
+    assert select_keyframes(mapper).all()
 
 
 def test_where_cameras_are_apart_the_ends_of_a_stop_tell_that_the_car_stood() -> None:
     steps = STOPS["in the middle"]
-    model = model_of(drive(steps, time_offset_ms=[0, 0, 0, 45]))
+    mapper = model_of(drive(steps, time_offset_ms=[0, 0, 0, 45]))
     # The late camera sees the car start at unit 16 already, so unit 15 is the last one that stands.
-    assert np.flatnonzero(~model.keyframe).tolist() == list(range(6, 15))
+    assert np.flatnonzero(~mapper.keyframe).tolist() == list(range(6, 15))
     stands = np.diff(np.cumsum(steps), prepend=-1.0) == 0
     assert np.flatnonzero(stands).tolist() == list(range(5, 17))

@@ -5,7 +5,7 @@ import pytest
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits, split_pairs
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_graph import Edges, _linearise, optimise_pose_graph
 from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import (
@@ -110,15 +110,15 @@ def test_the_pose_graphs_jacobians_agree_with_differences() -> None:
 DRIFT = se3.transform(se3.exp_so3(np.radians([0.1, -0.2, 0.5])), [0.3, -0.25, 0.1])
 
 
-def drifted_model() -> tuple[SimulatedDrive, Model, list[PairMatches]]:
+def drifted_model() -> tuple[SimulatedDrive, Mapper, list[PairMatches]]:
     """A drive whose second half went off by DRIFT, and the matches across a larger gap."""
     simulated = make_simulated_drive(units=16, cameras=2, points=1200, spacing_m=0.8)
     unit = np.array([i.unit for i in simulated.drive.images])
     near, far = split_pairs(true_matches(simulated, window=12), unit, window_units=4)
-    model = with_true_poses(make_model(simulated, near), simulated, range(16))
+    mapper = with_true_poses(make_model(simulated, near), simulated, range(16))
     for late in range(8, 16):
-        model.set_pose(late, DRIFT @ simulated.world_from_rig[late])
-    return simulated, model, [p for p in far if unit[p.image_a] < 4 and unit[p.image_b] >= 8]
+        mapper.set_pose(late, DRIFT @ simulated.world_from_rig[late])
+    return simulated, mapper, [p for p in far if unit[p.image_a] < 4 and unit[p.image_b] >= 8]
 
 
 def test_pairs_are_split_by_the_gap_between_their_units() -> None:
@@ -132,8 +132,8 @@ def test_pairs_are_split_by_the_gap_between_their_units() -> None:
 
 
 def test_pitfall_10_revisits_tell_the_drift_and_close_it() -> None:
-    simulated, model, far = drifted_model()
-    revisits, tried = find_revisits(model, far)
+    simulated, mapper, far = drifted_model()
+    revisits, tried = find_revisits(mapper, far)
     assert tried >= len(revisits) >= 3
     for revisit in revisits:
         # The drift found takes the unit back to where it is.
@@ -141,11 +141,11 @@ def test_pitfall_10_revisits_tell_the_drift_and_close_it() -> None:
         assert 1e-5 < np.linalg.norm(back[:3, 3] - simulated.world_from_rig[revisit.later, :3, 3]) < 0.1
 
     def error_of_last() -> float:
-        relative = between(model.state.world_from_rig, 0, 15)
+        relative = between(mapper.state.world_from_rig, 0, 15)
         return float(np.linalg.norm(relative[:3, 3] - between(simulated.world_from_rig, 0, 15)[:3, 3]))
 
     before = error_of_last()
-    moved_m = close_loops(model, revisits)
+    moved_m = close_loops(mapper, revisits)
     assert 0.3 < before < 0.6
     assert 0.001 < error_of_last() < 0.3 * before
     assert 0.2 < moved_m < 0.7
@@ -153,7 +153,7 @@ def test_pitfall_10_revisits_tell_the_drift_and_close_it() -> None:
 
 def test_pitfall_7_alike_places_are_not_believed() -> None:
     """Matches between places that only look alike: each pair of units tells another drift, or none."""
-    _, model, far = drifted_model()
+    _, mapper, far = drifted_model()
     rng = np.random.default_rng(0)
     wrong = [
         PairMatches(
@@ -163,8 +163,8 @@ def test_pitfall_7_alike_places_are_not_believed() -> None:
             inliers=p.inliers,
         )
         for p in far
-        if model.image_unit[p.image_a] < 2 and model.image_unit[p.image_b] < 11
+        if mapper.image_unit[p.image_a] < 2 and mapper.image_unit[p.image_b] < 11
     ]
-    revisits, tried = find_revisits(model, wrong)
+    revisits, tried = find_revisits(mapper, wrong)
     assert 4 <= tried <= 6
     assert revisits == []

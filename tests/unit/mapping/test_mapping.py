@@ -9,10 +9,11 @@ from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping.calibration import heading_change_deg
-from mrasfm_engine.mapping.incremental_mapping import MappingLog, grow
+from mrasfm_engine.mapping.incremental_mapping import MappingLog, run_incremental_mapping
 from mrasfm_engine.mapping.initialization import UnitScores, initialise
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import describe
+from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -25,37 +26,37 @@ from tests.helpers.simulated_drive import (
 )
 
 HELD = EngineConfig(threads=1).model_copy(
-    update={"adjustment": EngineConfig().adjustment.model_copy(update={"refine_calibration": False})}
+    update={"bundle_adjustment": EngineConfig().bundle_adjustment.model_copy(update={"refine_calibration": False})}
 )
 
 
 def reconstruct(
     simulated: SimulatedDrive, *, prior: np.ndarray | None = None, config: EngineConfig = HELD, wrong: int = 0
-) -> tuple[Model, MappingLog]:
+) -> tuple[Mapper, MappingLog]:
     pairs = true_matches(simulated, wrong=wrong)
-    model = make_model(simulated, pairs, config)
-    return model, grow(model, pairs, prior)
+    mapper = make_model(simulated, pairs, config)
+    return mapper, run_incremental_mapping(mapper, pairs, prior)
 
 
 @pytest.mark.parametrize("wrong", [0, 2])
 @pytest.mark.parametrize(("cameras", "points"), [(6, 1200), (2, 1000)])
 def test_a_drive_is_mapped_end_to_end(cameras: int, points: int, wrong: int) -> None:
     simulated = make_simulated_drive(units=12, cameras=cameras, points=points)
-    model, log = reconstruct(simulated, wrong=wrong)
-    assert model.registered.all()
+    mapper, log = reconstruct(simulated, wrong=wrong)
+    assert mapper.registered.all()
     assert log.initialisation is not None
     assert {r.unit for r in log.registrations} | set(log.initialisation.units) == set(range(12))
     assert log.global_adjustments
-    assert 1e-4 < rmse(metric_errors_m(model, simulated)) < 0.02
-    assert model.solved.sum() > 0.6 * len(simulated.truth.points_m)
-    rows = model.observation_rows()
-    errors = model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.02
+    assert mapper.triangulated.sum() > 0.6 * len(simulated.truth.points_m)
+    rows = mapper.observation_rows()
+    errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, mapper.tracks.of_keypoint[rows])
     assert 0.2 < np.median(errors) < 0.8  # 0.4 px of noise in each coordinate
-    np.testing.assert_array_equal(model.state.rig_from_cam, simulated.drive.rig_from_cam)
-    report = describe(model, log)
+    np.testing.assert_array_equal(mapper.state.rig_from_cam, simulated.drive.rig_from_cam)
+    report = describe(mapper, log)
     assert report["registered_units"] == 12
     assert report["units_not_registered"] == []
-    assert report["points"] == model.solved.sum()
+    assert report["points"] == mapper.triangulated.sum()
 
 
 @pytest.mark.parametrize("cameras", [6, 2])
@@ -66,9 +67,9 @@ def test_pitfall_2_scale_is_the_rigs_and_never_normalised(cameras: int) -> None:
         simulated = make_simulated_drive(
             units=8, cameras=cameras, points=1000, given=lambda rig, scale=scale: scaled_rig(rig, scale)
         )
-        model, _ = reconstruct(simulated)
-        assert model.registered.all()
-        ways.append(align_similarity(model.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale)
+        mapper, _ = reconstruct(simulated)
+        assert mapper.registered.all()
+        ways.append(align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale)
     assert ways[0] == pytest.approx(1.0, abs=0.01)
     assert ways[1] == pytest.approx(1.5, abs=0.015)
 
@@ -79,9 +80,9 @@ def test_pitfall_5_one_wrong_extrinsic_does_not_ruin_the_drive() -> None:
         return rig_from_cam
 
     simulated = make_simulated_drive(units=10, cameras=6, points=1200, given=given)
-    model, log = reconstruct(simulated)
-    assert model.registered.all()
-    assert 1e-4 < rmse(metric_errors_m(model, simulated)) < 0.15
+    mapper, log = reconstruct(simulated)
+    assert mapper.registered.all()
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.15
     voted_out = [name for r in log.registrations for name in r.voted_out]
     assert set(voted_out) <= {simulated.drive.cameras[3].name}
 
@@ -90,20 +91,20 @@ def test_pitfall_5_a_camera_occluded_for_half_of_the_drive() -> None:
     simulated = make_simulated_drive(
         units=12, cameras=6, points=1200, hidden=lambda unit, camera: camera == 0 and unit >= 6
     )
-    model, _ = reconstruct(simulated)
-    assert model.registered.all()
-    assert 1e-4 < rmse(metric_errors_m(model, simulated)) < 0.03
+    mapper, _ = reconstruct(simulated)
+    assert mapper.registered.all()
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.03
 
 
 @pytest.mark.parametrize("blind", [0, 6, 11])
 def test_a_unit_that_sees_nothing_is_reported_not_lost(blind: int) -> None:
     simulated = make_simulated_drive(units=12, cameras=2, points=900, hidden=lambda unit, camera: unit == blind)
-    model, log = reconstruct(simulated)
-    assert np.flatnonzero(~model.registered).tolist() == [blind]
-    missing = describe(model, log)["units_not_registered"]
+    mapper, log = reconstruct(simulated)
+    assert np.flatnonzero(~mapper.registered).tolist() == [blind]
+    missing = describe(mapper, log)["units_not_registered"]
     assert [(m["unit"], m["source_frame"]) for m in missing] == [(blind, blind)]
     assert missing[0]["reason"]
-    assert 1e-4 < rmse(metric_errors_m(model, simulated)) < 0.03
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.03
 
 
 def test_pitfall_8_a_drive_in_two_pieces_is_not_forced_together() -> None:
@@ -114,11 +115,11 @@ def test_pitfall_8_a_drive_in_two_pieces_is_not_forced_together() -> None:
         for p in true_matches(simulated)
         if (simulated.drive.images[p.image_a].unit < 6) == (simulated.drive.images[p.image_b].unit < 6)
     ]
-    model = make_model(simulated, pairs, HELD)
-    log = grow(model, pairs, None)
-    assert model.registered[:6].all() != model.registered[6:].all()
-    assert model.registered.sum() == 6
-    assert len(describe(model, log)["units_not_registered"]) == 6
+    mapper = make_model(simulated, pairs, HELD)
+    log = run_incremental_mapping(mapper, pairs, None)
+    assert mapper.registered[:6].all() != mapper.registered[6:].all()
+    assert mapper.registered.sum() == 6
+    assert len(describe(mapper, log)["units_not_registered"]) == 6
 
 
 def test_the_prior_puts_the_scene_into_its_frame() -> None:
@@ -127,23 +128,23 @@ def test_the_prior_puts_the_scene_into_its_frame() -> None:
     move = se3.transform(se3.exp_so3([0.0, 0.0, 2.0]), [300.0, -200.0, 20.0])
     noise = se3.transform(se3.exp_so3(rng.normal(size=(8, 3)) * 0.01), rng.normal(size=(8, 3)) * 0.2)
     prior = move @ simulated.world_from_rig @ noise
-    model, log = reconstruct(simulated, prior=prior)
+    mapper, log = reconstruct(simulated, prior=prior)
     assert log.initialisation is not None
     u = log.initialisation.units[0]
-    np.testing.assert_allclose(model.state.world_from_rig[u], prior[u], atol=1e-9)
-    assert 1e-4 < rmse(metric_errors_m(model, simulated)) < 0.03
+    np.testing.assert_allclose(mapper.state.world_from_rig[u], prior[u], atol=1e-9)
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.03
 
 
 @pytest.mark.parametrize("cameras", [2, 6])
 def test_initialisation_finds_the_relative_pose_of_two_units(cameras: int) -> None:
     simulated = make_simulated_drive(units=5, cameras=cameras, points=1200)
     pairs = true_matches(simulated)
-    model = make_model(simulated, pairs, HELD)
-    result = initialise(model, pairs, None)
+    mapper = make_model(simulated, pairs, HELD)
+    result = initialise(mapper, pairs, None)
     u, v = result.units
-    assert model.registered.sum() == 2
+    assert mapper.registered.sum() == 2
     assert result.points >= 30
-    found = se3.inverse(model.state.world_from_rig[u]) @ model.state.world_from_rig[v]
+    found = se3.inverse(mapper.state.world_from_rig[u]) @ mapper.state.world_from_rig[v]
     true = se3.inverse(simulated.world_from_rig[u]) @ simulated.world_from_rig[v]
     assert 1e-5 < np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.1
     assert 1e-5 < float(se3.rotation_angle_deg(found[:3, :3] @ true[:3, :3].T)) < 0.2
@@ -151,9 +152,9 @@ def test_initialisation_finds_the_relative_pose_of_two_units(cameras: int) -> No
 
 def test_nothing_in_common_is_an_error_that_says_so() -> None:
     simulated = make_simulated_drive(units=3, cameras=2, points=100)
-    model = make_model(simulated, [])
+    mapper = make_model(simulated, [])
     with pytest.raises(ReconstructionError, match="0 image pairs") as caught:
-        grow(model, [], None)
+        run_incremental_mapping(mapper, [], None)
     assert caught.value.code == "nothing-matches"
 
 
@@ -161,8 +162,8 @@ def test_the_units_with_most_in_common() -> None:
     simulated = make_simulated_drive(units=5, cameras=2, points=500)
     pairs = true_matches(simulated)
     pairs[0].inliers[:5] = False
-    model = make_model(simulated, pairs)
-    scores = UnitScores.of(model, pairs)
+    mapper = make_model(simulated, pairs)
+    scores = UnitScores.from_pairs(mapper, pairs)
     moving = {units: scores.moving(*units) for units in scores.between}
     assert scores.inside.sum() + sum(moving.values()) == sum(int(p.inliers.sum()) for p in pairs)
     assert (scores.inside > 0).all()
@@ -175,12 +176,12 @@ def test_units_that_stand_have_nothing_in_common() -> None:
     """However many matches they have: without motion they are no points."""
     simulated = make_simulated_drive(units=3, cameras=2, points=500)
     pairs = true_matches(simulated)
-    model = make_model(simulated, pairs)
+    mapper = make_model(simulated, pairs)
     for pair in pairs:
-        if (model.image_unit[[pair.image_a, pair.image_b]] == [0, 1]).all():
-            a, b = model.matched_keypoints(pair, 0)
-            model.keypoints.rays[b] = model.keypoints.rays[a]
-    scores = UnitScores.of(model, pairs)
+        if (mapper.image_unit[[pair.image_a, pair.image_b]] == [0, 1]).all():
+            a, b = mapper.matched_keypoints(pair, 0)
+            mapper.keypoints.rays[b] = mapper.keypoints.rays[a]
+    scores = UnitScores.from_pairs(mapper, pairs)
     assert scores.moving(0, 1) < 0.5 * scores.moving(1, 2)
     assert scores.best_of_gap(1) == (1, 2)
 
@@ -189,13 +190,15 @@ def test_cancelling() -> None:
     simulated = make_simulated_drive(units=6, cameras=2, points=600)
     pairs = true_matches(simulated)
     with pytest.raises(CancelledError):
-        grow(make_model(simulated, pairs, HELD), pairs, None, cancel=lambda: True)
+        run_incremental_mapping(make_model(simulated, pairs, HELD), pairs, None, cancel=lambda: True)
 
 
 def test_progress_counts_up_to_all_units() -> None:
     simulated = make_simulated_drive(units=6, cameras=2, points=600)
     pairs, calls = true_matches(simulated), []
-    grow(make_model(simulated, pairs, HELD), pairs, None, progress=lambda done, total: calls.append((done, total)))
+    run_incremental_mapping(
+        make_model(simulated, pairs, HELD), pairs, None, progress=lambda done, total: calls.append((done, total))
+    )
     assert calls == [(k, 6) for k in range(3, 7)]
 
 
@@ -203,7 +206,7 @@ def test_the_same_seed_gives_the_same_scene() -> None:
     simulated = make_simulated_drive(units=5, cameras=2, points=600)
     a, b = (reconstruct(simulated)[0] for _ in range(2))
     np.testing.assert_array_equal(a.state.unit_position_m, b.state.unit_position_m)
-    np.testing.assert_array_equal(a.solved, b.solved)
+    np.testing.assert_array_equal(a.triangulated, b.triangulated)
 
 
 def test_calibration_is_refined_where_the_drive_turns() -> None:
@@ -214,8 +217,8 @@ def test_calibration_is_refined_where_the_drive_turns() -> None:
         return rig_from_cam
 
     simulated = make_simulated_drive(units=24, cameras=4, points=2000, spacing_m=2.0, given=given)
-    model, _ = reconstruct(simulated, config=EngineConfig(threads=1))
-    assert heading_change_deg(model) > 15
+    mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1))
+    assert heading_change_deg(mapper) > 15
 
     def worst(rig_from_cam: np.ndarray) -> float:
         own, true = (
@@ -224,65 +227,65 @@ def test_calibration_is_refined_where_the_drive_turns() -> None:
         return float(se3.rotation_angle_deg(own @ np.swapaxes(true, 1, 2)).max())
 
     assert worst(simulated.drive.rig_from_cam) > 0.5
-    assert 1e-3 < worst(model.state.rig_from_cam) < 0.1
+    assert 1e-3 < worst(mapper.state.rig_from_cam) < 0.1
 
 
 def test_pitfall_3_on_a_straight_street_calibration_is_held() -> None:
     simulated = make_simulated_drive(units=8, cameras=2, points=800, straight=True)
-    model, _ = reconstruct(simulated, config=EngineConfig(threads=1))
-    assert heading_change_deg(model) < 5
-    np.testing.assert_array_equal(model.state.rig_from_cam, simulated.drive.rig_from_cam)
-    assert 1e-4 < rmse(metric_errors_m(model, simulated)) < 0.03
+    mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1))
+    assert heading_change_deg(mapper) < 5
+    np.testing.assert_array_equal(mapper.state.rig_from_cam, simulated.drive.rig_from_cam)
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.03
 
 
-def posed_model() -> tuple[SimulatedDrive, Model]:
+def posed_model() -> tuple[SimulatedDrive, Mapper]:
     simulated = make_simulated_drive(units=5, cameras=2, points=600)
     return simulated, with_true_poses(make_model(simulated), simulated, range(5))
 
 
 def test_filter_drops_bad_observations_and_points_left_alone() -> None:
-    _, model = posed_model()
-    rows = model.observation_rows()
-    track = model.tracks.of_keypoint[rows]
+    _, mapper = posed_model()
+    rows = mapper.observation_rows()
+    track = mapper.tracks.of_keypoint[rows]
     alone = np.unique(track)[:10]  # all observations but the first of these points are bad
     first = np.searchsorted(track, alone)
     bad = np.setdiff1d(rows[np.isin(track, alone)], rows[first])
-    model.keypoints.xy_px[bad] += 50.0
-    before = model.kept.sum()
-    observations, points = model.filter(4.0)
+    mapper.keypoints.xy_px[bad] += 50.0
+    before = mapper.is_inlier.sum()
+    observations, points = mapper.filter(4.0)
     assert (observations, points) == (len(bad), 10)
-    assert not model.solved[alone].any()
-    assert model.kept.sum() == before - len(bad) - 10
-    counts = np.bincount(model.tracks.of_keypoint[np.flatnonzero(model.kept)], minlength=len(model.tracks))
-    assert ((counts >= 2) == model.solved).all()
+    assert not mapper.triangulated[alone].any()
+    assert mapper.is_inlier.sum() == before - len(bad) - 10
+    counts = np.bincount(mapper.tracks.of_keypoint[np.flatnonzero(mapper.is_inlier)], minlength=len(mapper.tracks))
+    assert ((counts >= 2) == mapper.triangulated).all()
 
 
 def test_extend_gives_a_new_unit_its_observations() -> None:
     simulated = make_simulated_drive(units=5, cameras=2, points=600)
-    model = with_true_poses(make_model(simulated), simulated, [0, 1, 2, 3])
-    points, observations = model.solved.sum(), model.kept.sum()
-    model.set_pose(4, simulated.world_from_rig[4])
-    model.extend(4)
-    assert model.solved.sum() > points
-    assert (model.keypoints.unit[model.kept] == 4).sum() > 200
-    assert model.kept.sum() > observations + 200
+    mapper = with_true_poses(make_model(simulated), simulated, [0, 1, 2, 3])
+    points, observations = mapper.triangulated.sum(), mapper.is_inlier.sum()
+    mapper.set_pose(4, simulated.world_from_rig[4])
+    mapper.extend(4)
+    assert mapper.triangulated.sum() > points
+    assert (mapper.keypoints.unit[mapper.is_inlier] == 4).sum() > 200
+    assert mapper.is_inlier.sum() > observations + 200
 
 
 def test_local_adjustment_moves_only_what_is_free() -> None:
-    _, model = posed_model()
-    model.state.unit_position_m[3] += 0.02
-    before = model.state.unit_position_m.copy()
-    report = model.adjust(np.array([False, False, False, True, False]), options=SolverOptions())
+    _, mapper = posed_model()
+    mapper.state.unit_position_m[3] += 0.02
+    before = mapper.state.unit_position_m.copy()
+    report = adjust_poses(mapper, np.array([False, False, False, True, False]), options=SolverOptions())
     assert report.final_cost < report.initial_cost
-    np.testing.assert_array_equal(model.state.unit_position_m[[0, 1, 2, 4]], before[[0, 1, 2, 4]])
-    assert 0.01 < np.linalg.norm(model.state.unit_position_m[3] - before[3]) < 0.06
+    np.testing.assert_array_equal(mapper.state.unit_position_m[[0, 1, 2, 4]], before[[0, 1, 2, 4]])
+    assert 0.01 < np.linalg.norm(mapper.state.unit_position_m[3] - before[3]) < 0.06
 
 
 def test_clear_forgets_poses_and_points() -> None:
-    _, model = posed_model()
-    assert model.visible_counts().min() > 100
-    model.clear()
-    assert not model.registered.any()
-    assert not model.solved.any()
-    assert not model.kept.any()
-    assert not model.visible_counts().any()
+    _, mapper = posed_model()
+    assert mapper.visible_counts().min() > 100
+    mapper.clear()
+    assert not mapper.registered.any()
+    assert not mapper.triangulated.any()
+    assert not mapper.is_inlier.any()
+    assert not mapper.visible_counts().any()

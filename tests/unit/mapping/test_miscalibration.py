@@ -8,10 +8,10 @@ import pytest
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import calibration_prior
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
-    WrongCamera,
-    find_wrong_cameras,
+    Miscalibration,
+    find_miscalibrations,
     find_wrong_pair,
     finding,
     pair_finding,
@@ -40,19 +40,19 @@ def turned(camera: int | None, *, deg: float = 3.0, others_deg: float = 0.0, see
     return given
 
 
-def refined(simulated: SimulatedDrive) -> tuple[Model, Refinement]:
+def refined(simulated: SimulatedDrive) -> tuple[Mapper, Refinement]:
     """From true poses of the units, and the calibration as given."""
-    model = with_true_poses(make_model(simulated), simulated, range(len(simulated.world_from_rig)))
-    return model, refine(model, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    mapper = with_true_poses(make_model(simulated), simulated, range(len(simulated.world_from_rig)))
+    return mapper, refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
 
 
 def drive(given, *, straight: bool = False) -> SimulatedDrive:  # type: ignore[no-untyped-def]
     return make_simulated_drive(units=STRAIGHT if straight else TURNING, points=900, straight=straight, given=given)
 
 
-def relative_errors_deg(model: Model, simulated: SimulatedDrive) -> np.ndarray:
+def relative_errors_deg(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
     """Rotation errors (c,) of the cameras against the median of all."""
-    errors = se3.log_so3(model.state.camera_rotation @ np.swapaxes(simulated.truth.rig_from_cam[:, :3, :3], 1, 2))
+    errors = se3.log_so3(mapper.state.camera_rotation @ np.swapaxes(simulated.truth.rig_from_cam[:, :3, :3], 1, 2))
     return np.degrees(np.linalg.norm(errors - np.median(errors, axis=0), axis=1))
 
 
@@ -60,30 +60,30 @@ def relative_errors_deg(model: Model, simulated: SimulatedDrive) -> np.ndarray:
 def test_pitfall_5_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
     """Also on a straight street without positions, where the calibration as a whole is held."""
     simulated = drive(turned(2), straight=straight)
-    model, result = refined(simulated)
+    mapper, result = refined(simulated)
     assert result.calibration.free is not straight
-    assert [w.camera for w in result.wrong_cameras] == [2]
-    wrong = result.wrong_cameras[0]
+    assert [w.camera for w in result.miscalibrations] == [2]
+    wrong = result.miscalibrations[0]
     assert 2.9 < wrong.rotation_deg < 3.1
     assert 0 <= wrong.others_rotation_deg < 0.05
-    errors = relative_errors_deg(model, simulated)
+    errors = relative_errors_deg(mapper, simulated)
     assert 0 < errors[2] < 0.1
     assert errors.max() < 0.1
     if straight:
         np.testing.assert_array_equal(result.recalibrated, np.arange(6) == 2)
-        np.testing.assert_array_equal(model.state.camera_rotation[0], simulated.drive.rig_from_cam[0, :3, :3])
+        np.testing.assert_array_equal(mapper.state.camera_rotation[0], simulated.drive.rig_from_cam[0, :3, :3])
 
 
 @pytest.mark.parametrize("straight", [False, True])
 def test_a_usual_calibration_names_nobody(straight: bool) -> None:
     """Cameras that are off by 0.3 deg under a prior of 2 deg are what recalibration is for."""
     _, result = refined(drive(turned(None, others_deg=0.3), straight=straight))
-    assert result.wrong_cameras == []
+    assert result.miscalibrations == []
     assert result.recalibrated.all() != straight
 
 
 def test_a_finding_says_which_camera_and_by_how_much() -> None:
-    wrong = WrongCamera(
+    wrong = Miscalibration(
         camera=4,
         rotation_deg=2.96,
         translation_m=0.012,
@@ -107,11 +107,11 @@ def test_votes_in_units_with_covered_images_blame_no_camera() -> None:
 
 
 def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
-    model = make_model(make_simulated_drive(units=4, cameras=2, points=200))
-    prior = replace(calibration_prior(model), sigma_rotation_rad=np.radians([0.2, 0.2]))
+    mapper = make_model(make_simulated_drive(units=4, cameras=2, points=200))
+    prior = replace(calibration_prior(mapper), sigma_rotation_rad=np.radians([0.2, 0.2]))
     off = se3.exp_so3([0.0, 0.0, np.radians(1.5)])
     state = replace(
-        model.state,
+        mapper.state,
         camera_rotation=np.stack([off @ prior.rotation[0], off.T @ prior.rotation[1]]),
         camera_position_m=prior.position_m,
     )
@@ -124,7 +124,7 @@ def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
         sigma_scale=0.01,
         prior_sigma_scale=0.01,
     )
-    assert find_wrong_cameras(prior, state, directions) == []
+    assert find_miscalibrations(prior, state, directions) == []
     pair = find_wrong_pair(prior, state, directions)
     assert pair is not None
     assert pair.rotation_deg == pytest.approx(3.0)

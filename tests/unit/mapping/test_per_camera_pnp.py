@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.per_camera_pnp import Vote, agree, consensus
+from mrasfm_engine.mapping.per_camera_pnp import Vote, agree, largest_agreement
 
 TRUE = se3.transform(se3.exp_so3([0.1, -0.2, 1.3]), [12.0, -4.0, 0.5])
 
@@ -21,12 +21,12 @@ def errors(pose: np.ndarray) -> tuple[float, float]:
 
 
 def test_nobody_agrees_on_nothing() -> None:
-    assert consensus([]) is None
+    assert largest_agreement([]) is None
 
 
 def test_one_wrong_camera_among_six_moves_nothing() -> None:
     votes = [vote(c, turned_deg=0.02 * (-1) ** c, moved_m=0.01 * (-1) ** c) for c in range(5)]
-    found = consensus([*votes, vote(5, turned_deg=4.0, moved_m=2.0, inliers=1000)])
+    found = largest_agreement([*votes, vote(5, turned_deg=4.0, moved_m=2.0, inliers=1000)])
     assert found is not None
     np.testing.assert_array_equal(found.agreeing, [True] * 5 + [False])
     position_m, rotation_deg = errors(found.world_from_rig)
@@ -37,21 +37,21 @@ def test_one_wrong_camera_among_six_moves_nothing() -> None:
 def test_two_against_two_the_better_supported_win() -> None:
     right = [vote(0, inliers=120), vote(1, moved_m=0.02, inliers=90)]
     wrong = [vote(2, turned_deg=5.0, moved_m=3.0, inliers=80), vote(3, turned_deg=5.02, moved_m=3.0, inliers=70)]
-    found = consensus([*wrong, *right])
+    found = largest_agreement([*wrong, *right])
     assert found is not None
     np.testing.assert_array_equal(found.agreeing, [False, False, True, True])
     assert 0 < errors(found.world_from_rig)[0] < 0.02  # and not in the middle between both
 
 
 def test_of_two_that_differ_one_is_believed_and_not_their_mean() -> None:
-    found = consensus([vote(0, inliers=60), vote(1, turned_deg=10.0, moved_m=1.0, inliers=50)])
+    found = largest_agreement([vote(0, inliers=60), vote(1, turned_deg=10.0, moved_m=1.0, inliers=50)])
     assert found is not None
     np.testing.assert_array_equal(found.agreeing, [True, False])
     assert errors(found.world_from_rig)[0] < 1e-9
 
 
 def test_cameras_with_more_inliers_count_for_more() -> None:
-    found = consensus([vote(0, inliers=300), vote(1, moved_m=0.2, inliers=100)])
+    found = largest_agreement([vote(0, inliers=300), vote(1, moved_m=0.2, inliers=100)])
     assert found is not None
     assert found.agreeing.all()
     np.testing.assert_allclose(errors(found.world_from_rig)[0], 0.05, atol=1e-9)

@@ -5,29 +5,32 @@ import pytest
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping import unit_registration
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.resection import resect
-from mrasfm_engine.mapping.unit_registration import points_seen, register_unit
+from mrasfm_engine.mapping.unit_registration import correspondences_of_unit, register_unit
 from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
 
 UNIT = 5
 
 
-def scene(**kwargs: object) -> tuple[np.ndarray, Model]:
+def scene(**kwargs: object) -> tuple[np.ndarray, Mapper]:
     """The true poses, and a model with all units but one at them."""
     simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})  # type: ignore[arg-type]
-    model = with_true_poses(make_model(simulated), simulated, [u for u in range(9) if u != UNIT])
-    return simulated.world_from_rig, model
+    mapper = with_true_poses(make_model(simulated), simulated, [u for u in range(9) if u != UNIT])
+    return simulated.world_from_rig, mapper
 
 
-def found(model: Model, start: np.ndarray, *, wrong: float = 0.0) -> np.ndarray | None:
-    seen = points_seen(model, UNIT)
+def found(mapper: Mapper, start: np.ndarray, *, wrong: float = 0.0) -> np.ndarray | None:
+    matched = correspondences_of_unit(mapper, UNIT)
     rng = np.random.default_rng(0)
     points = (
-        seen.points_m + 20 * rng.normal(size=seen.points_m.shape) * (rng.random(len(seen.points_m)) < wrong)[:, None]
+        matched.points_m
+        + 20 * rng.normal(size=matched.points_m.shape) * (rng.random(len(matched.points_m)) < wrong)[:, None]
     )
-    state = model.state
-    return resect(start, seen.xy_px, points, seen.camera, state.rig_from_cam, model.camera_kind, state.camera_params)
+    state = mapper.state
+    return resect(
+        start, matched.xy_px, points, matched.camera, state.rig_from_cam, mapper.camera_kind, state.camera_params
+    )
 
 
 def off(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -45,8 +48,8 @@ def moved(pose: np.ndarray, *, by_m: float, by_deg: float) -> np.ndarray:
 
 @pytest.mark.parametrize("wrong", [0.0, 0.3])
 def test_a_pose_is_found_from_one_that_is_some_way_off(wrong: float) -> None:
-    true, model = scene()
-    pose = found(model, moved(true[UNIT], by_m=0.4, by_deg=2.0), wrong=wrong)
+    true, mapper = scene()
+    pose = found(mapper, moved(true[UNIT], by_m=0.4, by_deg=2.0), wrong=wrong)
     assert pose is not None
     position_m, rotation_deg = off(pose, true[UNIT])
     assert 1e-5 < position_m < 0.03
@@ -54,28 +57,28 @@ def test_a_pose_is_found_from_one_that_is_some_way_off(wrong: float) -> None:
 
 
 def test_nothing_in_front_of_any_camera_gives_no_pose() -> None:
-    true, model = scene(cameras=1)
+    true, mapper = scene(cameras=1)
     turned = true[UNIT] @ se3.transform(se3.exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
-    assert found(model, turned) is None
+    assert found(mapper, turned) is None
 
 
 def test_the_expected_pose_follows_from_the_units_around() -> None:
-    true, model = scene()
-    expected = model.motion.expected_pose(model.state, model.registered, UNIT)
+    true, mapper = scene()
+    expected = mapper.motion.expected_pose(mapper.state, mapper.registered, UNIT)
     assert expected is not None
     position_m, rotation_deg = off(expected, true[UNIT])
     assert 1e-6 < position_m < 0.1
     assert rotation_deg < 1.0
-    alone = np.zeros_like(model.registered)
+    alone = np.zeros_like(mapper.registered)
     alone[0] = True
-    assert model.motion.expected_pose(model.state, alone, UNIT) is None
+    assert mapper.motion.expected_pose(mapper.state, alone, UNIT) is None
 
 
 def test_a_unit_is_registered_from_its_expected_pose_without_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    true, model = scene()
-    searched = register_unit_with_search(model)
+    true, mapper = scene()
+    searched = register_unit_with_search(mapper)
     monkeypatch.setattr(unit_registration, "_joint_pose", None)  # nobody may call it
-    result = register_unit(model, UNIT)
+    result = register_unit(mapper, UNIT)
     assert result.method == "joint"
     assert result.world_from_rig is not None
     assert searched is not None
@@ -85,6 +88,6 @@ def test_a_unit_is_registered_from_its_expected_pose_without_a_search(monkeypatc
     assert off(result.world_from_rig, true[UNIT])[0] < 0.03
 
 
-def register_unit_with_search(model: Model) -> np.ndarray | None:
-    seen = points_seen(model, UNIT)
-    return unit_registration.register_seen(model, UNIT, seen, min_inliers=20).world_from_rig
+def register_unit_with_search(mapper: Mapper) -> np.ndarray | None:
+    matched = correspondences_of_unit(mapper, UNIT)
+    return unit_registration.register_from_correspondences(mapper, UNIT, matched, min_inliers=20).world_from_rig

@@ -8,8 +8,8 @@ import pytest
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import scale_with_baselines
-from mrasfm_engine.mapping.incremental_mapping import MappingLog, grow
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.incremental_mapping import MappingLog, run_incremental_mapping
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import describe_refinement, motion_findings
 from mrasfm_engine.mapping.refinement import Refinement
 from mrasfm_engine.mapping.unit_registration import register_unit
@@ -34,7 +34,7 @@ def settings(**mapping: object) -> EngineConfig:
     return default.model_copy(
         update={
             "mapping": default.mapping.model_copy(update=mapping),
-            "adjustment": default.adjustment.model_copy(update={"refine_calibration": False}),
+            "bundle_adjustment": default.bundle_adjustment.model_copy(update={"refine_calibration": False}),
         }
     )
 
@@ -44,7 +44,7 @@ def skewed(**options: object) -> SimulatedDrive:
     return make_simulated_drive(**{**drive, **options})  # type: ignore[arg-type]
 
 
-def true_unit_from_image(simulated: SimulatedDrive, model: Model) -> np.ndarray:
+def true_unit_from_image(simulated: SimulatedDrive, mapper: Mapper) -> np.ndarray:
     images = simulated.drive.images
     offset_s = np.array([(i.timestamp_us - int(simulated.drive.timestamps_us[i.unit])) / 1e6 for i in images])
     unit = np.array([i.unit for i in images])
@@ -52,33 +52,33 @@ def true_unit_from_image(simulated: SimulatedDrive, model: Model) -> np.ndarray:
     return se3.inverse(simulated.world_from_rig[unit]) @ then
 
 
-def place_truly(model: Model, simulated: SimulatedDrive) -> None:
+def place_truly(mapper: Mapper, simulated: SimulatedDrive) -> None:
     for u, pose in enumerate(simulated.world_from_rig):
-        model.set_pose(u, pose)
-    model.renew_motion()
+        mapper.set_pose(u, pose)
+    mapper.renew_motion()
 
 
-def reprojection_px(model: Model) -> np.ndarray:
-    rows = model.observation_rows()
-    return model.triangulator.errors_px(model.state, rows, model.state.points_m, model.tracks.of_keypoint[rows])
+def reprojection_px(mapper: Mapper) -> np.ndarray:
+    rows = mapper.observation_rows()
+    return mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, mapper.tracks.of_keypoint[rows])
 
 
-def point_errors_m(model: Model, simulated: SimulatedDrive) -> np.ndarray:
-    rows = np.flatnonzero(model.kept)
+def point_errors_m(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
+    rows = np.flatnonzero(mapper.is_inlier)
     point = np.concatenate(simulated.point_of_keypoint)
-    true = np.full((len(model.solved), 3), np.nan)
-    true[model.tracks.of_keypoint[rows]] = simulated.truth.points_m[point[rows]]
-    return np.linalg.norm(model.state.points_m - true, axis=1)[model.solved]
+    true = np.full((len(mapper.triangulated), 3), np.nan)
+    true[mapper.tracks.of_keypoint[rows]] = simulated.truth.points_m[point[rows]]
+    return np.linalg.norm(mapper.state.points_m - true, axis=1)[mapper.triangulated]
 
 
 def test_the_motion_between_a_units_images_follows_from_its_neighbours() -> None:
     simulated = skewed()
-    model = make_model(simulated)
-    place_truly(model, simulated)
-    error = se3.inverse(true_unit_from_image(simulated, model)) @ model.motion.unit_from_image(model.state)
+    mapper = make_model(simulated)
+    place_truly(mapper, simulated)
+    error = se3.inverse(true_unit_from_image(simulated, mapper)) @ mapper.motion.unit_from_image(mapper.state)
     assert 1e-6 < np.linalg.norm(error[:, :3, 3], axis=1).max() < 0.005
     assert 1e-4 < se3.rotation_angle_deg(error[:, :3, :3]).max() < 0.1
-    largest = model.motion.largest(model.state, model.registered)
+    largest = mapper.motion.largest(mapper.state, mapper.registered)
     assert 0.5 < largest.translation_m < 0.6
     assert 0.1 < largest.rotation_deg < 3.0
 
@@ -86,12 +86,12 @@ def test_the_motion_between_a_units_images_follows_from_its_neighbours() -> None
 def test_points_of_a_skewed_drive_fit_only_with_the_motion() -> None:
     simulated = skewed()
     with_motion, without = (make_model(simulated, config=settings(motion_compensation=on)) for on in (True, False))
-    for model in (with_motion, without):
-        place_truly(model, simulated)
-        model.triangulate()
+    for mapper in (with_motion, without):
+        place_truly(mapper, simulated)
+        mapper.triangulate()
     assert without.state.simultaneous
     assert 0.1 < np.median(reprojection_px(with_motion)) < 0.4
-    assert with_motion.kept.sum() > 1.2 * without.kept.sum()
+    assert with_motion.is_inlier.sum() > 1.2 * without.is_inlier.sum()
     error_m = np.median(point_errors_m(with_motion, simulated))
     assert 1e-3 < error_m < 0.06
     assert np.median(point_errors_m(without, simulated)) > 5 * error_m
@@ -99,13 +99,13 @@ def test_points_of_a_skewed_drive_fit_only_with_the_motion() -> None:
 
 def test_a_unit_is_registered_with_the_motion_of_its_neighbours() -> None:
     simulated = skewed()
-    model, unit = make_model(simulated), 5
-    place_truly(model, simulated)
-    model.registered[unit] = False
-    model.renew_motion()
-    model.triangulate()
-    model.motion.predict(model.state, model.registered, unit)
-    result = register_unit(model, unit)
+    mapper, unit = make_model(simulated), 5
+    place_truly(mapper, simulated)
+    mapper.registered[unit] = False
+    mapper.renew_motion()
+    mapper.triangulate()
+    mapper.motion.predict(mapper.state, mapper.registered, unit)
+    result = register_unit(mapper, unit)
     assert result.world_from_rig is not None
     assert result.voted_out == ()
     true = simulated.world_from_rig[unit]
@@ -115,20 +115,20 @@ def test_a_unit_is_registered_with_the_motion_of_its_neighbours() -> None:
 
 @pytest.mark.parametrize("with_prior", [True, False])
 def test_pitfall_1_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_prior: bool) -> None:
-    def mapped(simulated: SimulatedDrive, config: EngineConfig) -> tuple[Model, MappingLog]:
+    def mapped(simulated: SimulatedDrive, config: EngineConfig) -> tuple[Mapper, MappingLog]:
         pairs = true_matches(simulated)
-        model = make_model(simulated, pairs, config)
+        mapper = make_model(simulated, pairs, config)
         prior = simulated.world_from_rig.copy() if with_prior else None
         if prior is not None:
             prior[:, :3, 3] += np.random.default_rng(0).normal(size=(len(prior), 3)) * 0.3
-            model.motion.follow_prior(prior)
-        return model, grow(model, pairs, prior)
+            mapper.motion.follow_prior(prior)
+        return mapper, run_incremental_mapping(mapper, pairs, prior)
 
     simulated = skewed()
-    model, log = mapped(simulated, settings())
-    assert model.registered.all()
+    mapper, log = mapped(simulated, settings())
+    assert mapper.registered.all()
     assert not [r for r in log.registrations if r.voted_out]
-    error_m = rmse(metric_errors_m(model, simulated))
+    error_m = rmse(metric_errors_m(mapper, simulated))
     assert 1e-4 < error_m < 0.02
     ignored, _ = mapped(simulated, settings(motion_compensation=False))
     assert rmse(metric_errors_m(ignored, simulated)) > 5 * error_m
@@ -136,15 +136,15 @@ def test_pitfall_1_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_p
 
 def test_rows_of_a_rolling_shutter_have_their_own_times() -> None:
     simulated = skewed(time_offset_ms=None, readout_ms=30, cameras=2, points=1200, noise_px=0.1)
-    model, without = make_model(simulated), make_model(simulated, config=settings(motion_compensation=False))
-    shots = model.motion.shots
-    assert len(shots) == 61 * len(simulated.drive.images)
-    np.testing.assert_array_equal(shots.time_offset_s[shots.middle_of_image], 0.0)
-    for m in (model, without):
+    mapper, without = make_model(simulated), make_model(simulated, config=settings(motion_compensation=False))
+    bands = mapper.motion.bands
+    assert len(bands) == 61 * len(simulated.drive.images)
+    np.testing.assert_array_equal(bands.time_offset_s[bands.middle_of_image], 0.0)
+    for m in (mapper, without):
         place_truly(m, simulated)
         m.triangulate()
-    assert 0.05 < np.median(reprojection_px(model)) < 0.2
-    error_m = np.median(point_errors_m(model, simulated))
+    assert 0.05 < np.median(reprojection_px(mapper)) < 0.2
+    error_m = np.median(point_errors_m(mapper, simulated))
     assert 1e-3 < error_m < 0.04
     assert np.median(point_errors_m(without, simulated)) > 5 * error_m
 
@@ -165,32 +165,32 @@ def in_time(simulated: SimulatedDrive, time_s: list[float]) -> SimulatedDrive:
 
 def test_units_far_from_all_others_are_counted_and_named_in_a_warning() -> None:
     simulated = in_time(skewed(units=7), [0.0, 0.1, 0.2, 5.0, 10.0, 10.1, 20.0])
-    model = make_model(simulated)
-    place_truly(model, simulated)
-    assert model.motion.not_compensated(model.state, model.registered).tolist() == [3, 6]
-    alone = model.motion.unit_from_image(model.state)[model.image_unit == 3]
+    mapper = make_model(simulated)
+    place_truly(mapper, simulated)
+    assert mapper.motion.not_compensated(mapper.state, mapper.registered).tolist() == [3, 6]
+    alone = mapper.motion.unit_from_image(mapper.state)[mapper.image_unit == 3]
     np.testing.assert_array_equal(alone, np.tile(np.eye(4), (6, 1, 1)))
-    report = describe_refinement(model, Refinement(recalibrated=np.zeros(6, dtype=np.bool_)))
+    report = describe_refinement(mapper, Refinement(recalibrated=np.zeros(6, dtype=np.bool_)))
     assert report["motion_within_units"]["units_not_compensated"] == 2
-    (said,) = motion_findings(model)
+    (said,) = motion_findings(mapper)
     assert said.code == "motion-not-compensated"
     assert "2 of 7 registered units" in said.what
     # Images with poses of their own are where they are, whatever their times.
-    images = np.flatnonzero(model.image_unit == 3)
-    model.set_image_poses(images, np.tile(np.eye(4), (len(images), 1, 1)))
-    assert model.motion.not_compensated(model.state, model.registered).tolist() == [6]
+    images = np.flatnonzero(mapper.image_unit == 3)
+    mapper.set_image_poses(images, np.tile(np.eye(4), (len(images), 1, 1)))
+    assert mapper.motion.not_compensated(mapper.state, mapper.registered).tolist() == [6]
     # A unit without a pose is not missed, but its neighbour is alone now.
-    model.registered[5] = False
-    assert model.motion.not_compensated(model.state, model.registered).tolist() == [4, 6]
+    mapper.registered[5] = False
+    assert mapper.motion.not_compensated(mapper.state, mapper.registered).tolist() == [4, 6]
 
 
 def test_a_prior_tells_the_motion_where_no_registered_unit_does() -> None:
     simulated = skewed(units=5)
-    model = make_model(simulated)
-    model.set_pose(2, simulated.world_from_rig[2])
-    assert len(motion_findings(model)) == 1
-    model.motion.follow_prior(simulated.world_from_rig)
-    assert motion_findings(model) == []
+    mapper = make_model(simulated)
+    mapper.set_pose(2, simulated.world_from_rig[2])
+    assert len(motion_findings(mapper)) == 1
+    mapper.motion.follow_prior(simulated.world_from_rig)
+    assert motion_findings(mapper) == []
 
 
 def test_nothing_is_to_be_compensated_where_images_are_simultaneous_or_it_is_switched_off() -> None:
@@ -198,19 +198,19 @@ def test_nothing_is_to_be_compensated_where_images_are_simultaneous_or_it_is_swi
     off, at_once = settings(motion_compensation=False), skewed(units=3, time_offset_ms=None)
     for simulated, config in ((skewed(units=3), off), (at_once, settings())):
         drive = in_time(simulated, alone)
-        model = make_model(drive, config=config)
-        place_truly(model, drive)
-        assert motion_findings(model) == []
+        mapper = make_model(drive, config=config)
+        place_truly(mapper, drive)
+        assert motion_findings(mapper) == []
 
 
-def test_simultaneous_images_need_no_shots() -> None:
+def test_simultaneous_images_need_no_bands() -> None:
     simulated = make_simulated_drive(units=4, cameras=2, points=400)
-    model = make_model(simulated)
-    assert not model.motion.needed
-    assert model.state.simultaneous
-    assert model.renew_motion() == 0.0
-    np.testing.assert_array_equal(model.keypoints.shot, model.keypoints.image)
-    np.testing.assert_array_equal(model.motion.unit_from_image(model.state), np.tile(np.eye(4), (8, 1, 1)))
+    mapper = make_model(simulated)
+    assert not mapper.motion.needed
+    assert mapper.state.simultaneous
+    assert mapper.renew_motion() == 0.0
+    np.testing.assert_array_equal(mapper.keypoints.band, mapper.keypoints.image)
+    np.testing.assert_array_equal(mapper.motion.unit_from_image(mapper.state), np.tile(np.eye(4), (8, 1, 1)))
 
 
 def test_jitter_of_the_clocks_is_no_motion() -> None:
@@ -223,13 +223,13 @@ def test_jitter_of_the_clocks_is_no_motion() -> None:
 
 def test_an_image_can_have_a_pose_of_its_own() -> None:
     simulated = skewed()
-    model, image = make_model(simulated), 14
-    place_truly(model, simulated)
-    before = model.motion.unit_from_image(model.state)
+    mapper, image = make_model(simulated), 14
+    place_truly(mapper, simulated)
+    before = mapper.motion.unit_from_image(mapper.state)
     own = se3.transform(se3.exp_so3([0.0, 0.0, 0.02]), [0.3, -0.1, 0.05])
-    model.set_image_pose(image, own)
-    model.renew_motion()
-    after = model.motion.unit_from_image(model.state)
+    mapper.set_image_pose(image, own)
+    mapper.renew_motion()
+    after = mapper.motion.unit_from_image(mapper.state)
     np.testing.assert_allclose(after[image], own, atol=1e-12)
     others = np.arange(len(after)) != image
     np.testing.assert_array_equal(after[others], before[others])
@@ -237,52 +237,52 @@ def test_an_image_can_have_a_pose_of_its_own() -> None:
 
 def test_an_image_of_a_simultaneous_drive_can_have_a_pose_of_its_own() -> None:
     simulated = make_simulated_drive(units=4, cameras=2, points=400)
-    model = make_model(simulated)
-    place_truly(model, simulated)
-    model.triangulate()
-    good = reprojection_px(model)
+    mapper = make_model(simulated)
+    place_truly(mapper, simulated)
+    mapper.triangulate()
+    good = reprojection_px(mapper)
     own = se3.transform(np.eye(3), [0.5, 0.0, 0.0])
-    model.set_image_pose(3, own)
-    np.testing.assert_allclose(model.motion.unit_from_image(model.state)[3], own)
-    rows = model.observation_rows()
-    moved = model.keypoints.image[rows] == 3
-    assert np.median(reprojection_px(model)[moved]) > 5 * np.median(good[moved])
-    np.testing.assert_allclose(reprojection_px(model)[~moved], good[~moved], atol=1e-9)
+    mapper.set_image_pose(3, own)
+    np.testing.assert_allclose(mapper.motion.unit_from_image(mapper.state)[3], own)
+    rows = mapper.observation_rows()
+    moved = mapper.keypoints.image[rows] == 3
+    assert np.median(reprojection_px(mapper)[moved]) > 5 * np.median(good[moved])
+    np.testing.assert_allclose(reprojection_px(mapper)[~moved], good[~moved], atol=1e-9)
 
 
 def test_a_unit_that_is_forgotten_leaves_no_pose_of_its_images() -> None:
     simulated = skewed()
-    model = make_model(simulated)
-    place_truly(model, simulated)
-    before = model.motion.unit_from_image(model.state)
+    mapper = make_model(simulated)
+    place_truly(mapper, simulated)
+    before = mapper.motion.unit_from_image(mapper.state)
     pushed = before.copy()
     pushed[:, 0, 3] += 0.3
-    images = np.flatnonzero(np.isin(model.image_unit, [3, 4]))
-    model.set_image_poses(images, pushed[images])
-    model.forget(np.array([3]))
-    assert not model.motion.own_poses[0][model.image_unit == 3].any()
-    assert model.motion.own_poses[0][model.image_unit == 4].all()
-    model.clear()
-    assert not model.motion.own_poses[0].any()
+    images = np.flatnonzero(np.isin(mapper.image_unit, [3, 4]))
+    mapper.set_image_poses(images, pushed[images])
+    mapper.forget(np.array([3]))
+    assert not mapper.motion.own_poses[0][mapper.image_unit == 3].any()
+    assert mapper.motion.own_poses[0][mapper.image_unit == 4].all()
+    mapper.clear()
+    assert not mapper.motion.own_poses[0].any()
 
 
 def test_own_poses_and_rows_go_together() -> None:
     simulated = skewed(time_offset_ms=None, readout_ms=30, cameras=2)
-    model = make_model(simulated)
-    place_truly(model, simulated)
-    shots, image = model.motion.shots, 7
-    rows = np.arange(shots.first_of_image[image], shots.first_of_image[image + 1])
-    before = model.state.unit_from_shot[rows]
+    mapper = make_model(simulated)
+    place_truly(mapper, simulated)
+    bands, image = mapper.motion.bands, 7
+    rows = np.arange(bands.first_of_image[image], bands.first_of_image[image + 1])
+    before = mapper.state.unit_from_band[rows]
     own = se3.transform(se3.exp_so3([0.01, 0.0, 0.02]), [0.1, 0.2, 0.0])
-    model.set_image_pose(image, own)
-    np.testing.assert_allclose(model.state.unit_from_shot[rows], own @ before, atol=1e-12)
+    mapper.set_image_pose(image, own)
+    np.testing.assert_allclose(mapper.state.unit_from_band[rows], own @ before, atol=1e-12)
 
 
 def test_scaling_the_scene_changes_no_image() -> None:
     simulated = skewed()
-    model = make_model(simulated)
-    place_truly(model, simulated)
-    model.triangulate()
-    before = reprojection_px(model)
-    scale_with_baselines(model, 1.2)
-    np.testing.assert_allclose(reprojection_px(model), before, atol=1e-7)
+    mapper = make_model(simulated)
+    place_truly(mapper, simulated)
+    mapper.triangulate()
+    before = reprojection_px(mapper)
+    scale_with_baselines(mapper, 1.2)
+    np.testing.assert_allclose(reprojection_px(mapper), before, atol=1e-7)

@@ -7,11 +7,11 @@ import pytest
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.incremental_mapping import grow
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import describe, describe_refinement
 from mrasfm_engine.mapping.refinement import refine
-from mrasfm_engine.mapping.road import RoadJudgement, drop_off_road, height_sigmas_m, judge_road
+from mrasfm_engine.mapping.road import RoadAssessment, assess_road, drop_off_road, height_sigmas_m
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from mrasfm_engine.triangulation.tracks import Keypoints
@@ -58,12 +58,12 @@ def drive_over_shadows(*, share: float = 0.35, masks: bool = True) -> tuple[Simu
     return replace(simulated, features=features), moving
 
 
-def mapped(simulated: SimulatedDrive, config: EngineConfig = ON) -> Model:
+def mapped(simulated: SimulatedDrive, config: EngineConfig = ON) -> Mapper:
     return with_true_poses(make_model(simulated, config=config), simulated, range(UNITS))
 
 
-def is_moving(model: Model, simulated: SimulatedDrive, moving: np.ndarray, tracks: np.ndarray) -> np.ndarray:
-    point = np.concatenate(simulated.point_of_keypoint)[model.tracks.keypoints[model.tracks.first[tracks]]]
+def is_moving(mapper: Mapper, simulated: SimulatedDrive, moving: np.ndarray, tracks: np.ndarray) -> np.ndarray:
+    point = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[tracks]]]
     return moving[point]
 
 
@@ -74,76 +74,76 @@ def shadows() -> tuple[SimulatedDrive, np.ndarray]:
 
 @pytest.mark.parametrize("final", [False, True])
 def test_shadows_that_move_are_dropped_and_the_road_stays(
-    shadows: tuple[SimulatedDrive, np.ndarray], final: bool
+    shadows: tuple[SimulatedDrive, np.ndarray], for_map: bool
 ) -> None:
     simulated, moving = shadows
-    model = mapped(simulated)
-    judgement = judge_road(model, final=final)
-    assert isinstance(judgement, RoadJudgement)
+    mapper = mapped(simulated)
+    judgement = assess_road(mapper, for_map=for_map)
+    assert isinstance(judgement, RoadAssessment)
     assert judgement.source is RoadSource.MASKS
-    wrong = is_moving(model, simulated, moving, judgement.tracks)
+    wrong = is_moving(mapper, simulated, moving, judgement.tracks)
     height = judgement.points_m[:, 2]
     # Far beyond both ends of the way there are only points of shadows, which make a road of their own.
     way = simulated.world_from_rig[:, :3, 3]
     near = np.linalg.norm(judgement.points_m[:, None] - way[None], axis=2).min(1) < 40.0
     off = near & (np.abs(height) > 0.1)
     assert (wrong & off).sum() > 100
-    assert (~judgement.kept)[wrong & off].mean() > (0.97 if final else 0.85)
-    assert 0.9 < judgement.kept[~wrong & (np.abs(height) < 0.05)].mean() <= 1.0
+    assert (~judgement.is_inlier)[wrong & off].mean() > (0.97 if for_map else 0.85)
+    assert 0.9 < judgement.is_inlier[~wrong & (np.abs(height) < 0.05)].mean() <= 1.0
     assert abs(judgement.fitted.rig_height_m) < 0.05
     assert 0 < judgement.road.thickness_after.range90_m < 0.5 * judgement.road.thickness_before.range90_m
 
 
 def test_what_was_dropped_waits_until_all_are_tried_again(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
     simulated, _ = shadows
-    model = mapped(simulated)
-    before = model.solved.copy()
-    judgement = drop_off_road(model)
-    assert isinstance(judgement, RoadJudgement)
-    dropped = judgement.tracks[~judgement.kept]
+    mapper = mapped(simulated)
+    before = mapper.triangulated.copy()
+    judgement = drop_off_road(mapper)
+    assert isinstance(judgement, RoadAssessment)
+    dropped = judgement.tracks[~judgement.is_inlier]
     assert len(dropped) > 50
-    assert not model.solved[dropped].any()
-    rows = np.flatnonzero(model.kept)
-    assert not np.isin(model.tracks.of_keypoint[rows], dropped).any()
-    model.extend(UNITS - 1)
-    assert not model.solved[dropped].any()
-    model.readmit()
-    assert model.solved[dropped].all()
-    assert not model.barred.any()
-    drop_off_road(model)
-    model.complete()
-    assert (model.solved & before).sum() > 0.99 * before.sum()
+    assert not mapper.triangulated[dropped].any()
+    rows = np.flatnonzero(mapper.is_inlier)
+    assert not np.isin(mapper.tracks.of_keypoint[rows], dropped).any()
+    mapper.extend(UNITS - 1)
+    assert not mapper.triangulated[dropped].any()
+    mapper.readmit()
+    assert mapper.triangulated[dropped].all()
+    assert not mapper.rejected.any()
+    drop_off_road(mapper)
+    mapper.complete()
+    assert (mapper.triangulated & before).sum() > 0.99 * before.sum()
 
 
 def test_far_points_may_scatter_more(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
     simulated, _ = shadows
-    model = mapped(simulated)
-    tracks = np.flatnonzero(model.solved & (model.track_class == ROAD))
-    sigma = height_sigmas_m(model, tracks, model.state.world_from_rig)
-    away = np.abs(model.state.points_m[tracks, 2])
+    mapper = mapped(simulated)
+    tracks = np.flatnonzero(mapper.triangulated & (mapper.track_class == ROAD))
+    sigma = height_sigmas_m(mapper, tracks, mapper.state.world_from_rig)
+    away = np.abs(mapper.state.points_m[tracks, 2])
     nearest, farthest = sigma < np.quantile(sigma, 0.2), sigma > np.quantile(sigma, 0.8)
     assert 3 * np.median(sigma[nearest]) < np.median(sigma[farthest])
     assert 2 * np.median(away[nearest]) < np.median(away[farthest])
-    judgement = judge_road(model, final=False)
-    assert isinstance(judgement, RoadJudgement)
+    judgement = assess_road(mapper, for_map=False)
+    assert isinstance(judgement, RoadAssessment)
     assert judgement.limit_m[farthest].min() > 2 * judgement.limit_m[nearest].min()
-    final = judge_road(model, final=True)
-    assert isinstance(final, RoadJudgement)
-    assert final.limit_m.max() <= max(0.05, 3 * final.fitted.roughness_m) + 1e-9
+    for_map = assess_road(mapper, for_map=True)
+    assert isinstance(for_map, RoadAssessment)
+    assert for_map.limit_m.max() <= max(0.05, 3 * for_map.fitted.roughness_m) + 1e-9
 
 
 def test_without_masks_only_what_cannot_stand_is_dropped() -> None:
     simulated, moving = drive_over_shadows(masks=False)
-    model = mapped(simulated)
-    judgement = judge_road(model, final=True)
-    assert isinstance(judgement, RoadJudgement)
+    mapper = mapped(simulated)
+    judgement = assess_road(mapper, for_map=True)
+    assert isinstance(judgement, RoadAssessment)
     assert judgement.source is RoadSource.GEOMETRY
-    wrong = is_moving(model, simulated, moving, judgement.tracks)
-    dropped = ~judgement.kept
+    wrong = is_moving(mapper, simulated, moving, judgement.tracks)
+    dropped = ~judgement.is_inlier
     assert dropped[wrong].sum() > 10
     assert dropped[wrong].sum() > 3 * dropped[~wrong & (np.abs(judgement.points_m[:, 2]) < 0.05)].sum()
     beside = np.abs(judgement.points_m[:, 2]) < 0.05
-    assert judgement.kept[~wrong & beside].mean() > 0.95
+    assert judgement.is_inlier[~wrong & beside].mean() > 0.95
 
 
 def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
@@ -164,12 +164,12 @@ def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
     simulated = replace(simulated, features=features, point_of_keypoint=points)
     pairs, results = true_matches(simulated), []
     for config in (ON, OFF):
-        model = make_model(simulated, pairs, config)
-        log = grow(model, pairs, None)
-        refinement = refine(model, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
-        results.append((model, log, refinement))
+        mapper = make_model(simulated, pairs, config)
+        log = run_incremental_mapping(mapper, pairs, None)
+        refinement = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+        results.append((mapper, log, refinement))
     (on, log, refinement), (off, _, switched_off) = results
-    np.testing.assert_array_equal(on.state.points_m[on.solved], off.state.points_m[off.solved])
+    np.testing.assert_array_equal(on.state.points_m[on.triangulated], off.state.points_m[off.triangulated])
     np.testing.assert_array_equal(on.state.world_from_rig, off.state.world_from_rig)
     assert sum(describe(on, log)["road_points_dropped"]) == 0
     said = describe_refinement(on, refinement)["road"]
@@ -180,39 +180,39 @@ def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
 
 def test_bad_road_points_do_not_pull_the_poses(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
     simulated, moving = shadows
-    model = mapped(simulated)
-    refinement = refine(model, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
-    assert isinstance(refinement.road, RoadJudgement)
-    report = describe_refinement(model, refinement)["road"]
+    mapper = mapped(simulated)
+    refinement = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    assert isinstance(refinement.road, RoadAssessment)
+    report = describe_refinement(mapper, refinement)["road"]
     assert report["source"] == "masks"
     assert report["kept"] + report["dropped"] == report["points"]
     assert report["patches"] == len(refinement.road.fitted.surface) > 3
     assert 0 < report["thickness_after_m"] < 0.5 * report["thickness_before_m"]
     assert 0 < report["spread_after_m"] <= report["spread_before_m"]
-    error = np.linalg.norm(model.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
+    error = np.linalg.norm(mapper.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
     assert 0 < error.max() < 0.02
-    left = np.flatnonzero(model.solved & (model.track_class == ROAD))
-    assert 0 < np.percentile(np.abs(model.state.points_m[left, 2]), 90) < 0.06
+    left = np.flatnonzero(mapper.triangulated & (mapper.track_class == ROAD))
+    assert 0 < np.percentile(np.abs(mapper.state.points_m[left, 2]), 90) < 0.06
     assert moving.any()
 
 
 def test_classes_of_tracks_are_those_of_most_of_their_keypoints(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
     simulated, _ = shadows
-    keypoints = Keypoints.of(simulated.drive, simulated.features)
+    keypoints = Keypoints.from_features(simulated.drive, simulated.features)
     assert len(keypoints.classes) == len(keypoints.image)
-    model = mapped(simulated)
-    point = np.concatenate(simulated.point_of_keypoint)[model.tracks.keypoints[model.tracks.first[:-1]]]
+    mapper = mapped(simulated)
+    point = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[:-1]]]
     expected = np.where(simulated.truth.points_m[point, 2] == 0.0, ROAD, 1)
-    assert (model.track_class == expected).mean() > 0.999
+    assert (mapper.track_class == expected).mean() > 0.999
 
 
 def test_one_mask_does_not_switch_off_what_geometry_says_of_the_other_images() -> None:
     simulated, _ = drive_over_shadows(masks=False)
-    alone = judge_road(mapped(simulated), final=True)
+    alone = assess_road(mapped(simulated), for_map=True)
     first = replace(simulated.features[0], classes=np.full(len(simulated.features[0].xy_px), 1, np.uint8))
-    one = judge_road(mapped(replace(simulated, features=[first, *simulated.features[1:]])), final=True)
-    assert isinstance(alone, RoadJudgement)
-    assert isinstance(one, RoadJudgement)
+    one = assess_road(mapped(replace(simulated, features=[first, *simulated.features[1:]])), for_map=True)
+    assert isinstance(alone, RoadAssessment)
+    assert isinstance(one, RoadAssessment)
     assert one.source is RoadSource.GEOMETRY
     # What the mask says is not road is none; of the rest geometry judges as before.
     assert 50 < len(one.tracks) < len(alone.tracks)

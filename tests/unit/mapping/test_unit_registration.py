@@ -5,7 +5,7 @@ import pytest
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping import unit_registration
-from mrasfm_engine.mapping.mapper import Model
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.unit_registration import cameras_of, matrix_of, register_unit, rigid3d
 from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
 
@@ -19,22 +19,24 @@ def errors(pose: np.ndarray, simulated: SimulatedDrive, unit: int = UNIT) -> tup
     return float(np.linalg.norm(pose[:3, 3] - true[:3, 3])), turn
 
 
-def scene(**kwargs: object) -> tuple[SimulatedDrive, Model]:
+def scene(**kwargs: object) -> tuple[SimulatedDrive, Mapper]:
     """All units but one at their true poses, with points."""
     simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})  # type: ignore[arg-type]
-    model = make_model(simulated)
-    return simulated, with_true_poses(model, simulated, [u for u in range(9) if u != UNIT])
+    mapper = make_model(simulated)
+    return simulated, with_true_poses(mapper, simulated, [u for u in range(9) if u != UNIT])
 
 
-def turn_camera(model: Model, camera: int, deg: float) -> None:
+def turn_camera(mapper: Mapper, camera: int, deg: float) -> None:
     """The manifest's calibration of a camera is wrong, points come from the others."""
-    model.state.camera_rotation[camera] = se3.exp_so3(np.radians([0.0, 0.0, deg])) @ model.state.camera_rotation[camera]
+    mapper.state.camera_rotation[camera] = (
+        se3.exp_so3(np.radians([0.0, 0.0, deg])) @ mapper.state.camera_rotation[camera]
+    )
 
 
 @pytest.mark.parametrize("cameras", [1, 2, 6])
 def test_a_unit_is_registered_over_all_its_cameras(cameras: int) -> None:
-    simulated, model = scene(cameras=cameras)
-    result = register_unit(model, UNIT)
+    simulated, mapper = scene(cameras=cameras)
+    result = register_unit(mapper, UNIT)
     assert result.method == "joint"
     assert result.voted_out == ()
     assert result.reason == ""
@@ -43,15 +45,15 @@ def test_a_unit_is_registered_over_all_its_cameras(cameras: int) -> None:
     assert 1e-5 < position_m < 0.05
     assert 1e-5 < rotation_deg < 0.1
     assert 0.9 * result.correspondences < result.inliers <= result.correspondences
-    assert not model.registered[UNIT]  # the caller decides
+    assert not mapper.registered[UNIT]  # the caller decides
 
 
 @pytest.mark.parametrize("camera", [0, 5])
 @pytest.mark.parametrize("error_deg", [3.0, 15.0])
 def test_pitfall_5_a_camera_with_a_wrong_extrinsic_is_voted_out_by_name(camera: int, error_deg: float) -> None:
-    simulated, model = scene()
-    turn_camera(model, camera, error_deg)
-    result = register_unit(model, UNIT)
+    simulated, mapper = scene()
+    turn_camera(mapper, camera, error_deg)
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is not None
     assert result.voted_out == (simulated.drive.cameras[camera].name,)
     position_m, rotation_deg = errors(result.world_from_rig, simulated)
@@ -60,23 +62,23 @@ def test_pitfall_5_a_camera_with_a_wrong_extrinsic_is_voted_out_by_name(camera: 
 
 
 def test_pitfall_5_an_occluded_camera_gets_its_pose_from_the_unit() -> None:
-    simulated, model = scene(hidden=lambda unit, camera: camera == 0 and unit >= 4)
+    simulated, mapper = scene(hidden=lambda unit, camera: camera == 0 and unit >= 4)
     names = [c.name for c in simulated.drive.cameras]
-    result = register_unit(model, UNIT)
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is not None
     assert names[0] not in result.voted_out  # it sees nothing: it is not wrong
     assert errors(result.world_from_rig, simulated)[0] < 0.05
-    model.set_pose(UNIT, result.world_from_rig)
-    camera_pose = model.state.world_from_rig[UNIT] @ model.state.rig_from_cam[0]
+    mapper.set_pose(UNIT, result.world_from_rig)
+    camera_pose = mapper.state.world_from_rig[UNIT] @ mapper.state.rig_from_cam[0]
     true = simulated.world_from_rig[UNIT] @ simulated.truth.rig_from_cam[0]
     assert 1e-6 < np.linalg.norm(camera_pose[:3, 3] - true[:3, 3]) < 0.05
 
 
 def test_where_the_joint_pose_fails_the_cameras_vote(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulated, model = scene()
-    monkeypatch.setattr(unit_registration, "_joint_pose", lambda model, seen: None)
+    simulated, mapper = scene()
+    monkeypatch.setattr(unit_registration, "_joint_pose", lambda mapper, matched: None)
     monkeypatch.setattr(unit_registration, "_as_expected", lambda *_: None)
-    result = register_unit(model, UNIT)
+    result = register_unit(mapper, UNIT)
     assert result.method == "vote"
     assert result.voted_out == result.unclear == ()
     assert result.world_from_rig is not None
@@ -87,10 +89,10 @@ def test_where_the_joint_pose_fails_the_cameras_vote(monkeypatch: pytest.MonkeyP
 
 def test_two_cameras_against_two() -> None:
     """Two are turned alike, so each half agrees in itself: the pose is that of one half, never in between."""
-    simulated, model = scene(cameras=4)
+    simulated, mapper = scene(cameras=4)
     for camera in (1, 2):
-        turn_camera(model, camera, 6.0)
-    result = register_unit(model, UNIT)
+        turn_camera(mapper, camera, 6.0)
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is not None
     names = [c.name for c in simulated.drive.cameras]
     assert set(result.voted_out) in ({names[1], names[2]}, {names[0], names[3]})
@@ -100,15 +102,15 @@ def test_two_cameras_against_two() -> None:
 
 def test_all_cameras_but_one_are_covered() -> None:
     """What covers them shows points that fit no pose of the unit; they have no vote, and are not called wrong."""
-    simulated, model = scene()
+    simulated, mapper = scene()
     names = [c.name for c in simulated.drive.cameras]
     rng = np.random.default_rng(3)
-    rows = model.rows_of_unit[UNIT]
-    nonsense = rows[model.keypoints.camera[rows] != 0]
-    model.keypoints.xy_px[nonsense] = rng.uniform(0, 1, (len(nonsense), 2)) * [960, 540]
-    keep = np.concatenate([rows[model.keypoints.camera[rows] == 0], nonsense[::2]])
-    model.rows_of_unit[UNIT] = np.sort(keep)
-    result = register_unit(model, UNIT)
+    rows = mapper.rows_of_unit[UNIT]
+    nonsense = rows[mapper.keypoints.camera[rows] != 0]
+    mapper.keypoints.xy_px[nonsense] = rng.uniform(0, 1, (len(nonsense), 2)) * [960, 540]
+    keep = np.concatenate([rows[mapper.keypoints.camera[rows] == 0], nonsense[::2]])
+    mapper.rows_of_unit[UNIT] = np.sort(keep)
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is not None
     position_m, rotation_deg = errors(result.world_from_rig, simulated)
     assert 1e-5 < position_m < 0.15
@@ -118,22 +120,22 @@ def test_all_cameras_but_one_are_covered() -> None:
 
 
 def test_wrong_correspondences_are_outvoted() -> None:
-    simulated, model = scene()
+    simulated, mapper = scene()
     rng = np.random.default_rng(0)
-    rows = model.rows_of_unit[UNIT]
+    rows = mapper.rows_of_unit[UNIT]
     wrong = rng.choice(rows, int(0.4 * len(rows)), replace=False)
-    model.keypoints.xy_px[wrong] = rng.uniform(0, 1, (len(wrong), 2)) * [960, 540]
-    result = register_unit(model, UNIT)
+    mapper.keypoints.xy_px[wrong] = rng.uniform(0, 1, (len(wrong), 2)) * [960, 540]
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is not None
     assert errors(result.world_from_rig, simulated)[0] < 0.05
     assert 0.5 < result.inliers / result.correspondences < 0.72
 
 
 def test_too_few_points_are_a_reason_not_an_error() -> None:
-    _, model = scene(hidden=lambda unit, camera: unit == UNIT and camera != 2)
-    rows = model.rows_of_unit[UNIT]
-    model.solved[model.tracks.of_keypoint[rows[10:]]] = False
-    result = register_unit(model, UNIT)
+    _, mapper = scene(hidden=lambda unit, camera: unit == UNIT and camera != 2)
+    rows = mapper.rows_of_unit[UNIT]
+    mapper.triangulated[mapper.tracks.of_keypoint[rows[10:]]] = False
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is None
     assert result.method == "none"
     assert result.correspondences <= 10
@@ -142,19 +144,19 @@ def test_too_few_points_are_a_reason_not_an_error() -> None:
 
 
 def test_points_that_fit_no_pose_are_a_reason() -> None:
-    _, model = scene()
+    _, mapper = scene()
     rng = np.random.default_rng(1)
-    rows = model.rows_of_unit[UNIT]
-    model.keypoints.xy_px[rows] = rng.uniform(0, 1, (len(rows), 2)) * [960, 540]
-    result = register_unit(model, UNIT)
+    rows = mapper.rows_of_unit[UNIT]
+    mapper.keypoints.xy_px[rows] = rng.uniform(0, 1, (len(rows), 2)) * [960, 540]
+    result = register_unit(mapper, UNIT)
     assert result.world_from_rig is None
     assert "agree with one pose" in result.reason
     assert result.inliers < 0.2 * result.correspondences
 
 
 def test_registration_is_repeatable() -> None:
-    _, model = scene()
-    a, b = register_unit(model, UNIT), register_unit(model, UNIT)
+    _, mapper = scene()
+    a, b = register_unit(mapper, UNIT), register_unit(mapper, UNIT)
     assert a.world_from_rig is not None
     np.testing.assert_array_equal(a.world_from_rig, b.world_from_rig)
 
@@ -162,7 +164,7 @@ def test_registration_is_repeatable() -> None:
 def test_poses_go_to_pycolmap_and_back() -> None:
     pose = se3.transform(se3.exp_so3([0.1, -2.0, 0.4]), [1.0, 2.0, 3.0])
     np.testing.assert_allclose(matrix_of(rigid3d(pose)), pose, atol=1e-12)
-    simulated, model = scene(cameras=2, points=300)
-    cameras = cameras_of(model)
+    simulated, mapper = scene(cameras=2, points=300)
+    cameras = cameras_of(mapper)
     assert [c.model.name for c in cameras] == ["PINHOLE"] * 2
     np.testing.assert_allclose(cameras[1].params, simulated.truth.camera_params[1])

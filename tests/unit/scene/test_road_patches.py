@@ -58,7 +58,7 @@ def test_roads_above_one_another() -> None:
 
 def test_thickness() -> None:
     distance = np.random.default_rng(0).normal(0.5, 0.02, 20_000)
-    thickness = Thickness.of(np.append(distance, np.nan))
+    thickness = Thickness.from_distances(np.append(distance, np.nan))
     assert 0.0 < abs(thickness.range90_m - 2 * 1.645 * 0.02) < 0.002
     assert 0.0 < abs(thickness.spread_m - 0.02) < 0.001
-    assert np.isnan(Thickness.of(np.full(3, np.nan)).range90_m)
+    assert np.isnan(Thickness.from_distances(np.full(3, np.nan)).range90_m)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.scene.drive import Drive
-from mrasfm_engine.scene.row_bands import MAX_BAND_S, MAX_BANDS, Shots
+from mrasfm_engine.scene.row_bands import MAX_BAND_S, MAX_BANDS, RowBands
 from tests.helpers.simulated_drive import make_drive
 
 HEIGHT = 540
@@ -15,40 +15,40 @@ def drive(*, units: int = 3, **fields: object) -> Drive:
     return make_drive(poses, params, units=units, **fields)  # type: ignore[arg-type]
 
 
-def test_without_readout_and_skew_shots_are_images() -> None:
-    shots = Shots.of(drive())
-    assert shots.simultaneous
-    np.testing.assert_array_equal(shots.image, np.arange(6))
-    np.testing.assert_array_equal(shots.middle_of_image, np.arange(6))
-    np.testing.assert_array_equal(shots.unit, [0, 0, 1, 1, 2, 2])
-    np.testing.assert_array_equal(shots.camera, [0, 1] * 3)
-    np.testing.assert_array_equal(shots.of_rows(np.array([2, 5]), np.array([10.0, 500.0])), [2, 5])
+def test_without_readout_and_skew_bands_are_images() -> None:
+    bands = RowBands.from_drive(drive())
+    assert bands.simultaneous
+    np.testing.assert_array_equal(bands.image, np.arange(6))
+    np.testing.assert_array_equal(bands.middle_of_image, np.arange(6))
+    np.testing.assert_array_equal(bands.unit, [0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(bands.camera, [0, 1] * 3)
+    np.testing.assert_array_equal(bands.of_rows(np.array([2, 5]), np.array([10.0, 500.0])), [2, 5])
 
 
 def test_images_have_the_offsets_of_their_timestamps() -> None:
     recorded = drive(time_offset_us=[12_000, -40_000])
-    shots = Shots.of(recorded)
-    np.testing.assert_allclose(shots.time_offset_s, [0.012, -0.04] * 3)
-    assert Shots.of(recorded, compensate=False).simultaneous
+    bands = RowBands.from_drive(recorded)
+    np.testing.assert_allclose(bands.time_offset_s, [0.012, -0.04] * 3)
+    assert RowBands.from_drive(recorded, compensate=False).simultaneous
 
 
 @pytest.mark.parametrize("readout_us", [200, 5_000, 17_300, 30_000])
 def test_rows_are_cut_into_short_bands_about_the_images_timestamp(readout_us: int) -> None:
-    shots = Shots.of(drive(time_offset_us=[0, 20_000], readout_us=readout_us))
-    bands = np.diff(shots.first_of_image)
+    bands = RowBands.from_drive(drive(time_offset_us=[0, 20_000], readout_us=readout_us))
+    bands = np.diff(bands.first_of_image)
     assert len(set(bands.tolist())) == 1
     assert bands[0] % 2 == 1
     assert readout_us / 1e6 / bands[0] <= MAX_BAND_S
-    np.testing.assert_allclose(shots.time_offset_s[shots.middle_of_image], [0.0, 0.02] * 3, atol=1e-12)
+    np.testing.assert_allclose(bands.time_offset_s[bands.middle_of_image], [0.0, 0.02] * 3, atol=1e-12)
     rows = np.linspace(0.5, HEIGHT - 0.5, 200)
-    own = shots.of_rows(np.full(200, 3), rows)
-    assert (shots.image[own] == 3).all()
+    own = bands.of_rows(np.full(200, 3), rows)
+    assert (bands.image[own] == 3).all()
     expected = 0.02 + (rows / HEIGHT - 0.5) * readout_us / 1e6
-    assert 0 < np.abs(shots.time_offset_s[own] - expected).max() <= 0.5 * MAX_BAND_S + 1e-9
+    assert 0 < np.abs(bands.time_offset_s[own] - expected).max() <= 0.5 * MAX_BAND_S + 1e-9
     # Rounding may put a keypoint on the edge of the image or just outside.
-    edge = shots.of_rows(np.array([3, 3]), np.array([-0.4, HEIGHT + 0.4]))
-    assert edge.tolist() == [shots.first_of_image[3], shots.first_of_image[4] - 1]
+    edge = bands.of_rows(np.array([3, 3]), np.array([-0.4, HEIGHT + 0.4]))
+    assert edge.tolist() == [bands.first_of_image[3], bands.first_of_image[4] - 1]
 
 
 def test_the_number_of_bands_is_bounded() -> None:
-    assert np.diff(Shots.of(drive(readout_us=200_000)).first_of_image).tolist() == [MAX_BANDS] * 6
+    assert np.diff(RowBands.from_drive(drive(readout_us=200_000)).first_of_image).tolist() == [MAX_BANDS] * 6

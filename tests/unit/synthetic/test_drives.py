@@ -259,8 +259,8 @@ def test_calibration_is_off_by_the_asked_norms() -> None:
         perturb_rotation_deg=0.8,
         perturb_translation_m=0.05,
         declare_sigmas=True,
-        wrong_camera="back",
-        wrong_by_deg=3.0,
+        miscalibrated_camera="back",
+        miscalibrated_by_deg=3.0,
     )
     given = given_cameras(options, rig, np.random.default_rng(0))
     for true, camera in zip(rig, given, strict=True):
@@ -334,7 +334,7 @@ def test_several_drives_share_one_world(tmp_path: Path) -> None:
         {"drop_images": 1.5},
         {"time_skew_ms": 100.0},
         {"occluded_cameras": ("nowhere",)},
-        {"wrong_camera": "nowhere"},
+        {"miscalibrated_camera": "nowhere"},
         {"world": World.LOOP, "units": 40},
         {"tight": True, "perturb_rotation_deg": 1.0},
         {"standing_units": 30},

@@ -18,7 +18,7 @@ def keypoints_of(per_image: list[int]) -> Keypoints:
         image=image,
         unit=image,
         camera=np.zeros(n, dtype=np.int64),
-        shot=image,
+        band=image,
         xy_px=np.zeros((n, 2)),
         rays=np.tile([0.0, 0, 1], (n, 1)),
     )
@@ -89,7 +89,7 @@ def test_random_matches_never_put_two_keypoints_of_an_image_together(seed: int) 
 
 def test_pitfall_7_planted_wrong_matches_do_not_merge_everything() -> None:
     simulated = make_simulated_drive(units=6, cameras=2, points=500, clutter=20)
-    keypoints = Keypoints.of(simulated.drive, simulated.features)
+    keypoints = Keypoints.from_features(simulated.drive, simulated.features)
     truth = np.concatenate(simulated.point_of_keypoint)
     purity = {}
     for wrong in (0, 3):
@@ -125,7 +125,7 @@ def test_keypoints_line_up_images_and_their_rays() -> None:
     simulated = make_simulated_drive(
         units=2, cameras=3, points=200, hidden=lambda unit, camera: (unit, camera) == (0, 1)
     )
-    keypoints = Keypoints.of(simulated.drive, simulated.features)
+    keypoints = Keypoints.from_features(simulated.drive, simulated.features)
     assert keypoints.first[2] == keypoints.first[1]  # an image without keypoints
     for i, (image, f) in enumerate(zip(simulated.drive.images, simulated.features, strict=True)):
         rows = slice(keypoints.first[i], keypoints.first[i + 1])

@@ -24,8 +24,8 @@ class Setting:
     tracks: Tracks
     triangulator: Triangulator
     points_m: np.ndarray
-    solved: np.ndarray
-    kept: np.ndarray
+    triangulated: np.ndarray
+    is_inlier: np.ndarray
 
     def run(self, registered: np.ndarray | None = None) -> None:
         units = len(self.state.unit_rotation)
@@ -35,8 +35,8 @@ class Setting:
             np.ones(units, dtype=np.bool_) if registered is None else registered,
             which=np.arange(len(self.tracks), dtype=np.int64),
             points_m=self.points_m,
-            solved=self.solved,
-            kept=self.kept,
+            triangulated=self.triangulated,
+            is_inlier=self.is_inlier,
         )
 
 
@@ -80,7 +80,7 @@ def setting(
         image=image,
         unit=image,
         camera=np.zeros(len(image), dtype=np.int64),
-        shot=image,
+        band=image,
         xy_px=flat,
         rays=unproject_pixels(kind, params, flat),
     )
@@ -117,8 +117,8 @@ def test_exact_points_are_recovered(kind: int, params: np.ndarray) -> None:
     points = some_points()
     s = setting(points, kind=kind, params=params)
     s.run()
-    assert s.solved.all()
-    assert s.kept.all()
+    assert s.triangulated.all()
+    assert s.is_inlier.all()
     np.testing.assert_allclose(s.points_m, points, atol=1e-4)
 
 
@@ -126,9 +126,9 @@ def test_noise_leaves_the_error_that_it_should() -> None:
     points = some_points(200)
     s = setting(points, noise_px=0.5)
     s.run()
-    assert s.solved.mean() > 0.98
-    assert s.kept.mean() > 0.98
-    off = np.linalg.norm(s.points_m - points, axis=1)[s.solved]
+    assert s.triangulated.mean() > 0.98
+    assert s.is_inlier.mean() > 0.98
+    off = np.linalg.norm(s.points_m - points, axis=1)[s.triangulated]
     assert 0.01 < np.median(off) < 0.3
 
 
@@ -137,10 +137,10 @@ def test_an_outlier_is_dropped_and_the_point_stays(wrong_unit: int) -> None:
     points = some_points(20)
     s = setting(points, move={(p, wrong_unit): (40.0, -25.0) for p in range(20)})
     s.run()
-    assert s.solved.all()
-    kept = s.kept.reshape(6, 20)
-    assert not kept[wrong_unit].any()
-    assert np.delete(kept, wrong_unit, axis=0).mean() > 0.98
+    assert s.triangulated.all()
+    is_inlier = s.is_inlier.reshape(6, 20)
+    assert not is_inlier[wrong_unit].any()
+    assert np.delete(is_inlier, wrong_unit, axis=0).mean() > 0.98
     np.testing.assert_allclose(s.points_m, points, atol=0.05)
 
 
@@ -150,35 +150,35 @@ def test_two_of_six_wrong_ones_are_outvoted() -> None:
     s = setting(points, move=move)
     s.run()
     right = np.linalg.norm(s.points_m - points, axis=1) < 0.1
-    assert (s.solved & right).sum() >= 18
+    assert (s.triangulated & right).sum() >= 18
 
 
 def test_too_small_an_angle_gives_no_point() -> None:
     far = np.array([[400.0, 5.0, 3.0], [450.0, -3.0, 6.0]])
     s = setting(far)
     s.run()
-    assert not s.solved.any()
-    assert not s.kept.any()
+    assert not s.triangulated.any()
+    assert not s.is_inlier.any()
     near = setting(some_points(10))
     near.run()
-    assert near.solved.all()
+    assert near.triangulated.all()
     strict = setting(some_points(10), min_angle_deg=45.0)
     strict.run()
-    assert not strict.solved.any()
+    assert not strict.triangulated.any()
 
 
 def test_pitfall_6_a_standing_car_gives_no_points() -> None:
     s = setting(some_points(20), step_m=0.0, noise_px=0.3)
     s.state.unit_position_m[:] = 0.0
     s.run()
-    assert not s.solved.any()
+    assert not s.triangulated.any()
 
 
 def test_behind_the_camera_there_is_no_point() -> None:
     # Rays that meet behind the cameras: what a mirrored match looks like.
     s = setting(some_points(20) * [-1.0, 1.0, 1.0])
     s.run()
-    assert not s.solved.any()
+    assert not s.triangulated.any()
 
 
 def test_only_registered_units_take_part() -> None:
@@ -186,13 +186,13 @@ def test_only_registered_units_take_part() -> None:
     s = setting(points, move={(p, 2): (100.0, 100.0) for p in range(15)})
     registered = np.array([True, True, False, True, False, True])
     s.run(registered)
-    assert s.solved.all()
-    kept = s.kept.reshape(6, 15)
-    assert kept[registered].all()
-    assert not kept[~registered].any()
+    assert s.triangulated.all()
+    is_inlier = s.is_inlier.reshape(6, 15)
+    assert is_inlier[registered].all()
+    assert not is_inlier[~registered].any()
     s.run(np.array([True, False, False, False, False, False]))
-    assert not s.solved.any()
-    assert not s.kept.any()
+    assert not s.triangulated.any()
+    assert not s.is_inlier.any()
 
 
 def test_tracks_not_asked_for_are_left_alone() -> None:
@@ -204,11 +204,11 @@ def test_tracks_not_asked_for_are_left_alone() -> None:
         np.ones(6, dtype=np.bool_),
         which=np.array([2, 7], dtype=np.int64),
         points_m=s.points_m,
-        solved=s.solved,
-        kept=s.kept,
+        triangulated=s.triangulated,
+        is_inlier=s.is_inlier,
     )
-    assert np.flatnonzero(s.solved).tolist() == [2, 7]
-    assert sorted(set(s.tracks.of_keypoint[s.kept].tolist())) == [2, 7]
+    assert np.flatnonzero(s.triangulated).tolist() == [2, 7]
+    assert sorted(set(s.tracks.of_keypoint[s.is_inlier].tolist())) == [2, 7]
     assert np.isnan(s.points_m[[0, 1, 3]]).all()
 
 
@@ -217,9 +217,9 @@ def test_long_tracks_of_many_images_are_solved(units: int) -> None:
     points = some_points(30) + np.array([30.0, 0.0, 0.0])
     s = setting(points, units=units, step_m=40.0 / units, noise_px=0.3)
     s.run()
-    assert s.solved.all()
+    assert s.triangulated.all()
     assert 1e-4 < np.median(np.linalg.norm(s.points_m - points, axis=1)) < 0.3
-    assert s.kept.reshape(units, 30).sum(0).min() > 0.8 * min(units, 256)
+    assert s.is_inlier.reshape(units, 30).sum(0).min() > 0.8 * min(units, 256)
 
 
 def test_errors_px_agree_with_projection() -> None:
