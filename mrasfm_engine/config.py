@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mrasfm_engine.errors import InputError
+from schemas.methods import ExtractorName, MatcherName
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
@@ -28,7 +29,7 @@ class _Section(BaseModel):
 class FeatureConfig(_Section):
     """Extraction of keypoints."""
 
-    extractor: Literal["sift", "superpoint", "aliked", "xfeat"] = Field(
+    extractor: ExtractorName = Field(
         "sift", description="every extractor but `sift` needs a model, see `mrasfm models list`"
     )
     model: str | None = Field(
@@ -83,7 +84,7 @@ class PairConfig(_Section):
 class MatchConfig(_Section):
     """Matching of image pairs and verification of the matches."""
 
-    matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] = Field(
+    matcher: MatcherName = Field(
         "nearest", description="every matcher but `nearest` needs a model, see `mrasfm models list`"
     )
     model: str | None = Field(

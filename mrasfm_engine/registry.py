@@ -1,4 +1,6 @@
-"""Which extractor, matcher and segmenter a configuration asks for, checked and loaded before any work.
+"""The extractor, matcher and segmenter of a configuration, checked and loaded before any work.
+
+`schemas.methods` is the table of extractors and matchers.
 
 | features.extractor | matching.matcher |
 |---|---|
@@ -10,48 +12,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from mrasfm_engine.config import EngineConfig, FeatureConfig, MatchConfig
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.features.extraction import Extractor, SiftExtractor
-from mrasfm_engine.features.learned_extractors import (
-    AlikedDetector,
-    Detector,
-    LearnedExtractor,
-    SuperPointDetector,
-    XFeatDetector,
-)
+from mrasfm_engine.features.extraction import Extractor
 from mrasfm_engine.features.segmentation import OnnxSegmenter, Segmenter
-from mrasfm_engine.learned import signatures
-from mrasfm_engine.learned.catalogue import CATALOGUE, default_model
+from mrasfm_engine.learned.catalogue import LearnedMethod, Method, default_model, known_models
 from mrasfm_engine.learned.model_folder import InstalledModel, ModelFolder, default_folder
 from mrasfm_engine.learned.network import Network
-from mrasfm_engine.matching.learned_matchers import (
-    ColmapLightGlueMatcher,
-    LearnedMatcher,
-    LighterGlueMatcher,
-    LightGlueMatcher,
-    SuperGlueMatcher,
-)
-from mrasfm_engine.matching.nearest_neighbour import Matcher, NearestNeighbourMatcher
+from mrasfm_engine.matching.pair_matching import Matcher
 from schemas import LabelMap
-
-_DETECTORS: dict[str, Callable[[Network], Detector]] = {
-    "xfeat": XFeatDetector,
-    "aliked": AlikedDetector,
-    "superpoint": SuperPointDetector,
-}
-# By signature: one method has been exported in several ways.
-_MATCHERS: dict[signatures.Signature, type[LearnedMatcher]] = {
-    signatures.LIGHTERGLUE: LighterGlueMatcher,
-    signatures.LIGHTGLUE: LightGlueMatcher,
-    signatures.LIGHTGLUE_COLMAP: ColmapLightGlueMatcher,
-    signatures.SUPERGLUE: SuperGlueMatcher,
-}
+from schemas.methods import EXTRACTORS, MATCHERS
 
 
 @dataclass(frozen=True)
@@ -104,26 +79,40 @@ def load_components(config: EngineConfig, label_map: LabelMap | None) -> Compone
         Where extractor and matcher do not go together, or a model is missing, damaged, or not what the settings say.
     """
     require_compatible(config.features, config.matching)
-    folder = ModelFolder(config.models.folder or default_folder())
-    load = partial(_load, folder, gpu=config.models.gpu)
+    load = partial(_load, ModelFolder(config.models.folder or default_folder()), gpu=config.models.gpu)
     models: dict[str, LoadedModel] = {}
-    extractor: Extractor = SiftExtractor(config.features)
-    matcher: Matcher = NearestNeighbourMatcher(config.matching)
-    segmenter: Segmenter | None = None
-    method = config.features.extractor
-    if method != "sift":
-        loaded = load("features.model", config.features.model, method, method)
-        models["extractor"] = loaded
-        extractor = LearnedExtractor(_DETECTORS[method](loaded.network), config.features)
-    if config.matching.matcher != "nearest":
-        loaded = load("matching.model", config.matching.model, config.matching.matcher, method)
+    descriptors = config.features.extractor
+    extracting = extractor_method(descriptors)
+    if isinstance(extracting, LearnedMethod):
+        loaded = models["extractor"] = load("features.model", config.features.model, descriptors, descriptors)
+        extractor = extracting.build(config.features, loaded.network, loaded.installed.known)
+    else:
+        extractor = extracting.build(config.features)
+    matching = matcher_method(config.matching.matcher)
+    if isinstance(matching, LearnedMethod):
+        loaded = load("matching.model", config.matching.model, config.matching.matcher, descriptors)
         models["matcher"] = loaded
-        matcher = _MATCHERS[loaded.installed.known.signature](loaded.network, config.matching)
+        matcher = matching.build(config.matching, loaded.network, loaded.installed.known)
+    else:
+        matcher = matching.build(config.matching)
+    segmenter: Segmenter | None = None
     if config.semantics.model is not None:
-        loaded = load("semantics.model", config.semantics.model, "segmenter", None)
-        models["segmenter"] = loaded
+        loaded = models["segmenter"] = load("semantics.model", config.semantics.model, "segmenter", None)
         segmenter = OnnxSegmenter(loaded.network, label_map)
     return Components(extractor, matcher, segmenter, models)
+
+
+def extractor_method(name: str) -> Method[FeatureConfig, Extractor] | LearnedMethod[FeatureConfig, Extractor]:
+    """Import the extractor of a name of `schemas.methods`."""
+    method: Method[FeatureConfig, Extractor] | LearnedMethod[FeatureConfig, Extractor]
+    method = import_module(EXTRACTORS[name]).METHOD
+    return method
+
+
+def matcher_method(name: str) -> Method[MatchConfig, Matcher] | LearnedMethod[MatchConfig, Matcher]:
+    """Import the matcher of a name of `schemas.methods`."""
+    method: Method[MatchConfig, Matcher] | LearnedMethod[MatchConfig, Matcher] = import_module(MATCHERS[name]).METHOD
+    return method
 
 
 def require_compatible(feature_config: FeatureConfig, match_config: MatchConfig) -> None:
@@ -134,26 +123,29 @@ def require_compatible(feature_config: FeatureConfig, match_config: MatchConfig)
     InputError
         That names both settings.
     """
-    for section, what, choice in (
-        ("features", feature_config.model, feature_config.extractor),
-        ("matching", match_config.model, match_config.matcher),
+    extractor, matcher = feature_config.extractor, match_config.matcher
+    for section, model, setting, needs_model in (
+        ("features", feature_config.model, f'extractor = "{extractor}"', _needs_model(extractor_method(extractor))),
+        ("matching", match_config.model, f'matcher = "{matcher}"', _needs_model(matcher_method(matcher))),
     ):
-        if what is not None and choice in ("sift", "nearest"):
-            name = "extractor" if section == "features" else "matcher"
+        if model is not None and not needs_model:
             raise InputError(
-                f'{section}.model = "{what}" is given, but {section}.{name} = "{choice}" needs no model',
-                remedy=f"Set {section}.{name}, or leave out {section}.model.",
+                f'{section}.model = "{model}" is given, but {section}.{setting} needs no model',
+                remedy=f"Set {section}.{setting.split()[0]}, or leave out {section}.model.",
                 code="bad-settings",
             )
-    if match_config.matcher == "nearest" or default_model(match_config.matcher, feature_config.extractor) is not None:
+    if not _needs_model(matcher_method(matcher)) or default_model(matcher, extractor) is not None:
         return
-    partners = sorted({m.descriptors for m in CATALOGUE if m.method == match_config.matcher and m.descriptors})
+    partners = sorted({m.descriptors for m in known_models() if m.method == matcher and m.descriptors})
     raise InputError(
-        f'matching.matcher = "{match_config.matcher}" was not trained on the descriptors of '
-        f'features.extractor = "{feature_config.extractor}"',
+        f'matching.matcher = "{matcher}" was not trained on the descriptors of features.extractor = "{extractor}"',
         remedy=f"Set features.extractor to {' or '.join(partners)}, or matching.matcher to nearest.",
         code="bad-settings",
     )
+
+
+def _needs_model(method: object) -> bool:
+    return isinstance(method, LearnedMethod)
 
 
 def _load(

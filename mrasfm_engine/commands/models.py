@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 from rich.table import Table
 
-from mrasfm_engine.learned.catalogue import CATALOGUE, KnownModel, known_model
+from mrasfm_engine.learned.catalogue import KnownModel, known_model, known_models
 from mrasfm_engine.learned.download import pull
 from mrasfm_engine.learned.model_folder import InstalledModel, ModelFolder, default_folder
 
@@ -50,7 +50,7 @@ def run_list(arguments: argparse.Namespace) -> int:
     """Print every known model and every one of the user's own."""
     folder = _folder(arguments)
     installed = {model.name: model for model in folder.installed()}
-    names = [model.name for model in CATALOGUE]
+    names = [model.name for model in known_models()]
     names += [name for name in installed if name not in names]
     rows = [_row(name, installed.get(name)) for name in names]
     if arguments.json:

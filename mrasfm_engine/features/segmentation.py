@@ -8,9 +8,29 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.learned.catalogue import KnownModel
 from mrasfm_engine.learned.network import STRIDE_PX, Network
+from mrasfm_engine.learned.signatures import UINT8, ModelKind, Signature, Tensor, float_tensor
 from mrasfm_engine.types import Bytes
 from schemas import LabelMap
+
+# Any network for semantic segmentation: image RGB 0..1, ids of the drive's label map a pixel.
+SIGNATURE = Signature(
+    inputs=(float_tensor("image", 1, 3, "H", "W"),),
+    outputs=(Tensor("classes", (UINT8,), (1, "H", "W")),),
+)
+MODELS = (
+    KnownModel(
+        name="segmenter",
+        kind=ModelKind.SEGMENTER,
+        method="segmenter",
+        descriptors=None,
+        signature=SIGNATURE,
+        licence="that of the file",
+        commercial_use=None,
+        source="an export of your own",
+    ),
+)
 
 
 class Segmenter(Protocol):

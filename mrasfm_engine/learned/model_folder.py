@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.errors import InputError, StorageError
-from mrasfm_engine.learned.catalogue import CATALOGUE, KnownModel, by_sha256, known_model
+from mrasfm_engine.learned import catalogue
+from mrasfm_engine.learned.catalogue import KnownModel, by_sha256, known_model
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.learned.onnx_file import read_model, sha256_of
 from mrasfm_engine.learned.signatures import Signature
@@ -183,7 +184,7 @@ class ModelFolder:
 
 def how_to_get(name: str) -> str:
     """What to do where a model is missing."""
-    known = next((model for model in CATALOGUE if model.name == name), None)
+    known = next((model for model in catalogue.known_models() if model.name == name), None)
     if known is None:
         return "`mrasfm models list` shows what is there; `mrasfm models add FILE --name NAME` adds one."
     if known.url is not None:
@@ -194,7 +195,7 @@ def how_to_get(name: str) -> str:
 def _recognise(data: bytes, sha256: str, name: str | None, what: str) -> KnownModel:
     """Which model of the catalogue these bytes are or can stand for."""
     published = by_sha256(sha256)
-    named = next((model for model in CATALOGUE if model.name == name), None)
+    named = next((model for model in catalogue.known_models() if model.name == name), None)
     if named is not None and named.is_published and published is not named:
         raise InputError(
             f"{what} is not {name}: SHA-256 {named.sha256} is expected, {sha256} was found",
@@ -203,7 +204,9 @@ def _recognise(data: bytes, sha256: str, name: str | None, what: str) -> KnownMo
         )
     # By hash alone a model would be accepted that this runtime cannot run.
     signature = Network(name or what, data, gpu=False).signature
-    candidates = [named] if named is not None else [published] if published is not None else list(CATALOGUE)
+    candidates = (
+        [named] if named is not None else [published] if published is not None else list(catalogue.known_models())
+    )
     fitting = [model for model in candidates if not model.signature.mismatches(signature)]
     if not fitting:
         raise _unlike(what, candidates, signature)

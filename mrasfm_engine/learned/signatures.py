@@ -77,79 +77,9 @@ def _fits(expected: Tensor, found: Tensor) -> bool:
     )
 
 
-F32, I64, U8 = "float32", "int64", "uint8"
+FLOAT32, INT64, UINT8 = "float32", "int64", "uint8"
 
 
-def _f32(name: str, *shape: str | int) -> Tensor:
-    return Tensor(name, (F32,), shape)
-
-
-# XFeat (Potje et al., CVPR 2024) as exported by noahzhy/xfeat_lightglue_onnx: image RGB 0..1, keypoints in pixels.
-XFEAT = Signature(
-    inputs=(_f32("images", 1, 3, "H", "W"),),
-    outputs=(_f32("keypoints", "K", 2), _f32("descriptors", "K", 64), _f32("scores", "K")),
-)
-# LighterGlue of the same repository; keypoints as LightGlue was trained, (xy - size / 2) / (max(size) / 2).
-LIGHTERGLUE = Signature(
-    inputs=(
-        _f32("kpts0", 1, "N0", 2),
-        _f32("kpts1", 1, "N1", 2),
-        _f32("desc0", 1, "N0", 64),
-        _f32("desc1", 1, "N1", 64),
-    ),
-    outputs=(Tensor("matches", (I64,), ("M", 2)), _f32("scores", "M")),
-)
-# ALIKED (Zhao et al., TIM 2023) as COLMAP publishes it: image RGB 0..1, sides multiples of 32, keypoints in -1..1.
-ALIKED = Signature(
-    inputs=(
-        _f32("image", 1, 3, "H", "W"),
-        Tensor("max_keypoints", (I64,), ()),
-        _f32("min_score"),
-    ),
-    outputs=(_f32("keypoints", 1, "K", 2), _f32("descriptors", 1, "K", "D"), _f32("scores", 1, "K")),
-)
-# LightGlue (Lindenberger et al., ICCV 2023) as COLMAP publishes it: keypoints in pixels, matches0 -1 where none.
-LIGHTGLUE_COLMAP = Signature(
-    inputs=(
-        _f32("kpts0", 1, "N0", 2),
-        _f32("kpts1", 1, "N1", 2),
-        _f32("desc0", 1, "N0", "D"),
-        _f32("desc1", 1, "N1", "D"),
-        _f32("image_size0", 1, 2),
-        _f32("image_size1", 1, 2),
-    ),
-    outputs=(Tensor("matches0", (I64, F32), ("N0",)), _f32("mscores0", "N0")),
-)
-# SuperPoint (DeTone et al., CVPRW 2018) as exported by fabio-sim/LightGlue-ONNX: gray 0..1, keypoints in pixels.
-SUPERPOINT = Signature(
-    inputs=(_f32("image", 1, 1, "H", "W"),),
-    outputs=(Tensor("keypoints", (I64, F32), (1, "K", 2)), _f32("scores", 1, "K"), _f32("descriptors", 1, "K", 256)),
-)
-# LightGlue of the same repository; keypoints normalised as above.
-LIGHTGLUE = Signature(
-    inputs=(
-        _f32("kpts0", 1, "N0", 2),
-        _f32("kpts1", 1, "N1", 2),
-        _f32("desc0", 1, "N0", 256),
-        _f32("desc1", 1, "N1", 256),
-    ),
-    outputs=(Tensor("matches0", (I64,), ("M", 2)), _f32("mscores0", "M")),
-)
-# SuperGlue (Sarlin et al., CVPR 2020) as exported by yuefanhao/SuperPoint-SuperGlue-TensorRT and used by AirSLAM:
-# keypoints (xy - size / 2) / (0.7 max(size)), descriptors by column, logarithms of the assignment with its dustbins.
-SUPERGLUE = Signature(
-    inputs=(
-        _f32("keypoints_0", 1, "N0", 2),
-        _f32("scores_0", 1, "N0"),
-        _f32("descriptors_0", 1, 256, "N0"),
-        _f32("keypoints_1", 1, "N1", 2),
-        _f32("scores_1", 1, "N1"),
-        _f32("descriptors_1", 1, 256, "N1"),
-    ),
-    outputs=(_f32("scores", 1, "N0+1", "N1+1"),),
-)
-# Any network for semantic segmentation: image RGB 0..1, ids of the drive's label map a pixel.
-SEGMENTER = Signature(
-    inputs=(_f32("image", 1, 3, "H", "W"),),
-    outputs=(Tensor("classes", (U8,), (1, "H", "W")),),
-)
+def float_tensor(name: str, *shape: str | int) -> Tensor:
+    """Declare a tensor of 32 bit floats."""
+    return Tensor(name, (FLOAT32,), shape)

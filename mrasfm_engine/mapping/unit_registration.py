@@ -187,7 +187,7 @@ def _spread(count: int, limit: int) -> Ints:
 def cameras_of(mapper: Mapper) -> list[pycolmap.Camera]:
     """The cameras with their current intrinsics, as pycolmap takes them."""
     return [
-        pycolmap.Camera(mapper=c.model, width=c.width, height=c.height, params=unpack_camera(c.model, params))
+        pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=unpack_camera(c.model, params))
         for c, params in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
     ]
 

@@ -1,27 +1,16 @@
-"""Matches between the descriptors of two images."""
+"""Nearest neighbours of descriptors: needs no model."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints32
-
-
-class Matcher(Protocol):
-    """Matches two images' features."""
-
-    def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Any:
-        """What the matcher needs of one image of width x height pixels, computed once."""
-        ...
-
-    def match(self, a: Any, b: Any) -> Ints32:
-        """Pairs (m, 2) of keypoint indices of two prepared images."""
-        ...
 
 
 @njit(cache=True, nogil=True)
@@ -70,3 +59,6 @@ class NearestNeighbourMatcher:
             return np.zeros((0, 2), np.int32)
         result: Ints32 = _mutual_ratio(a @ b.T, self._ratio2)
         return result
+
+
+METHOD = Method[MatchConfig, NearestNeighbourMatcher](build=NearestNeighbourMatcher)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -13,14 +14,25 @@ from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.matching.nearest_neighbour import Matcher
 from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, in_front_of_both
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import may_match
-from mrasfm_engine.types import Cancel, CountProgress, Ints
+from mrasfm_engine.types import Cancel, CountProgress, Ints, Ints32
 
 SIMULTANEOUS_US = 2_000  # cameras less apart than this are one rig: a fast car goes 6 cm
+
+
+class Matcher(Protocol):
+    """Matches two images' features."""
+
+    def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Any:
+        """What the matcher needs of one image of width x height pixels, computed once."""
+        ...
+
+    def match(self, a: Any, b: Any) -> Ints32:
+        """Pairs (m, 2) of keypoint indices of two prepared images."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, StringConstraints
 from pydantic.config import JsonDict
 
 from schemas.api.problems import Problem
 from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_JOB, RequestBody, Resource, Times
+from schemas.methods import ExtractorName, MatcherName
 
 DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
 
@@ -28,10 +29,8 @@ class ReconstructionSettings(RequestBody):
     refine_calibration: bool | None = Field(None, description="rig_from_cam, where the drive makes it observable")
     refine_focal: bool | None = Field(None, description="focal lengths, where rig_from_cam varies too")
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(None, description="of all that is drawn at random")
-    extractor: Literal["sift", "superpoint", "aliked", "xfeat"] | None = Field(
-        None, description="of keypoints; all but sift need a model on the workers"
-    )
-    matcher: Literal["nearest", "superglue", "lightglue", "lighterglue"] | None = Field(
+    extractor: ExtractorName | None = Field(None, description="of keypoints; all but sift need a model on the workers")
+    matcher: MatcherName | None = Field(
         None, description="all but nearest need a model on the workers, trained on the extractor's descriptors"
     )
     segmentation_model: Annotated[str, Field(pattern="^[a-z0-9][a-z0-9._-]{0,63}$")] | None = Field(

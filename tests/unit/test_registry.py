@@ -6,17 +6,14 @@ import pytest
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.features.extraction import SiftExtractor
-from mrasfm_engine.features.learned_extractors import LearnedExtractor
+from mrasfm_engine.features.network_extractor import NetworkExtractor
+from mrasfm_engine.features.sift import SiftExtractor
 from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.learned.onnx_file import sha256_of
-from mrasfm_engine.matching.learned_matchers import (
-    ColmapLightGlueMatcher,
-    LighterGlueMatcher,
-    LightGlueMatcher,
-    SuperGlueMatcher,
-)
+from mrasfm_engine.matching.lighterglue import LighterGlueMatcher
+from mrasfm_engine.matching.lightglue import ColmapLightGlueMatcher, LightGlueMatcher
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
+from mrasfm_engine.matching.superglue import SuperGlueMatcher
 from mrasfm_engine.registry import Components, load_components
 from tests.helpers import learned_graphs
 
@@ -74,7 +71,7 @@ def test_what_goes_together_is_loaded(
         features={"extractor": extractor, "model": model},
         matching={"matcher": matcher, "model": matching_model},
     )
-    assert isinstance(components.extractor, LearnedExtractor)
+    assert isinstance(components.extractor, NetworkExtractor)
     assert isinstance(components.matcher, expected)
     name = model or extractor
     assert components.fingerprint_of("extractor") == {"extractor": sha256_of(GRAPHS[name]())}

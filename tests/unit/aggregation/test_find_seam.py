@@ -156,9 +156,11 @@ def test_lengths_that_differ_are_found_and_refused_beyond_the_limit(
     assert 2.4 < float(strict.reason.split()[-2]) < 3.6
 
 
-def test_without_consensus_nothing_but_the_number_of_points_is_asked(street: Street, folder: Path, a: Driven) -> None:
+def test_without_agreeing_units_nothing_but_the_number_of_points_is_asked(
+    street: Street, folder: Path, a: Driven
+) -> None:
     other = drive_along(street, folder / "loose", WAY_B, scale=1.03, seed=6)
-    seam = seam_of(a, other, configured(max_scale_error=0.01, consensus=False))
+    seam = seam_of(a, other, configured(max_scale_error=0.01, agreeing_units=False))
     assert seam.accepted
     assert seam.quality["units_agreeing"] == 1
 

@@ -293,7 +293,7 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
     first = np.arange(len(assembly.registered)) < 3  # of the first drive's 7 units
 
     def sigmas(free: np.ndarray) -> list[np.ndarray]:
-        found = calibration_priors(assembly, state, free, CONFIG.adjustment)
+        found = calibration_priors(assembly, state, free, CONFIG.bundle_adjustment)
         assert [prior.camera.tolist() for prior in found] == [[0, 1, 2, 3], [4, 5, 6, 7]][: len(found)]
         assert all((prior.held == np.repeat([False, True], 3)).all() for prior in found)
         return [prior.sigma for prior in found]
@@ -301,15 +301,15 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
     (some,), every = sigmas(first), sigmas(assembly.registered)
     np.testing.assert_allclose(some[:, :3], np.radians(0.1) * np.sqrt(7 / 4), rtol=1e-6)
     for sigma in every:
-        np.testing.assert_allclose(sigma[:, :3], np.radians(CONFIG.adjustment.sigma_rotation_deg))
-        np.testing.assert_allclose(sigma[:, 3:], CONFIG.adjustment.sigma_translation_m)
+        np.testing.assert_allclose(sigma[:, :3], np.radians(CONFIG.bundle_adjustment.sigma_rotation_deg))
+        np.testing.assert_allclose(sigma[:, 3:], CONFIG.bundle_adjustment.sigma_translation_m)
     assert len(every) == 2
     assert sigmas(~assembly.registered) == []
     monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8))
     assert len(sigmas(assembly.registered)) == 2
     monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8) - 1)
     assert sigmas(assembly.registered) == []
-    held = CONFIG.adjustment.model_copy(update={"refine_calibration": False})
+    held = CONFIG.bundle_adjustment.model_copy(update={"refine_calibration": False})
     monkeypatch.undo()
     assert calibration_priors(assembly, state, assembly.registered, held) == []
 

@@ -102,7 +102,7 @@ def test_all_scenes_are_adjusted_at_once(drives: list[Driven], seams: list[Seam]
         shift, turn = off(found.first_from_scene[k], truth[k], at)
         assert 0 < shift < 0.015
         assert 0 < turn < 0.1
-    without = adjust_jointly(assembly, start, seams, 1, configured(joint=False), cancel=lambda: False)
+    without = adjust_jointly(assembly, start, seams, 1, configured(multi_scene_adjustment=False), cancel=lambda: False)
     assert without.report is None
     np.testing.assert_array_equal(without.first_from_scene, start)
 

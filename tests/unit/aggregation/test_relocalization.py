@@ -81,7 +81,7 @@ def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, D
     shift, turn = off(found.a_from_b, truth, place(b))
     assert 0 < shift < 0.1
     assert 0 < turn < 0.5
-    alone = asked(two, wrong, consensus=False)
+    alone = asked(two, wrong, agreeing_units=False)
     assert alone.a_from_b is not None
     assert alone.units_agreeing == (3,)
     by = se3.apply(alone.a_from_b, place(b)[None]) - se3.apply(truth, place(b)[None])
@@ -126,7 +126,7 @@ def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Drive
     assert "another is nearly as good" in found.reason
     assert found.runner_up >= 4
     # What repeats for one unit of seven does no harm.
-    found = asked(two, both.of((both.unit == 3) | (np.arange(len(both.unit)) < len(here.unit))))
+    found = asked(two, both.select((both.unit == 3) | (np.arange(len(both.unit)) < len(here.unit))))
     assert found.a_from_b is not None
     assert found.runner_up <= 1
 

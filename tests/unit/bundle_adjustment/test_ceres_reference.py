@@ -19,7 +19,7 @@ from mrasfm_engine.bundle_adjustment.priors import (
     UprightPrior,
 )
 from mrasfm_engine.bundle_adjustment.problem import Layout, RowBandMotion
-from mrasfm_engine.bundle_adjustment.rigid_groups import UnitSets
+from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
@@ -187,19 +187,19 @@ def two_receivers(rng: Rng) -> Problem:
 
 def sets_of_units(rng: Rng) -> Problem:
     problem = problem_at_truth(rng, units=[False] * 2 + [True] * 4, cameras=[False] * 3)
-    sets = UnitSets(of_unit=np.array([-1, -1, 0, 0, 1, 1]), count=2)
+    sets = RigidGroups(of_unit=np.array([-1, -1, 0, 0, 1, 1]), count=2)
     return replace(problem, state=with_sets_moved(problem.state, sets, rng), sets=sets)
 
 
 def sets_of_units_with_positions(rng: Rng) -> Problem:
     """All units belong to sets: nothing but positions and gravity is the gauge."""
     problem = problem_at_truth(rng, units=[True] * 6, cameras=[False] * 3)
-    sets = UnitSets(of_unit=np.array([0, 0, 0, 1, 1, 1]), count=2)
+    sets = RigidGroups(of_unit=np.array([0, 0, 0, 1, 1, 1]), count=2)
     terms = [position_prior(problem.state, rng), upright_prior()]
     return replace(problem, state=with_sets_moved(problem.state, sets, rng), sets=sets, terms=terms)
 
 
-def with_sets_moved(state: State, sets: UnitSets, rng: Rng) -> State:
+def with_sets_moved(state: State, sets: RigidGroups, rng: Rng) -> State:
     """Each set as a rigid body, and all points."""
     poses = state.world_from_rig
     for k in range(sets.count):
@@ -306,7 +306,7 @@ def test_what_colmap_cannot_say_is_refused() -> None:
     with pytest.raises(ValueError, match="unit's timestamp"):
         CeresProblem.of(replace(problem, motion=RowBandMotion.held(np.zeros(1, dtype=np.int64))))
     with pytest.raises(ValueError, match="fixed calibration"):
-        CeresProblem.of(replace(problem, sets=UnitSets(of_unit=np.zeros(UNITS, dtype=np.int64), count=1)))
+        CeresProblem.of(replace(problem, sets=RigidGroups(of_unit=np.zeros(UNITS, dtype=np.int64), count=1)))
     params = problem.state.camera_params.copy()
     params[1, 1] *= 1.001
     with pytest.raises(ValueError, match=r"camera 1: .*fx = fy"):

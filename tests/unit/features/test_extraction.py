@@ -8,7 +8,8 @@ import pytest
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.features.extraction import SiftExtractor, extract_features
+from mrasfm_engine.features.extraction import extract_features
+from mrasfm_engine.features.sift import SiftExtractor
 from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import FeatureConfig
-from mrasfm_engine.features.learned_extractors import (
-    AlikedDetector,
-    Detector,
-    LearnedExtractor,
-    SuperPointDetector,
-    XFeatDetector,
-)
+from mrasfm_engine.features.aliked import AlikedDetector
+from mrasfm_engine.features.network_extractor import Detector, NetworkExtractor
+from mrasfm_engine.features.superpoint import SuperPointDetector
+from mrasfm_engine.features.xfeat import XFeatDetector
 from mrasfm_engine.learned.network import Network
 from tests.helpers import learned_graphs
 
@@ -59,8 +56,8 @@ def aliked_whole() -> Detector:
 ALL = [xfeat_tiles, superpoint_tiles, superpoint_whole, aliked_whole]
 
 
-def extractor(make: MakeDetector, *, spread: bool = False, **settings: float) -> LearnedExtractor:
-    return LearnedExtractor(make(), FeatureConfig(refine=False, spread=spread, **settings))
+def extractor(make: MakeDetector, *, spread: bool = False, **settings: float) -> NetworkExtractor:
+    return NetworkExtractor(make(), FeatureConfig(refine=False, spread=spread, **settings))
 
 
 @pytest.mark.parametrize("make", ALL)

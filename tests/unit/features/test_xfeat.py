@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.learned.model_folder import ModelFolder
-from mrasfm_engine.matching.learned_matchers import LearnedMatcher
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
+from mrasfm_engine.matching.network_matcher import NetworkMatcher
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -150,7 +150,7 @@ def test_lighterglue_gets_the_units_it_was_trained_with(models: Path, shared_dat
         return int(essential_inliers(rays[0][matches[:, 0]], rays[1][matches[:, 1]], max_error=2.0 / FOCAL_PX).sum())
 
     matcher = loaded.matcher
-    assert isinstance(matcher, LearnedMatcher)
+    assert isinstance(matcher, NetworkMatcher)
     size = {"width": later.shape[1], "height": later.shape[0]}
     trained = [matcher.prepare(f, **size) for f in pair]
     in_pixels = [replace(p, xy=f.xy_px[None, : p.count]) for p, f in zip(trained, pair, strict=True)]

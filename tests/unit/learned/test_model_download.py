@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from mrasfm_engine.errors import InputError, StorageError
-from mrasfm_engine.learned import catalogue, model_folder
+from mrasfm_engine.learned import catalogue
 from mrasfm_engine.learned.catalogue import KnownModel, known_model
 from mrasfm_engine.learned.download import pull
 from mrasfm_engine.learned.model_folder import ModelFolder
@@ -57,9 +57,8 @@ def server() -> Iterator[Server]:
 def aliked(server: Server, monkeypatch: pytest.MonkeyPatch) -> KnownModel:
     """A small graph in the place of the published ALIKED."""
     model = replace(known_model("aliked-n16rot"), url=server.url, sha256=sha256_of(DATA))
-    known = tuple(model if m.name == model.name else m for m in catalogue.CATALOGUE)
-    monkeypatch.setattr(catalogue, "CATALOGUE", known)
-    monkeypatch.setattr(model_folder, "CATALOGUE", known)
+    known = tuple(model if m.name == model.name else m for m in catalogue.known_models())
+    monkeypatch.setattr(catalogue, "known_models", lambda: known)
     return model
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine.errors import InputError, StorageError
-from mrasfm_engine.learned import catalogue, model_folder
+from mrasfm_engine.learned import catalogue
 from mrasfm_engine.learned.model_folder import ModelFolder, default_folder
 from mrasfm_engine.learned.onnx_file import sha256_of
 from tests.helpers import learned_graphs
@@ -29,9 +29,8 @@ def folder(tmp_path: Path) -> ModelFolder:
 def published(monkeypatch: pytest.MonkeyPatch) -> bytes:
     """A small graph in the place of the published XFeat."""
     data = learned_graphs.xfeat()
-    known = tuple(replace(m, sha256=sha256_of(data)) if m.name == "xfeat" else m for m in catalogue.CATALOGUE)
-    monkeypatch.setattr(catalogue, "CATALOGUE", known)
-    monkeypatch.setattr(model_folder, "CATALOGUE", known)
+    known = tuple(replace(m, sha256=sha256_of(data)) if m.name == "xfeat" else m for m in catalogue.known_models())
+    monkeypatch.setattr(catalogue, "known_models", lambda: known)
     return data
 
 

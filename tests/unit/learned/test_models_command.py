@@ -12,7 +12,7 @@ import pytest
 
 from mrasfm_engine.commands import models
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.learned.catalogue import CATALOGUE
+from mrasfm_engine.learned.catalogue import known_models
 from mrasfm_engine.learned.onnx_file import sha256_of
 from tests.helpers import learned_graphs
 
@@ -34,7 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_list_shows_licence_use_and_whether_a_model_is_there(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("list") == 0
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
-    assert set(lines) >= {model.name for model in CATALOGUE}
+    assert set(lines) >= {model.name for model in known_models()}
     assert "Apache-2.0" in lines["xfeat"]
     assert "yes" in lines["xfeat"]
     assert "no (pull)" in lines["aliked-n16rot"]

@@ -7,8 +7,11 @@ import onnxruntime
 import pytest
 
 from mrasfm_engine.errors import InputError, ReconstructionError
-from mrasfm_engine.learned import signatures
+from mrasfm_engine.features import aliked, segmentation, superpoint, xfeat
+from mrasfm_engine.learned.catalogue import known_models
 from mrasfm_engine.learned.network import CPU_PROVIDER, GPU_PROVIDERS, Network
+from mrasfm_engine.learned.signatures import Signature
+from mrasfm_engine.matching import lighterglue, lightglue, superglue
 from tests.helpers import learned_graphs
 
 
@@ -45,34 +48,34 @@ def test_a_gpu_is_used_where_there_is_a_provider_and_the_cpu_elsewhere() -> None
 def test_the_signature_and_the_fixed_size_are_read() -> None:
     fixed = Network("x", learned_graphs.xfeat(32, 64), gpu=False)
     assert fixed.fixed_size("images") == (32, 64)
-    assert signatures.XFEAT.mismatches(fixed.signature) == []
+    assert xfeat.SIGNATURE.mismatches(fixed.signature) == []
     free = Network("s", learned_graphs.superpoint(), gpu=False)
     assert free.fixed_size("image") is None
-    assert signatures.SUPERPOINT.mismatches(free.signature) == []
+    assert superpoint.SIGNATURE.mismatches(free.signature) == []
 
 
 @pytest.mark.parametrize(
     ("graph", "signature"),
     [
-        (learned_graphs.aliked, signatures.ALIKED),
-        (learned_graphs.lightglue, signatures.LIGHTGLUE),
-        (learned_graphs.colmap_lightglue, signatures.LIGHTGLUE_COLMAP),
-        (learned_graphs.lighterglue, signatures.LIGHTERGLUE),
-        (learned_graphs.superglue, signatures.SUPERGLUE),
-        (learned_graphs.segmenter, signatures.SEGMENTER),
+        (learned_graphs.aliked, aliked.SIGNATURE),
+        (learned_graphs.lightglue, lightglue.LIGHTGLUE),
+        (learned_graphs.colmap_lightglue, lightglue.LIGHTGLUE_COLMAP),
+        (learned_graphs.lighterglue, lighterglue.LIGHTERGLUE),
+        (learned_graphs.superglue, superglue.SUPERGLUE),
+        (learned_graphs.segmenter, segmentation.SIGNATURE),
     ],
 )
-def test_every_signature_fits_its_own_graph_and_no_other(graph: object, signature: signatures.Signature) -> None:
+def test_every_signature_fits_its_own_graph_and_no_other(graph: object, signature: Signature) -> None:
     assert callable(graph)
     found = Network("x", graph(), gpu=False).signature
-    known = [s for s in vars(signatures).values() if isinstance(s, signatures.Signature)]
+    known = [model.signature for model in known_models()]
     assert len(known) == 8
     assert [s for s in known if not s.mismatches(found)] == [signature]
 
 
 def test_mismatches_say_what_is_expected_and_what_is_there() -> None:
     found = Network("x", learned_graphs.xfeat(), gpu=False).signature
-    problems = signatures.SUPERPOINT.mismatches(found)
+    problems = superpoint.SIGNATURE.mismatches(found)
     assert "input image float32[1,1,H,W] is missing" in problems
     assert "input images float32[1,3,64,96] is not expected" in problems
     assert "output keypoints int64|float32[1,K,2] is expected, keypoints float32[K,2] is there" in problems

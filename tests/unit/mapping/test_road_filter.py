@@ -72,7 +72,7 @@ def shadows() -> tuple[SimulatedDrive, np.ndarray]:
     return drive_over_shadows()
 
 
-@pytest.mark.parametrize("final", [False, True])
+@pytest.mark.parametrize("for_map", [False, True])
 def test_shadows_that_move_are_dropped_and_the_road_stays(
     shadows: tuple[SimulatedDrive, np.ndarray], for_map: bool
 ) -> None:

@@ -8,18 +8,15 @@ import pytest
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
-from mrasfm_engine.matching.learned_matchers import (
-    ColmapLightGlueMatcher,
-    LearnedMatcher,
-    LighterGlueMatcher,
-    LightGlueMatcher,
-    SuperGlueMatcher,
-)
+from mrasfm_engine.matching.lighterglue import LighterGlueMatcher
+from mrasfm_engine.matching.lightglue import ColmapLightGlueMatcher, LightGlueMatcher
+from mrasfm_engine.matching.network_matcher import NetworkMatcher
+from mrasfm_engine.matching.superglue import SuperGlueMatcher
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers import learned_graphs
 
 WIDTH, HEIGHT = 1000, 600
-CASES: list[tuple[type[LearnedMatcher], Callable[[], bytes], int]] = [
+CASES: list[tuple[type[NetworkMatcher], Callable[[], bytes], int]] = [
     (LighterGlueMatcher, learned_graphs.lighterglue, 64),
     (LightGlueMatcher, learned_graphs.lightglue, 256),
     (ColmapLightGlueMatcher, learned_graphs.colmap_lightglue, 128),
@@ -37,7 +34,7 @@ def features(descriptors: np.ndarray, xy: np.ndarray | None = None) -> ImageFeat
     )
 
 
-def matched(matcher: LearnedMatcher, a: ImageFeatures, b: ImageFeatures) -> np.ndarray:
+def matched(matcher: NetworkMatcher, a: ImageFeatures, b: ImageFeatures) -> np.ndarray:
     pair = (matcher.prepare(f, width=WIDTH, height=HEIGHT) for f in (a, b))
     return matcher.match(*pair)
 
@@ -49,7 +46,7 @@ def unit(rng: np.random.Generator, n: int, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("matcher", "graph", "size"), CASES)
 def test_planted_matches_are_found_and_unlikely_ones_left_out(
-    matcher: type[LearnedMatcher], graph: Callable[[], bytes], size: int
+    matcher: type[NetworkMatcher], graph: Callable[[], bytes], size: int
 ) -> None:
     rng = np.random.default_rng(0)
     a, order = unit(rng, 90, size), rng.permutation(90)[:50]
@@ -61,7 +58,7 @@ def test_planted_matches_are_found_and_unlikely_ones_left_out(
 
 @pytest.mark.parametrize(("matcher", "graph", "size"), CASES)
 def test_only_the_strongest_keypoints_are_matched(
-    matcher: type[LearnedMatcher], graph: Callable[[], bytes], size: int
+    matcher: type[NetworkMatcher], graph: Callable[[], bytes], size: int
 ) -> None:
     d = unit(np.random.default_rng(1), 60, size)
     network = Network("m", graph(), gpu=False)
@@ -72,7 +69,7 @@ def test_only_the_strongest_keypoints_are_matched(
 @pytest.mark.parametrize(("matcher", "graph", "size"), CASES)
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 9), (9, 0), (1, 9), (9, 1)])
 def test_hardly_any_keypoints(
-    matcher: type[LearnedMatcher], graph: Callable[[], bytes], size: int, n: int, m: int
+    matcher: type[NetworkMatcher], graph: Callable[[], bytes], size: int, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(2)
     pair = features(unit(rng, n, size)), features(unit(rng, m, size))
@@ -89,7 +86,7 @@ def test_hardly_any_keypoints(
     ],
 )
 def test_keypoints_are_given_in_the_networks_units(
-    matcher: type[LearnedMatcher], corner: tuple[float, float], middle: tuple[float, float]
+    matcher: type[NetworkMatcher], corner: tuple[float, float], middle: tuple[float, float]
 ) -> None:
     graph = {m: g for m, g, _ in CASES}[matcher]
     xy = np.array([[0.5, 0.5], [500.5, 300.5]])

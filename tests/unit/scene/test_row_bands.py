@@ -35,10 +35,10 @@ def test_images_have_the_offsets_of_their_timestamps() -> None:
 @pytest.mark.parametrize("readout_us", [200, 5_000, 17_300, 30_000])
 def test_rows_are_cut_into_short_bands_about_the_images_timestamp(readout_us: int) -> None:
     bands = RowBands.from_drive(drive(time_offset_us=[0, 20_000], readout_us=readout_us))
-    bands = np.diff(bands.first_of_image)
-    assert len(set(bands.tolist())) == 1
-    assert bands[0] % 2 == 1
-    assert readout_us / 1e6 / bands[0] <= MAX_BAND_S
+    counts = np.diff(bands.first_of_image)
+    assert len(set(counts.tolist())) == 1
+    assert counts[0] % 2 == 1
+    assert readout_us / 1e6 / counts[0] <= MAX_BAND_S
     np.testing.assert_allclose(bands.time_offset_s[bands.middle_of_image], [0.0, 0.02] * 3, atol=1e-12)
     rows = np.linspace(0.5, HEIGHT - 0.5, 200)
     own = bands.of_rows(np.full(200, 3), rows)

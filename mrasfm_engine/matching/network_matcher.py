@@ -1,4 +1,4 @@
-"""Trained matchers, each behind the `Matcher` interface. They see where keypoints lie, not only what they look like."""
+"""The matcher around a trained network, which sees where keypoints lie and not only what they look like."""
 
 from __future__ import annotations
 
@@ -11,10 +11,6 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints, Ints32
-
-LIGHTGLUE_MIN_SCORE = 0.1  # the published value
-SUPERGLUE_MIN_SCORE = 0.2
-LIGHTERGLUE_MIN_SCORE = 0.3  # half of the wrong matches that 0.1 lets through, four fifths of the right ones
 
 
 @dataclass(frozen=True)
@@ -32,10 +28,10 @@ class Prepared:
         return int(self.xy.shape[1])
 
 
-class LearnedMatcher:
+class NetworkMatcher:
     """What all trained matchers share: the first keypoints of an image, in the network's own units."""
 
-    usual_min_score = LIGHTGLUE_MIN_SCORE
+    usual_min_score: float
 
     def __init__(self, network: Network, config: MatchConfig) -> None:
         self.network = network
@@ -85,61 +81,3 @@ class LearnedMatcher:
 
     def _feed(self, a: Prepared, b: Prepared) -> dict[str, Floats32]:
         return {"kpts0": a.xy, "kpts1": b.xy, "desc0": a.descriptors, "desc1": b.descriptors}
-
-
-class LighterGlueMatcher(LearnedMatcher):
-    """LightGlue with three layers for XFeat's descriptors; with so few of them low scores are often wrong."""
-
-    usual_min_score = LIGHTERGLUE_MIN_SCORE
-
-    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
-        found = self.network.run(self._feed(a, b))
-        return found["matches"], found["scores"]
-
-
-class LightGlueMatcher(LearnedMatcher):
-    """LightGlue (Lindenberger et al., ICCV 2023) as fabio-sim/LightGlue-ONNX exports it."""
-
-    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
-        found = self.network.run(self._feed(a, b))
-        return found["matches0"], found["mscores0"]
-
-
-class ColmapLightGlueMatcher(LearnedMatcher):
-    """LightGlue as COLMAP publishes it, which brings keypoints into its units itself."""
-
-    def _units(self, xy_px: Floats32, size: Floats32) -> Floats32:
-        return xy_px - np.float32(0.5)
-
-    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
-        found = self.network.run({**self._feed(a, b), "image_size0": a.size, "image_size1": b.size})
-        partner = found["matches0"].astype(np.int64)
-        matched = np.flatnonzero(partner >= 0)
-        return np.stack([matched, partner[matched]], axis=1), found["mscores0"][matched]
-
-
-class SuperGlueMatcher(LearnedMatcher):
-    """SuperGlue (Sarlin et al., CVPR 2020): mutual maxima of its assignment."""
-
-    usual_min_score = SUPERGLUE_MIN_SCORE
-
-    def _units(self, xy_px: Floats32, size: Floats32) -> Floats32:
-        result: Floats32 = (xy_px - np.float32(0.5) - size / 2) / (np.float32(0.7) * size.max())
-        return result
-
-    def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
-        found = self.network.run(
-            {
-                "keypoints_0": a.xy,
-                "scores_0": a.scores,
-                "descriptors_0": np.ascontiguousarray(a.descriptors.transpose(0, 2, 1)),
-                "keypoints_1": b.xy,
-                "scores_1": b.scores,
-                "descriptors_1": np.ascontiguousarray(b.descriptors.transpose(0, 2, 1)),
-            }
-        )
-        # The last row and column stand for "no partner"; as in the published code the threshold decides that.
-        assignment = found["scores"][0, :-1, :-1]
-        best = assignment.argmax(axis=1)
-        mutual = np.flatnonzero(assignment.argmax(axis=0)[best] == np.arange(len(best)))
-        return np.stack([mutual, best[mutual]], axis=1), np.exp(assignment[mutual, best[mutual]])

@@ -1,4 +1,4 @@
-"""Keypoints found by trained networks, each behind the `Extractor` interface.
+"""The extractor around a trained network: tiles, masks, refinement and the order of keypoints.
 
 All coordinates become COLMAP's, where the centre of the top left pixel is at (0.5, 0.5).
 """
@@ -53,7 +53,7 @@ class Detector(Protocol):
         ...
 
 
-class LearnedExtractor:
+class NetworkExtractor:
     """An `Extractor` around a network, which is given the whole image or, if its size is fixed, tiles of it."""
 
     def __init__(self, detector: Detector, config: FeatureConfig) -> None:
@@ -136,79 +136,6 @@ def _up(size: int) -> int:
     return -(-size // STRIDE_PX) * STRIDE_PX
 
 
-def _planes(pixels: Bytes) -> Floats32:
-    """An image (h, w, 3) as (1, 3, h, w), 0 to 1."""
+def planes(pixels: Bytes) -> Floats32:
+    """Convert an image (h, w, 3) to a tensor (1, 3, h, w) of 0 to 1."""
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], dtype=np.float32) / np.float32(255)
-
-
-class XFeatDetector:
-    """XFeat (Potje et al., CVPR 2024), exported with its own resampling to multiples of 32.
-
-    Its keypoints are whole pixels of the shrunk image, and refined: see `keypoint_refinement`.
-    """
-
-    image = "images"
-    takes_number = False
-    is_refined = True
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-
-    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
-        """See `Detector`; number and least score are part of the exported network."""
-        found = self.network.run({"images": _planes(pixels)})
-        # The network shrinks the image to multiples of 32, takes whole pixels there, counted from 0, and multiplies
-        # them by the shrinkage.
-        rows, columns = pixels.shape[:2]
-        shrinkage = np.array([columns / _down(columns), rows / _down(rows)], np.float32)
-        half = np.float32(0.5) * shrinkage
-        return Detections(found["keypoints"] + half, found["descriptors"], found["scores"])
-
-
-def _down(size: int) -> int:
-    return size // STRIDE_PX * STRIDE_PX
-
-
-class AlikedDetector:
-    """ALIKED (Zhao et al., TIM 2023) as COLMAP publishes it."""
-
-    image = "image"
-    takes_number = True
-    is_refined = False
-    usual_min_score = 0.2  # COLMAP's
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-
-    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
-        """See `Detector`."""
-        found = self.network.run(
-            {
-                "image": _planes(pixels),
-                "max_keypoints": np.array(wanted, np.int64),
-                "min_score": np.array(self.usual_min_score if min_score is None else min_score, np.float32),
-            }
-        )
-        # -1 and 1 are the centres of the first and last pixel.
-        rows, columns = pixels.shape[:2]
-        half_range = 0.5 * np.array([columns - 1, rows - 1], np.float32)
-        xy = (found["keypoints"][0] + np.float32(1)) * half_range + np.float32(0.5)
-        return Detections(xy, found["descriptors"][0], found["scores"][0])
-
-
-class SuperPointDetector:
-    """SuperPoint (DeTone et al., CVPRW 2018) as exported for LightGlue."""
-
-    image = "image"
-    takes_number = False
-    is_refined = False
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-
-    def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
-        """See `Detector`; number and least score are part of the exported network."""
-        gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-        found = self.network.run({"image": gray[None, None].astype(np.float32) / np.float32(255)})
-        xy = found["keypoints"][0].astype(np.float32) + np.float32(0.5)
-        return Detections(xy, found["descriptors"][0], found["scores"][0])

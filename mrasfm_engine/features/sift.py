@@ -1,0 +1,60 @@
+"""SIFT by OpenCV: needs no model."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE, NO_FEATURES, colors_at
+from mrasfm_engine.learned.catalogue import Method
+from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.types import Bools, Bytes
+
+SMALLEST_DESCRIPTOR_SUM = 1e-3
+
+
+class SiftExtractor:
+    """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012)."""
+
+    def __init__(self, config: FeatureConfig) -> None:
+        self._config = config
+
+    def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
+        """See `Extractor`."""
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        scale = min(1.0, self._config.max_side_px / max(gray.shape))
+        if scale < 1.0:
+            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small_mask, wanted = None, self._config.max_keypoints
+        if mask is not None:
+            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            # OpenCV masks only after it has chosen the strongest: the rest of the image must not use up the number.
+            wanted = round(wanted / max(float(small_mask.mean()), 0.05))
+        # A detector an image: OpenCV's objects must not be shared between threads. Without precise upscaling all its
+        # keypoints are 0.25 px too far right and down, which turns cameras by 0.02 deg against one another.
+        sift = cv2.SIFT.create(
+            nfeatures=wanted,
+            contrastThreshold=self._config.contrast_threshold,
+            enable_precise_upscale=True,
+        )
+        keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
+        if not keypoints:
+            return NO_FEATURES
+        order = np.argsort([-k.response for k in keypoints], kind="stable")[: self._config.max_keypoints]
+        # OpenCV puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
+        xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (
+            gray.shape[1] / rgb.shape[1],
+            gray.shape[0] / rgb.shape[0],
+        )
+        root = np.sqrt(
+            descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM)
+        )
+        return ImageFeatures(
+            xy_px=xy.astype(np.float32),
+            descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
+            colors=colors_at(rgb, xy),
+        )
+
+
+METHOD = Method[FeatureConfig, SiftExtractor](build=SiftExtractor)
