@@ -57,7 +57,7 @@ def older(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Older]:
 
 def test_an_older_data_folder_goes_on(older: Older) -> None:
     service, written = older.standalone, older.written
-    database = Database.of(older.settings)
+    database = Database.from_settings(older.settings)
     with database.engine.connect() as connection:
         assert connection.scalar(text("SELECT version_num FROM alembic_version")) == OLD_SCHEMA
     service.start()
