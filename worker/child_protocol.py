@@ -1,4 +1,4 @@
-"""What a supervisor and its child process tell each other, as files in the attempt's folder.
+"""Messages between a supervisor and its child process, as files in the attempt's folder.
 
 Only the standard library: the child reads its request before it loads anything else.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -14,43 +15,24 @@ from typing import Any
 
 
 class Work(StrEnum):
-    """What a child is asked to do."""
+    """The kinds of work of a child."""
 
     RECONSTRUCTION = "reconstruction"
     PREFLIGHT = "preflight"
     AGGREGATION = "aggregation"
 
 
-class ErrorKind(StrEnum):
-    """Which of the engine's errors ended the child's work."""
-
-    INPUT = "input"
-    RECONSTRUCTION = "reconstruction"
-    STORAGE = "storage"
-    CANCELLED = "cancelled"
-    OTHER = "other"  # a scene that contradicts itself, or does not read back as it was written
-
-
 @dataclass(frozen=True, kw_only=True)
-class ChildRequest:
-    """What one child process does.
+class Attempt:
+    """The work of one attempt.
 
     Attributes
     ----------
     drive
-        Folder with `drive.json`; None for an aggregation.
-    out
-        Folder of the scene or map; finished stages lie in its `.stages`.
+        Folder with `drive.json` and the files it names; None for an aggregation. Finished stages are found again
+        only where the files' times of modification are those of the last time.
     settings
         As in the API's `ReconstructionSettings`.
-    cancel_file
-        The child ends its work where this file exists.
-    result_file
-        Where the child writes its ChildResult.
-    progress_fd
-        Inherited descriptor of a pipe that takes lines of progress.
-    parent_pid
-        The supervisor: without it the child ends.
     scenes, into, remove
         Of an aggregation: folders of scenes by name, folder of the map that they are added to, names of scenes that it
         shall lose.
@@ -61,24 +43,44 @@ class ChildRequest:
     """
 
     work: Work
-    drive: Path | None
+    settings: Mapping[str, Any]
+    drive: Path | None = None
+    scenes: Mapping[str, Path] = field(default_factory=dict)
+    into: Path | None = None
+    remove: Sequence[str] = field(default_factory=list)
+    failed: Sequence[Mapping[str, Any]] = field(default_factory=list)
+    members: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    leave_out: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChildRequest(Attempt):
+    """An attempt with all that one child process needs for it.
+
+    Attributes
+    ----------
+    out
+        Folder of the scene or map; finished stages lie in its `.stages`.
+    cancel_file
+        The child ends its work where this file exists.
+    result_file
+        The file for the child's ChildResult.
+    progress_fd
+        Inherited descriptor of a pipe that takes lines of progress.
+    parent_pid
+        The supervisor: without it the child ends.
+    """
+
     out: Path
-    settings: dict[str, Any]
     threads: int
     cancel_file: Path
     result_file: Path
     progress_fd: int
     parent_pid: int
-    scenes: dict[str, Path] = field(default_factory=dict)
-    into: Path | None = None
-    remove: list[str] = field(default_factory=list)
-    failed: list[dict[str, Any]] = field(default_factory=list)
-    members: dict[str, dict[str, Any]] = field(default_factory=dict)
-    leave_out: bool = False
 
     def write(self, path: Path) -> None:
         """Put the request where the child reads it."""
-        path.write_text(json.dumps(asdict(self), default=str), encoding="utf-8")
+        path.write_text(json.dumps(asdict(self), default=lambda given: str(given.resolve())), encoding="utf-8")
 
     @classmethod
     def read(cls, path: Path) -> ChildRequest:
@@ -97,20 +99,25 @@ class ChildError:
 
     Attributes
     ----------
+    retryable
+        Whether another attempt may succeed.
+    is_storage
+        Whether a disk failed.
     findings
         All that the check of the drive found, where that is what refused it.
     """
 
-    kind: ErrorKind
     code: str
     what: str
     remedy: str
+    retryable: bool
+    is_storage: bool = False
     findings: list[dict[str, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChildResult:
-    """How a child's work ended: with a report, or with an error."""
+    """The end of a child's work: a report or an error."""
 
     report: dict[str, Any] | None = None
     error: ChildError | None = None
@@ -132,7 +139,4 @@ class ChildResult:
         except FileNotFoundError:
             return None
         error = values["error"]
-        return cls(
-            report=values["report"],
-            error=None if error is None else ChildError(**{**error, "kind": ErrorKind(error["kind"])}),
-        )
+        return cls(report=values["report"], error=None if error is None else ChildError(**error))

@@ -1,4 +1,4 @@
-"""When the silence of a worker means its death."""
+"""Guards leases against clocks that jump: the silence of a worker does not always mean its death."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ClockGuard:
             self._asked_s = time.monotonic()
 
     def counts(self, clock_us: int) -> bool:
-        """Whether leases that have run out may be taken as such; called when the turn to write is there.
+        """True where leases that have run out may be taken as such; called when the turn to write is there.
 
         Parameters
         ----------

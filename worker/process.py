@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from worker.child_output import ChildOutput
@@ -75,7 +74,7 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """Of the child, and of its process group."""
+        """The id of the child, and of its process group."""
         return self._process.pid
 
     def pump(self, timeout_s: float) -> list[StageReport]:
@@ -104,7 +103,7 @@ class ChildProcess:
         return []
 
     def has_exited(self) -> bool:
-        """Whether the child is a zombie. It stays one until `close`: so its group's id names no other processes."""
+        """True once the child is a zombie. It stays one until `close`: so its group's id names no other processes."""
         try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
         except ChildProcessError:
@@ -141,8 +140,6 @@ class ChildProcess:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._process.returncode is None:
             self.close()
