@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.config import EngineConfig
+from schemas.artifacts import CHECKPOINT_FOLDER
 from service.settings import Settings
 from worker.child_output import ChildOutput
 from worker.child_protocol import ChildRequest, ChildResult, Work
@@ -61,8 +62,9 @@ class Attempt:
     Attributes
     ----------
     drive
-        Folder with `drive.json` and the files it names; None for an aggregation. Finished stages are found again
-        only where the files' times of modification are those of the last time.
+        Folder with `drive.json` and the files it names; None for an aggregation.
+    content_sha256
+        SHA-256 of these files by name: what finished stages are found again by.
     settings
         As in the API's `ReconstructionSettings`.
     scenes, into, remove, failed, members, leave_out
@@ -72,6 +74,7 @@ class Attempt:
     work: Work
     settings: Mapping[str, Any]
     drive: Path | None = None
+    content_sha256: Mapping[str, str] | None = None
     scenes: Mapping[str, Path] = field(default_factory=dict)
     into: Path | None = None
     remove: Sequence[str] = ()
@@ -94,7 +97,7 @@ class AttemptFolder:
     @property
     def finished_stages(self) -> Path:
         """Where finished stages lie, one `NAME.npz` each: put there before to be reused, taken from there after."""
-        return self.out / ".stages"
+        return self.out / CHECKPOINT_FOLDER
 
     @property
     def request(self) -> Path:

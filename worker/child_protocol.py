@@ -40,7 +40,9 @@ class ChildRequest:
     drive
         Folder with `drive.json`; None for an aggregation.
     out
-        Folder of the scene or map; finished stages lie in its `.stages`.
+        Folder of the scene or map; finished stages lie in its `CHECKPOINT_FOLDER`.
+    content_sha256
+        SHA-256 of the drive's files by name; None for an aggregation.
     settings
         As in the API's `ReconstructionSettings`.
     cancel_file
@@ -69,6 +71,7 @@ class ChildRequest:
     result_file: Path
     progress_fd: int
     parent_pid: int
+    content_sha256: dict[str, str] | None = None
     scenes: dict[str, Path] = field(default_factory=dict)
     into: Path | None = None
     remove: list[str] = field(default_factory=list)

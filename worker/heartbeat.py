@@ -11,6 +11,7 @@ from types import TracebackType
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from schemas.artifacts import Stage
 from service.database.connections import Database
 from service.domain import jobs
 from service.settings import Settings
@@ -125,5 +126,5 @@ def _note(progress: Progress | None) -> jobs.ProgressNote | None:
         eta_low_s=None if low_s is None else round(low_s, 1),
         eta_high_s=None if high_s is None else round(high_s, 1),
         reused=progress.reused,
-        engine_ran=progress.stage not in ("", "fetch"),
+        engine_ran=progress.stage not in ("", Stage.FETCH),
     )

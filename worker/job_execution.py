@@ -17,6 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.api.resource import Finding
+from schemas.artifacts import Stage
 from service.database.connections import Database
 from service.domain import jobs
 from service.domain.checkpoints import Shelf
@@ -125,7 +126,7 @@ class Runner:
 
     def _do(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> None:
         look = self._looking(heart, meter)
-        publishing = _counting(meter, "publish", look)
+        publishing = _counting(meter, Stage.PUBLISH, look)
         try:
             outcome = self._attempt(held, folder, heart, meter, look)
             self._record(held, outcome, publishing, look)
@@ -137,7 +138,7 @@ class Runner:
     ) -> Outcome:
         assignment = assignment_of(self._database, held)
         fetch = PatientFetch(self._artifacts, patience_s=self._settings.storage_patience_seconds, look=look)
-        count = _counting(meter, "fetch", look)
+        count = _counting(meter, Stage.FETCH, look)
         try:
             attempt = watched(lambda: assignment.lay_out(folder, fetch, count), look)
         except DriveGoneError:
@@ -146,7 +147,7 @@ class Runner:
                 what=f"drive {held.drive_id} was deleted",
                 remedy="Upload it again.",
                 retryable=False,
-                stage="fetch",
+                stage=Stage.FETCH,
             )
         with self._keeping(held, assignment.shelf, folder, fetch, look):
             return run_attempt(
@@ -298,7 +299,7 @@ def _note_memory_kills(folder: AttemptFolder) -> None:
             now.write(folder.memory_kills)
 
 
-def _counting(meter: ProgressMeter, stage: str, look: Look) -> Counting:
+def _counting(meter: ProgressMeter, stage: Stage, look: Look) -> Counting:
     """A callback for one of the worker's own stages, which stops where a child would be stopped."""
 
     def count(done: int, total: int) -> None:

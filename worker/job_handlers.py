@@ -78,8 +78,8 @@ class DriveAssignment:
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
         """The drive as a folder."""
         drive = folder.root / "drive"
-        materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
-        return Attempt(work=WORK[self._held.kind], drive=drive, settings=self._held.settings)
+        contents = materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
+        return Attempt(work=WORK[self._held.kind], drive=drive, content_sha256=contents, settings=self._held.settings)
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
@@ -123,7 +123,7 @@ class MapAssignment:
         wanted += [(root / "base" / file.path, file) for file in inputs.base]
         for i, (target, file) in enumerate(wanted):
             target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            fetch(file.key, target, file.sha256)
+            fetch(file.key, target)
             progress(i + 1, len(wanted))
         return Attempt(
             work=Work.AGGREGATION,

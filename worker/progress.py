@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from schemas.artifacts import CHECKPOINTED, Stage
 from worker.child_protocol import Work
 
 # Shares of the time, measured on drives of 100 images; what counts is that nothing seems to stand still. `fetch` and
@@ -13,45 +14,43 @@ from worker.child_protocol import Work
 WEIGHTS: Mapping[Work, Mapping[str, float]] = MappingProxyType(
     {
         Work.RECONSTRUCTION: {
-            "fetch": 3.0,
-            "preflight": 4.0,
-            "features": 32.0,
-            "matches": 25.0,
-            "mapping": 20.0,
-            "refinement": 6.0,
-            "pictures": 3.0,
-            "export": 4.0,
-            "publish": 3.0,
+            Stage.FETCH: 3.0,
+            Stage.PREFLIGHT: 4.0,
+            Stage.FEATURES: 32.0,
+            Stage.MATCHES: 25.0,
+            Stage.MAPPING: 20.0,
+            Stage.REFINEMENT: 6.0,
+            Stage.PICTURES: 3.0,
+            Stage.EXPORT: 4.0,
+            Stage.PUBLISH: 3.0,
         },
         Work.AGGREGATION: {
-            "fetch": 4.0,
-            "scenes": 8.0,
-            "association": 1.0,
-            "seams": 52.0,
-            "joint": 5.0,
-            "adjustment": 16.0,
-            "pictures": 4.0,
-            "export": 6.0,
-            "publish": 4.0,
+            Stage.FETCH: 4.0,
+            Stage.SCENES: 8.0,
+            Stage.ASSOCIATION: 1.0,
+            Stage.SEAMS: 52.0,
+            Stage.JOINT: 5.0,
+            Stage.ADJUSTMENT: 16.0,
+            Stage.PICTURES: 4.0,
+            Stage.EXPORT: 6.0,
+            Stage.PUBLISH: 4.0,
         },
-        Work.PREFLIGHT: {"fetch": 20.0, "preflight": 30.0, "calibration": 50.0},
+        Work.PREFLIGHT: {Stage.FETCH: 20.0, Stage.PREFLIGHT: 30.0, Stage.CALIBRATION: 50.0},
     }
 )
 UNITS: Mapping[str, str] = MappingProxyType(
     {
-        "fetch": "files",
-        "scenes": "scenes",
-        "preflight": "files",
-        "features": "images",
-        "matches": "pairs",
-        "mapping": "units",  # rigid units: all cameras at one instant
-        "refinement": "rounds",
-        "pictures": "images",
-        "publish": "files",
+        Stage.FETCH: "files",
+        Stage.SCENES: "scenes",
+        Stage.PREFLIGHT: "files",
+        Stage.FEATURES: "images",
+        Stage.MATCHES: "pairs",
+        Stage.MAPPING: "units",  # rigid units: all cameras at one instant
+        Stage.REFINEMENT: "rounds",
+        Stage.PICTURES: "images",
+        Stage.PUBLISH: "files",
     }
 )
-REUSABLE = frozenset({"features", "matches", "mapping"})
-
 _MIN_EARNED = 5.0  # percent that must have been worked for before a time to the end means something
 _MIN_ELAPSED_S = 3.0
 _DOUBT = 1.0  # at the beginning the end may be twice as far, or half; at the end there is no doubt left
@@ -106,10 +105,10 @@ class ProgressMeter:
         now = self._progress
         begins = stage != now.stage
         # The engine ends each of these with "1 of 1"; one that begins so was finished before.
-        reused = begins and done == total == 1 and stage in REUSABLE
+        reused = begins and done == total == 1 and stage in CHECKPOINTED
         if reused:
             self._skipped += self._weights.get(stage, 0.0)
-        elif done == total == 1 and stage in REUSABLE:
+        elif done == total == 1 and stage in CHECKPOINTED:
             done = total = max(now.total, 1)
         self._progress = Progress(
             stage=stage,

@@ -120,10 +120,10 @@ class PatientFetch:
         self._patience_s = patience_s
         self._look = look
 
-    def __call__(self, key: str, target: Path, sha256: str) -> None:
+    def __call__(self, key: str, target: Path) -> None:
         """Put the object's bytes at `target`."""
         patiently(
-            lambda: self._artifacts.fetch(key, target, sha256, look=self._look),
+            lambda: self._artifacts.fetch(key, target, look=self._look),
             patience_s=self._patience_s,
             look=self._look,
         )

@@ -33,8 +33,8 @@ from mrasfm_engine.export import (
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
+from schemas.artifacts import PICTURES_FOLDER
 
-PICTURES = "pictures"
 NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
@@ -65,8 +65,8 @@ def write_scene(
     """
     check_scene(scene)
     needed = _size_bytes(scene) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=(PICTURES, ROAD_FILE)) as work:
-        picture_files.write_pictures(pictures, work / PICTURES)
+    with publishing(out, needed, replaced=(PICTURES_FOLDER, ROAD_FILE)) as work:
+        picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
         _write(scene, work, report)
 
 

@@ -15,8 +15,8 @@ from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Floats
 from schemas import Pose
+from schemas.artifacts import MAP_FILE
 
-MAP_FILE = "map.json"
 REMEDY = "Give the folder that `mrasfm aggregate --out` wrote."
 
 

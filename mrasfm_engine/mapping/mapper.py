@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
@@ -21,6 +24,12 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, inlier_members
 from mrasfm_engine.triangulation.triangulate import Triangulator
 from mrasfm_engine.types import Bools, Floats, Ints
+
+_RESULTS = ("registered", "keyframe", "triangulated", "is_inlier", "missing")
+_STATE = (
+    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
+    "band_rotation", "band_position_m",
+)  # fmt: skip
 
 
 class Mapper:
@@ -90,6 +99,47 @@ class Mapper:
         bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
         tracked = tracks.of_keypoint >= 0
         self.rows_of_unit = [rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in pairwise(bounds))]
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything that mapping has found, for `from_arrays`."""
+        has_own_pose, unit_from_image = self.motion.own_poses
+        return {
+            "of_keypoint": self.tracks.of_keypoint,
+            "has_own_pose": has_own_pose,
+            "unit_from_image": unit_from_image,
+            **{name: getattr(self, name) for name in _RESULTS},
+            **{name: getattr(self.state, name) for name in _STATE},
+        }
+
+    @staticmethod
+    def from_arrays(
+        drive: Drive,
+        keypoints: Keypoints,
+        config: EngineConfig,
+        prior_world_from_rig: Floats | None,
+        arrays: Mapping[str, NDArray[Any]],
+    ) -> Mapper:
+        """The mapper whose `to_arrays` these are; units without a pose move as the prior trajectory says."""
+        mapper = Mapper(drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), config)
+        for name in _RESULTS:
+            setattr(mapper, name, arrays[name])
+        mapper.state = replace(mapper.state, **{name: arrays[name] for name in _STATE})
+        if prior_world_from_rig is not None:
+            mapper.motion.follow_prior(prior_world_from_rig)
+        for image in np.flatnonzero(arrays["has_own_pose"]):
+            mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
+        return mapper
+
+    def with_points_of(self, units: Bools) -> Mapper:
+        """A mapper of the same poses whose units (units,) alone are registered, with points triangulated from these."""
+        result = copy.copy(self)
+        result.registered = self.registered & units
+        result.state = replace(self.state, points_m=np.zeros_like(self.state.points_m))
+        for name in ("triangulated", "is_inlier", "rejected"):
+            setattr(result, name, np.zeros_like(getattr(self, name)))
+        result.triangulate()
+        result.filter(self.config.mapping.filter_error_px)
+        return result
 
     def set_pose(self, unit: int, world_from_rig: Floats) -> None:
         """Give a unit a pose and count it as registered."""

@@ -67,7 +67,7 @@ def test_store_that_is_away_for_seconds(world: World, brief_drive: Path, monkeyp
     fetching: list[Exception] = [REFUSED, OSError(errno.ENOSPC, "full"), REFUSED]
     storing: list[Exception] = [REFUSED, TimeoutError(), REFUSED, REFUSED]
     break_store(monkeypatch, "fetch", fetching)
-    break_store(monkeypatch, "adopt", storing)
+    break_store(monkeypatch, "put_file", storing)
     Runner(world.settings).run(job_id)
     assert (fetching, storing) == ([], [])
     assert world.outcomes(job_id) == ["succeeded"]
@@ -114,11 +114,11 @@ def test_stop_while_the_store_hangs(
         keep(world, shelf, "features.npz", b"a finished stage")
     real = ArtifactStore.fetch
 
-    def fetch(store: ArtifactStore, key: str, target: Path, sha256: str, **options: Any) -> None:
+    def fetch(store: ArtifactStore, key: str, target: Path, **options: Any) -> None:
         if during == "fetch" or target.suffix == ".npz":
             hangs.set()
             go_on.wait(60)
-        real(store, key, target, sha256, **options)
+        real(store, key, target, **options)
 
     monkeypatch.setattr(ArtifactStore, "fetch", fetch)
     thread = threading.Thread(target=Runner(world.settings, shutting_down=stop.is_set).run, args=(job_id,))
@@ -224,7 +224,7 @@ def test_checkpoint_that_cannot_be_kept(
     (tmp_path / "stages").mkdir()
     (tmp_path / "stages" / "features.npz").write_bytes(b"features")
     shelf = DriveShelf(world.add_drive(brief_drive), SHELF)
-    break_store(monkeypatch, "adopt", errors)
+    break_store(monkeypatch, "put_file", errors)
     with caplog.at_level(logging.WARNING, "mrasfm.worker"), keeper(world, shelf, tmp_path):
         wait_until(lambda: len(errors) == 1, "the first try")
         time.sleep(0.5)
