@@ -62,7 +62,7 @@ def celery_options(settings: Settings) -> dict[str, Any]:
     }
 
 
-class Wakeups:
+class JobQueue:
     """Sends messages, and sees which are waiting.
 
     Every method raises `BrokerError` within seconds where the broker does not answer. What speaks to the broker takes

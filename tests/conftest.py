@@ -88,6 +88,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def _needs_kernels(item: pytest.Item) -> bool:
+    if item.get_closest_marker("engine") is not None:
+        return True
     return not any(item.path.is_relative_to(folder) for folder in _WITHOUT_KERNELS)
 
 

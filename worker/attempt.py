@@ -20,7 +20,7 @@ from worker.oom import kills_since, memory_kills
 from worker.outcomes import Ending, Outcome, outcome_of
 from worker.process import ChildProcess
 from worker.progress import Progress, ProgressMeter
-from worker.termination import Escalation, StopReason
+from worker.termination import StopReason, Termination
 
 TICK_S = 0.25
 
@@ -37,7 +37,7 @@ _THREADS = (
 Command = Callable[[int], Sequence[str]]
 
 
-class Verdict(StrEnum):
+class StopRequest(StrEnum):
     """What becomes of an attempt under way."""
 
     GO_ON = "go on"
@@ -47,12 +47,12 @@ class Verdict(StrEnum):
 
 
 _STOPS = {
-    Verdict.CANCEL: StopReason.CANCEL,
-    Verdict.SHUT_DOWN: StopReason.SHUT_DOWN,
-    Verdict.FENCED: StopReason.FENCED,
+    StopRequest.CANCEL: StopReason.CANCEL,
+    StopRequest.SHUT_DOWN: StopReason.SHUT_DOWN,
+    StopRequest.FENCED: StopReason.FENCED,
 }
 
-Tick = Callable[[Progress], Verdict]
+Tick = Callable[[Progress], StopRequest]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,15 +183,15 @@ def supervise(
     with ChildProcess(
         command, folder=folder.root, environment=_environment(threads, folder.root), output=output
     ) as child:
-        escalation = Escalation(child.send, folder.cancel, settings)
-        _watch(child, escalation, tick=tick, meter=meter, timeout_s=settings.job_timeout_seconds)
+        termination = Termination(child.send, folder.cancel, settings)
+        _watch(child, termination, tick=tick, meter=meter, timeout_s=settings.job_timeout_seconds)
         returncode, reports = child.close()
     for report in reports:
         meter.update(*report)
     return outcome_of(
         Ending(
             returncode=returncode,
-            stopped_for=escalation.reason,
+            stopped_for=termination.reason,
             result=ChildResult.read(folder.result),
             stage=meter.stage,
             log_tail=output.tail(),
@@ -202,7 +202,9 @@ def supervise(
     )
 
 
-def _watch(child: ChildProcess, escalation: Escalation, *, tick: Tick, meter: ProgressMeter, timeout_s: float) -> None:
+def _watch(
+    child: ChildProcess, termination: Termination, *, tick: Tick, meter: ProgressMeter, timeout_s: float
+) -> None:
     """Follow the child until it has ended, and stop it where somebody or the time asks for it."""
     parent = os.getppid()
     now_s = time.monotonic()
@@ -215,13 +217,13 @@ def _watch(child: ChildProcess, escalation: Escalation, *, tick: Tick, meter: Pr
             tick_s = now_s + TICK_S
             verdict = tick(meter.at(now_s))
             now_s = time.monotonic()
-            if verdict is not Verdict.GO_ON:
-                escalation.stop(_STOPS[verdict], now_s)
+            if verdict is not StopRequest.GO_ON:
+                termination.stop(_STOPS[verdict], now_s)
             if os.getppid() != parent:
-                escalation.stop(StopReason.ORPHANED, now_s)
+                termination.stop(StopReason.ORPHANED, now_s)
             if now_s >= ends_s:
-                escalation.stop(StopReason.TIMEOUT, now_s)
-        escalation.advance(now_s)
+                termination.stop(StopReason.TIMEOUT, now_s)
+        termination.advance(now_s)
 
 
 def _environment(threads: int, scratch: Path) -> dict[str, str]:

@@ -78,10 +78,10 @@ class CheckpointKeeper:
 
     def _run(self) -> None:
         while not self._ended.wait(_LOOK_EVERY_S):
-            self._look()
-        self._look(is_last=True)
+            self._poll()
+        self._poll(is_last=True)
 
-    def _look(self, *, is_last: bool = False) -> None:
+    def _poll(self, *, is_last: bool = False) -> None:
         for path in sorted(self._folder.glob("*.npz")):
             with suppress(FileNotFoundError):  # the attempt's folder is being removed
                 identity = _identity(path)

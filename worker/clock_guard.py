@@ -7,7 +7,7 @@ import time
 _SHARE = 0.25  # of a lease: a live worker has more than that left at any time
 
 
-class Silence:
+class ClockGuard:
     """Told apart from a clock that was set, a machine that slept, and a database that nobody could reach.
 
     After any of these every lease may have run out with its worker alive, so for the length of a lease none counts.

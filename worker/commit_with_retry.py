@@ -10,15 +10,15 @@ from sqlalchemy.orm import Session
 
 from service.database.connections import Database
 from service.domain import jobs
-from worker.retry import PATIENCE_S, patiently
+from worker.retry import RETRY_BUDGET_S, retry
 
 log = logging.getLogger("mrasfm.worker")
 
 T = TypeVar("T")
 
 
-def settle(
-    database: Database, held: jobs.Claim, transaction: Callable[[Session], T], *, patience_s: float = PATIENCE_S
+def commit_with_retry(
+    database: Database, held: jobs.Claim, transaction: Callable[[Session], T], *, budget_s: float = RETRY_BUDGET_S
 ) -> T | None:
     """Write how an attempt ended, again where the database did not take it.
 
@@ -48,7 +48,7 @@ def settle(
             log.info("the end was recorded already; only the database's answer was lost")
             return None
 
-    return patiently(write, patience_s=patience_s)
+    return retry(write, budget_s=budget_s)
 
 
 def _has_succeeded(database: Database, held: jobs.Claim) -> bool:

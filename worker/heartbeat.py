@@ -15,7 +15,7 @@ from schemas.artifacts import Stage
 from service.database.connections import Database
 from service.domain import jobs
 from service.settings import Settings
-from worker.attempt import Verdict
+from worker.attempt import StopRequest
 from worker.progress import Progress
 from worker.retry import may_pass
 
@@ -25,7 +25,7 @@ _LOOK_EVERY_S = 1.0  # progress that changes is told this often, and so is a req
 _SURE_SHARE = 0.8  # of the lease: after that without an answer, another worker may soon hold the job
 
 
-class Heart:
+class Heartbeat:
     """A thread that renews a job's lease for as long as it is in its `with` block.
 
     It beats apart from the attempt itself: fetching a large drive or publishing a large scene must not look like death.
@@ -41,10 +41,10 @@ class Heart:
         self._fenced = False
         self._ended = threading.Event()
         self._thread = threading.Thread(
-            target=contextvars.copy_context().run, args=(self._run,), name="heart", daemon=True
+            target=contextvars.copy_context().run, args=(self._run,), name="heartbeat", daemon=True
         )  # in our context: its log lines name the job too
 
-    def __enter__(self) -> Heart:
+    def __enter__(self) -> Heartbeat:
         self._thread.start()
         return self
 
@@ -54,24 +54,24 @@ class Heart:
         self._ended.set()
         self._thread.join()
 
-    def tell(self, progress: Progress) -> Verdict:
+    def tell(self, progress: Progress) -> StopRequest:
         """Say how far the attempt is; never waits.
 
         Returns
         -------
-        Verdict
+        StopRequest
             FENCED where the job is not ours any more, CANCEL where somebody asked for its end, else GO_ON.
         """
         self._progress = progress
         if self._fenced:
-            return Verdict.FENCED
-        return Verdict.CANCEL if self._cancel else Verdict.GO_ON
+            return StopRequest.FENCED
+        return StopRequest.CANCEL if self._cancel else StopRequest.GO_ON
 
     def _run(self) -> None:
         try:
             self._beat_until_ended()
         finally:
-            self._fenced = not self._ended.is_set()  # without a heart, another worker will soon hold the job
+            self._fenced = not self._ended.is_set()  # without a heartbeat, another worker will soon hold the job
 
     def _beat_until_ended(self) -> None:
         sure_until_s = time.monotonic() + _SURE_SHARE * self._settings.lease_seconds
@@ -81,7 +81,7 @@ class Heart:
             news = self._news()
             try:
                 if news is None and now_s - beat_s < self._settings.heartbeat_seconds:
-                    self._look()
+                    self._poll()
                     continue
                 self._beat(news)
             except jobs.FencedError:
@@ -100,7 +100,7 @@ class Heart:
         progress = self._progress
         return None if replace(progress, eta_s=None) == replace(self._told, eta_s=None) else progress
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """See whether somebody asked for the job's end: that does not wait for the next heartbeat."""
         with self._database.read() as session:
             self._cancel = jobs.cancel_requested(session, self._held)

@@ -27,15 +27,15 @@ from service.settings import Settings
 from service.storage.artifacts import ArtifactStore, Fetch
 from service.storage.blob_writer import StoredFile, file_sha256, store_file
 from service.storage.process_folder import process_folder, sweep
-from worker.attempt import AttemptFolder, Verdict, run_attempt
+from worker.attempt import AttemptFolder, StopRequest, run_attempt
 from worker.checkpoints import CheckpointKeeper
-from worker.commit_with_retry import settle
-from worker.heartbeat import Heart
-from worker.job_handlers import WORK, Counting, assignment_of
+from worker.commit_with_retry import commit_with_retry
+from worker.heartbeat import Heartbeat
+from worker.job_handlers import WORK, Counting, handler_of
 from worker.oom import MemoryKills, kills_since, memory_kills
 from worker.outcomes import Abandoned, Cancelled, Failed, Outcome, Succeeded
 from worker.progress import Progress, ProgressMeter
-from worker.retry import PATIENCE_S, Look, PatientFetch, patiently, watched
+from worker.retry import RETRY_BUDGET_S, CheckStop, RetryingFetch, retry, watched
 from worker.termination import StopReason
 
 log = logging.getLogger("mrasfm.worker")
@@ -55,13 +55,13 @@ _FAILED = {
     JobKind.AGGREGATION: "No map could be made",
 }
 
-_PARTING_PATIENCE_S = 5.0  # a process that was told to end does not wait long for the database
+_PARTING_BUDGET_S = 5.0  # a process that was told to end does not wait long for the database
 
 
 class _StoppedError(Exception):
     """One of the worker's own stages was stopped."""
 
-    def __init__(self, verdict: Verdict) -> None:
+    def __init__(self, verdict: StopRequest) -> None:
         super().__init__(verdict)
         self.verdict = verdict
 
@@ -78,7 +78,7 @@ class Runner:
     def __init__(self, settings: Settings, *, shutting_down: Callable[[], bool] = lambda: False) -> None:
         self._settings = settings
         self._shutting_down = shutting_down
-        self._database = Database.of(settings)
+        self._database = Database.from_settings(settings)
         self._artifacts = ArtifactStore(settings)
         self._owner = f"{socket.gethostname()}:{os.getpid()}"
 
@@ -103,12 +103,12 @@ class Runner:
         try:
             with (
                 process_folder(self._settings.scratch_dir, f"{held.job_id}.{held.fence}") as folder,
-                Heart(self._database, held, self._settings) as heart,
+                Heartbeat(self._database, held, self._settings) as heartbeat,
             ):
                 attempt = AttemptFolder(folder)
                 _note_memory_kills(attempt)
                 self.sweep_scratch()
-                self._do(held, attempt, heart, meter)
+                self._do(held, attempt, heartbeat, meter)
         except jobs.FencedError:
             raise
         except (OSError, StoreError) as error:
@@ -121,26 +121,26 @@ class Runner:
             # This process was told to end and not, or not only, the main one: by a cold shutdown, or by who signals
             # all of a service's processes at once.
             with suppress(jobs.FencedError, SQLAlchemyError):  # else the job's lease runs out
-                self._release(held, patience_s=_PARTING_PATIENCE_S)
+                self._release(held, budget_s=_PARTING_BUDGET_S)
             raise
 
-    def _do(self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter) -> None:
-        look = self._looking(heart, meter)
-        publishing = _counting(meter, Stage.PUBLISH, look)
+    def _do(self, held: jobs.Claim, folder: AttemptFolder, heartbeat: Heartbeat, meter: ProgressMeter) -> None:
+        check_stop = self._stop_check(heartbeat, meter)
+        publishing = _counting(meter, Stage.PUBLISH, check_stop)
         try:
-            outcome = self._attempt(held, folder, heart, meter, look)
-            self._record(held, outcome, publishing, look)
+            outcome = self._attempt(held, folder, heartbeat, meter, check_stop)
+            self._record(held, outcome, publishing, check_stop)
         except _StoppedError as stopped:
-            self._record(held, _of_verdict(stopped.verdict, meter.stage), publishing, look)
+            self._record(held, _of_verdict(stopped.verdict, meter.stage), publishing, check_stop)
 
     def _attempt(
-        self, held: jobs.Claim, folder: AttemptFolder, heart: Heart, meter: ProgressMeter, look: Look
+        self, held: jobs.Claim, folder: AttemptFolder, heartbeat: Heartbeat, meter: ProgressMeter, check_stop: CheckStop
     ) -> Outcome:
-        assignment = assignment_of(self._database, held)
-        fetch = PatientFetch(self._artifacts, patience_s=self._settings.storage_patience_seconds, look=look)
-        count = _counting(meter, Stage.FETCH, look)
+        handler = handler_of(self._database, held)
+        fetch = RetryingFetch(self._artifacts, budget_s=self._settings.storage_patience_seconds, check_stop=check_stop)
+        count = _counting(meter, Stage.FETCH, check_stop)
         try:
-            attempt = watched(lambda: assignment.lay_out(folder, fetch, count), look)
+            attempt = watched(lambda: handler.lay_out(folder, fetch, count), check_stop)
         except DriveGoneError:
             return Failed(
                 code="drive-deleted",
@@ -149,17 +149,17 @@ class Runner:
                 retryable=False,
                 stage=Stage.FETCH,
             )
-        with self._keeping(held, assignment.shelf, folder, fetch, look):
+        with self._keeping(held, handler.shelf, folder, fetch, check_stop):
             return run_attempt(
                 attempt,
                 scratch=folder.root,
-                tick=lambda progress: self._tick(heart, progress),
+                tick=lambda progress: self._tick(heartbeat, progress),
                 meter=meter,
                 settings=self._settings,
             )
 
     def _keeping(
-        self, held: jobs.Claim, shelf: Shelf | None, folder: AttemptFolder, fetch: Fetch, look: Look
+        self, held: jobs.Claim, shelf: Shelf | None, folder: AttemptFolder, fetch: Fetch, check_stop: CheckStop
     ) -> AbstractContextManager[object]:
         """Finished stages brought, and those that are finished now kept."""
         if shelf is None:
@@ -172,43 +172,43 @@ class Runner:
             folder=folder.finished_stages,
             spare=folder.root / "checkpoints",
         )
-        watched(lambda: keeper.restore(fetch), look)
+        watched(lambda: keeper.restore(fetch), check_stop)
         return keeper
 
-    def _looking(self, heart: Heart, meter: ProgressMeter) -> Look:
+    def _stop_check(self, heartbeat: Heartbeat, meter: ProgressMeter) -> CheckStop:
         """What ends the worker's own steps where a child would be stopped."""
 
-        def look() -> None:
-            verdict = self._tick(heart, meter.at(time.monotonic()))
-            if verdict is not Verdict.GO_ON:
+        def check_stop() -> None:
+            verdict = self._tick(heartbeat, meter.at(time.monotonic()))
+            if verdict is not StopRequest.GO_ON:
                 raise _StoppedError(verdict)
 
-        return look
+        return check_stop
 
-    def _tick(self, heart: Heart, progress: Progress) -> Verdict:
-        verdict = heart.tell(progress)
-        return Verdict.SHUT_DOWN if verdict is Verdict.GO_ON and self._shutting_down() else verdict
+    def _tick(self, heartbeat: Heartbeat, progress: Progress) -> StopRequest:
+        verdict = heartbeat.tell(progress)
+        return StopRequest.SHUT_DOWN if verdict is StopRequest.GO_ON and self._shutting_down() else verdict
 
-    def _record(self, held: jobs.Claim, outcome: Outcome, progress: Counting, look: Look) -> None:
+    def _record(self, held: jobs.Claim, outcome: Outcome, progress: Counting, check_stop: CheckStop) -> None:
         match outcome:
             case Succeeded() if held.kind is JobKind.PREFLIGHT:
                 findings, sound = outcome.report["findings"], outcome.report["sound"]
-                settle(self._database, held, lambda s: jobs.record_findings(s, held, findings, sound=sound))
+                commit_with_retry(self._database, held, lambda s: jobs.record_findings(s, held, findings, sound=sound))
                 log.info("checked", extra={"fields": {"sound": sound}})
             case Succeeded():
-                self._publish(held, outcome, progress, look)
+                self._publish(held, outcome, progress, check_stop)
             case Failed():
                 self._fail(held, outcome)
             case Cancelled():
-                settle(self._database, held, lambda session: jobs.cancelled(session, held))
+                commit_with_retry(self._database, held, lambda session: jobs.cancelled(session, held))
                 log.info("cancelled")
             case Abandoned(reason=StopReason.SHUT_DOWN):
                 self._release(held)
             case Abandoned():
                 raise jobs.FencedError
 
-    def _release(self, held: jobs.Claim, *, patience_s: float = PATIENCE_S) -> None:
-        settle(self._database, held, lambda session: jobs.release(session, held), patience_s=patience_s)
+    def _release(self, held: jobs.Claim, *, budget_s: float = RETRY_BUDGET_S) -> None:
+        commit_with_retry(self._database, held, lambda session: jobs.release(session, held), budget_s=budget_s)
         log.info("released: this worker stops")
 
     def _fail(self, held: jobs.Claim, failed: Failed) -> None:
@@ -228,7 +228,7 @@ class Runner:
             retryable=failed.retryable,
             job_id=held.job_id,
         )
-        state = settle(
+        state = commit_with_retry(
             self._database,
             held,
             lambda session: jobs.fail(
@@ -249,17 +249,19 @@ class Runner:
         delay_s = first_s * float(self._settings.storage_retry_growth**held.blame)
         return max(first_s, min(delay_s, self._settings.longest_retry_delay_seconds))
 
-    def _publish(self, held: jobs.Claim, done: Succeeded, progress: Counting, look: Look) -> None:
+    def _publish(self, held: jobs.Claim, done: Succeeded, progress: Counting, check_stop: CheckStop) -> None:
         found = sorted(_artifacts(done.out).items())
         files = {}
         for i, (name, path) in enumerate(found):
-            files[name] = self._store(held, path, look)
+            files[name] = self._store(held, path, check_stop)
             progress(i + 1, len(found))
-        assignment = assignment_of(self._database, held)
-        made = settle(self._database, held, lambda session: assignment.publish(session, done, files, self._settings))
+        handler = handler_of(self._database, held)
+        made = commit_with_retry(
+            self._database, held, lambda session: handler.publish(session, done, files, self._settings)
+        )
         log.info("published", extra={"fields": made or {}})
 
-    def _store(self, held: jobs.Claim, path: Path, look: Look) -> StoredFile:
+    def _store(self, held: jobs.Claim, path: Path, check_stop: CheckStop) -> StoredFile:
         sha256, size_bytes = file_sha256(path), path.stat().st_size
 
         def store() -> StoredFile:
@@ -272,8 +274,8 @@ class Runner:
                 size_bytes=size_bytes,
             )
 
-        patience_s = self._settings.storage_patience_seconds
-        return patiently(lambda: watched(store, look), patience_s=patience_s, look=look)
+        budget_s = self._settings.storage_patience_seconds
+        return retry(lambda: watched(store, check_stop), budget_s=budget_s, check_stop=check_stop)
 
     def sweep_scratch(self) -> None:
         """Remove what killed processes of this machine left behind, and end the leases of their jobs at once."""
@@ -299,12 +301,12 @@ def _note_memory_kills(folder: AttemptFolder) -> None:
             now.write(folder.memory_kills)
 
 
-def _counting(meter: ProgressMeter, stage: Stage, look: Look) -> Counting:
+def _counting(meter: ProgressMeter, stage: Stage, check_stop: CheckStop) -> Counting:
     """A callback for one of the worker's own stages, which stops where a child would be stopped."""
 
     def count(done: int, total: int) -> None:
         meter.update(stage, done, total)
-        look()
+        check_stop()
 
     return count
 
@@ -315,15 +317,15 @@ def _artifacts(out: Path) -> dict[str, Path]:
     return {name.as_posix(): path for name, path in found.items() if not any(p.startswith(".") for p in name.parts)}
 
 
-def _of_verdict(verdict: Verdict, stage: str) -> Outcome:
+def _of_verdict(verdict: StopRequest, stage: str) -> Outcome:
     match verdict:
-        case Verdict.CANCEL:
+        case StopRequest.CANCEL:
             return Cancelled(
                 what=f"the job was cancelled in stage {stage!r}",
                 remedy="Retry the job to go on: finished stages are reused.",
                 stage=stage,
             )
-        case Verdict.SHUT_DOWN:
+        case StopRequest.SHUT_DOWN:
             return Abandoned(reason=StopReason.SHUT_DOWN)
     return Abandoned(reason=StopReason.FENCED)
 

@@ -33,7 +33,7 @@ WORK = {
 Counting = Callable[[int, int], None]  # done, total
 
 
-class Assignment(Protocol):
+class JobHandler(Protocol):
     """One claimed job."""
 
     @property
@@ -55,7 +55,7 @@ class Assignment(Protocol):
         """Record what it made, of stored files by path, and end the job; for the log, what that is."""
 
 
-def assignment_of(database: Database, held: jobs.Claim) -> Assignment:
+def handler_of(database: Database, held: jobs.Claim) -> JobHandler:
     """Of a job's kind."""
     of_kind = MapAssignment if held.kind is JobKind.AGGREGATION else DriveAssignment
     return of_kind(database, held)
@@ -113,7 +113,7 @@ class MapAssignment:
         """Of every pair of its scenes, under these settings."""
         held = self._held
         ids = self._inputs.scene_ids
-        return MapShelf.of(held.map_id or "", held.project_id, scenes=ids, settings=held.settings)
+        return MapShelf.from_scenes(held.map_id or "", held.project_id, scenes=ids, settings=held.settings)
 
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
         """The scenes as folders, and the version that they are added to."""

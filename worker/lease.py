@@ -23,7 +23,7 @@ from service.settings import Settings
 
 log = logging.getLogger("mrasfm.worker")
 
-_PATIENCE_S = 2.0  # the main process must not wait long for the database: it renews leases
+_DATABASE_TIMEOUT_S = 2.0  # the main process must not wait long for the database: it renews leases
 
 
 class RenewLeases(bootsteps.StartStopStep):
@@ -74,7 +74,7 @@ class ReportPresence(bootsteps.StartStopStep):
     @staticmethod
     def _report(consumer: Any) -> None:
         # Opened for each report: pool processes are forked from this one and must not share a connection with it.
-        database = Database(consumer.app.mrasfm_settings.resolved_database_url, patience_s=_PATIENCE_S)
+        database = Database(consumer.app.mrasfm_settings.resolved_database_url, timeout_s=_DATABASE_TIMEOUT_S)
         try:
             with database.write() as session:
                 workers.report(

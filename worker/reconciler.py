@@ -12,12 +12,12 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 from service.database.connections import Database, clock_us
 from service.database.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, Pass, now_us
 from service.domain import job_trees, jobs, maps, workers
-from service.job_queue import BrokerError, Wakeups, task_id
+from service.job_queue import BrokerError, JobQueue, task_id
 from service.logs import log_fields
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
 from service.storage.garbage_collection import collect_orphans, collect_unused
-from worker.clock_guard import Silence
+from worker.clock_guard import ClockGuard
 
 log = logging.getLogger("mrasfm.reconciler")
 
@@ -36,11 +36,11 @@ class Reconciler:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._database = Database.of(settings)
+        self._database = Database.from_settings(settings)
         self._artifacts = ArtifactStore(settings)
-        self._wakeups = Wakeups(settings)
+        self._job_queue = JobQueue(settings)
         self._broker_was_there = True
-        self._silence = Silence(settings.lease_seconds)
+        self._clock_guard = ClockGuard(settings.lease_seconds)
         self._limits = jobs.RetryLimits.from_settings(settings)
 
     def close(self) -> None:
@@ -91,7 +91,7 @@ class Reconciler:
         if not due:
             return
         try:
-            known = self._wakeups.waiting()
+            known = self._job_queue.waiting()
             missing = [job for job in due if task_id(job) not in known]
             for i in range(0, len(missing), _BATCH):
                 self._send(missing[i : i + _BATCH])
@@ -107,15 +107,15 @@ class Reconciler:
     def _expire_leases(self) -> list[str]:
         chosen = self._settings
         longest_delay_s = max(chosen.retry_delay_seconds, chosen.longest_retry_delay_seconds)
-        self._silence.ask()
+        self._clock_guard.ask()
         with self._database.write() as session:
-            counts = self._silence.counts(clock_us(session))
+            counts = self._clock_guard.counts(clock_us(session))
             lost = jobs.expire_leases(session, limits=self._limits, only_ended=not counts)
             jobs.bound_times(session, lease_us=int(chosen.lease_seconds * 1e6), delay_us=int(longest_delay_s * 1e6))
         return lost
 
     def _send(self, missing: list[Job]) -> None:
-        self._wakeups.send(missing)
+        self._job_queue.send(missing)
         with self._database.write() as session:
             jobs.mark_enqueued(session, [job.id for job in missing])
 

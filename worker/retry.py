@@ -19,7 +19,7 @@ from service.storage.artifacts import ArtifactStore
 
 log = logging.getLogger("mrasfm.worker")
 
-PATIENCE_S = 120.0
+RETRY_BUDGET_S = 120.0
 
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
@@ -47,22 +47,22 @@ _FINAL = (
 )
 
 T = TypeVar("T")
-Look = Callable[[], None]
+CheckStop = Callable[[], None]
 
 
-def _see_nothing() -> None:
-    """Of who has nothing to look at."""
+def _never_stop() -> None:
+    """Nothing asks for a stop."""
 
 
-def patiently(step: Callable[[], T], *, patience_s: float = PATIENCE_S, look: Look = _see_nothing) -> T:
-    """Do something that may be done again, until it is taken or `patience_s` have passed.
+def retry(step: Callable[[], T], *, budget_s: float = RETRY_BUDGET_S, check_stop: CheckStop = _never_stop) -> T:
+    """Do something that may be done again, until it is taken or `budget_s` have passed.
 
     Parameters
     ----------
-    look
+    check_stop
         Called several times a second between two tries; what it raises ends the waiting.
     """
-    end_s = time.monotonic() + patience_s
+    end_s = time.monotonic() + budget_s
     pause_s = _FIRST_PAUSE_S
     while True:
         try:
@@ -73,7 +73,7 @@ def patiently(step: Callable[[], T], *, patience_s: float = PATIENCE_S, look: Lo
             log.warning("what a step needs is away; it is tried again", exc_info=True)
         again_s = time.monotonic() + pause_s
         while (left_s := again_s - time.monotonic()) > 0:
-            look()
+            check_stop()
             time.sleep(min(left_s, _LOOK_EVERY_S))
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
@@ -87,11 +87,11 @@ def may_pass(error: Exception) -> bool:
     return isinstance(error, store.BaseError) and not isinstance(error, _FINAL)
 
 
-def watched(step: Callable[[], T], look: Look) -> T:
-    """Do something that may hang, and look meanwhile whether it is still wanted.
+def watched(step: Callable[[], T], check_stop: CheckStop) -> T:
+    """Do something that may hang, and check meanwhile whether it is still wanted.
 
-    What `look` raises is passed on. The step is left to itself then: it looks too where it can, and else ends with
-    what it hangs on, or with the process.
+    What `check_stop` raises is passed on. The step is left to itself then: it checks too where it can, and
+    else ends with what it hangs on, or with the process.
     """
     future: Future[T] = Future()
 
@@ -105,25 +105,25 @@ def watched(step: Callable[[], T], look: Look) -> T:
     thread.start()
     try:
         while not wait([future], _LOOK_EVERY_S).done:
-            look()
+            check_stop()
     except BaseException:
         thread.join(_ENDS_WITHIN_S)
         raise
     return future.result()
 
 
-class PatientFetch:
+class RetryingFetch:
     """Brings objects from the artifact store as `ArtifactStore.fetch` does, also where it is away for a while."""
 
-    def __init__(self, artifacts: ArtifactStore, *, patience_s: float, look: Look) -> None:
+    def __init__(self, artifacts: ArtifactStore, *, budget_s: float, check_stop: CheckStop) -> None:
         self._artifacts = artifacts
-        self._patience_s = patience_s
-        self._look = look
+        self._budget_s = budget_s
+        self._check_stop = check_stop
 
     def __call__(self, key: str, target: Path) -> None:
         """Put the object's bytes at `target`."""
-        patiently(
-            lambda: self._artifacts.fetch(key, target, look=self._look),
-            patience_s=self._patience_s,
-            look=self._look,
+        retry(
+            lambda: self._artifacts.fetch(key, target, check_stop=self._check_stop),
+            budget_s=self._budget_s,
+            check_stop=self._check_stop,
         )

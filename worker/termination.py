@@ -23,10 +23,10 @@ class StopReason(IntEnum):
     ORPHANED = 5  # who started this supervisor is gone
 
 
-_PATIENT = (StopReason.CANCEL, StopReason.TIMEOUT)
+_GRACEFUL = (StopReason.CANCEL, StopReason.TIMEOUT)
 
 
-class Escalation:
+class Termination:
     """The steps by which a child is stopped, each in its time.
 
     Parameters
@@ -46,7 +46,7 @@ class Escalation:
 
     def stop(self, reason: StopReason, now_s: float) -> None:
         """Begin to stop the child, if it is not being stopped for at least as good a reason."""
-        if self.reason is not None and (reason <= self.reason or reason in _PATIENT):
+        if self.reason is not None and (reason <= self.reason or reason in _GRACEFUL):
             return
         self.reason = reason
         self._steps = sorted(((now_s + after_s, step) for after_s, step in self._plan(reason)), key=lambda s: s[0])
@@ -63,7 +63,7 @@ class Escalation:
         def kill() -> None:
             self._send(signal.SIGKILL)
 
-        if reason in _PATIENT:
+        if reason in _GRACEFUL:
             return [
                 (0.0, self._ask),
                 (self._settings.terminate_after_seconds, terminate),

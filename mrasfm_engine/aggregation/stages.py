@@ -123,8 +123,19 @@ def _scenes_of_map(folder: Path) -> dict[str, SourceScene]:
                 remedy="Copy or download the map again, or make it anew from its scenes.",
                 code="damaged-map",
             )
-        result[entry["name"]] = SourceScene.unpack(entry["name"], *found)
+        try:
+            result[entry["name"]] = SourceScene.unpack(entry["name"], *found)
+        except (KeyError, TypeError, ValueError) as error:
+            raise _of_another_version(folder, f"{SCENES_FOLDER}/{entry['name']}.npz: {error}") from error
     return result
+
+
+def _of_another_version(folder: Path, what: str) -> InputError:
+    return InputError(
+        f"map {folder} was written by another version of the engine: {what}",
+        remedy="Make the map anew from its scenes.",
+        code="map-version",
+    )
 
 
 def map_document(folder: Path) -> dict[str, Any]:
@@ -140,7 +151,7 @@ def map_document(folder: Path) -> dict[str, Any]:
             raise FileNotFoundError("it has no report.json")
         document = json.loads((folder / MAP_FILE).read_text(encoding="utf-8"))
         if document["version"] != 1:
-            raise ValueError(f"version {document['version']!r}")
+            raise _of_another_version(folder, f"{MAP_FILE} is of version {document['version']!r}, not of 1")
         names = [scene["name"] for scene in document["scenes"]]
         if len(set(names)) != len(names):
             raise ValueError("a scene is in it twice")

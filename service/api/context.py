@@ -10,7 +10,7 @@ from service.api.http.fair_places import FairPlaces
 from service.database.connections import Database
 from service.domain.keys import KeyRing
 from service.domain.request_holds import HoldKeeper
-from service.job_queue import Wakeups
+from service.job_queue import JobQueue
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
 
@@ -30,7 +30,7 @@ class Context:
     keys: KeyRing
     holds: HoldKeeper
     artifacts: ArtifactStore
-    wakeups: Wakeups
+    job_queue: JobQueue
     disk: anyio.CapacityLimiter  # uploads that write at one time
     large_bodies: FairPlaces  # JSON bodies that are in memory at one time
     large_documents: FairPlaces  # of these, what is parsed and recorded at one time
@@ -41,14 +41,14 @@ class Context:
     @classmethod
     def open(cls, settings: Settings) -> Context:
         """Open everything that the settings name; the broker is not asked."""
-        database = Database.of(settings)
+        database = Database.from_settings(settings)
         return cls(
             settings=settings,
             database=database,
             keys=KeyRing(database),
             holds=HoldKeeper(database),
             artifacts=ArtifactStore(settings),
-            wakeups=Wakeups(settings),
+            job_queue=JobQueue(settings),
             disk=anyio.CapacityLimiter(settings.max_concurrent_writes),
             large_bodies=FairPlaces(
                 _LARGE_BODIES, per_project=_LARGE_BODIES // 2, waiting_per_project=_LARGE_BODIES_WAITING

@@ -88,7 +88,7 @@ _IDEMPOTENCY = (
 
 
 @dataclass(frozen=True)
-class Once:
+class IdempotentRequest:
     """Runs a POST's effect in one transaction, once a key, and wakes workers up for the jobs that it made."""
 
     context: Context
@@ -120,7 +120,7 @@ class Once:
         return JSONResponse(answer.body, status_code=answer.status, headers=headers, background=self.background)
 
 
-async def get_once(
+async def get_idempotent_request(
     context: ContextDep,
     caller: CallerDep,
     request: Request,
@@ -131,18 +131,18 @@ async def get_once(
             alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description=_IDEMPOTENCY
         ),
     ] = None,
-) -> Once:
+) -> IdempotentRequest:
     """The idempotent execution of this request."""
-    return Once(context, caller, request, background, idempotency_key)
+    return IdempotentRequest(context, caller, request, background, idempotency_key)
 
 
-OnceDep = Annotated[Once, Depends(get_once)]
+IdempotentDep = Annotated[IdempotentRequest, Depends(get_idempotent_request)]
 
 
 def wake_up(context: Context, waiting: list[Job]) -> None:
     """Tell workers about jobs; where the broker does not answer, the reconciler does it later."""
     try:
-        context.wakeups.send(waiting)
+        context.job_queue.send(waiting)
     except BrokerError as error:
         log.warning("no worker was woken up", extra={"fields": {"why": str(error), "jobs": len(waiting)}})
         return

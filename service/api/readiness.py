@@ -13,7 +13,7 @@ from service.database.tables import WorkerSeen
 from service.errors import ServiceError
 
 _KEPT_S = 2.0  # many may ask, also without a key
-_PATIENCE_S = 8.0
+_TIMEOUT_S = 8.0
 
 
 class Readiness:
@@ -46,7 +46,7 @@ class Readiness:
 
     async def _ask(self) -> ServiceError | None:
         try:
-            with anyio.fail_after(_PATIENCE_S):
+            with anyio.fail_after(_TIMEOUT_S):
                 return await anyio.to_thread.run_sync(self._probe, limiter=self._thread, abandon_on_cancel=True)
         except TimeoutError as error:
             return _not_ready("the database or the artifact store", error)

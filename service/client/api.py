@@ -23,14 +23,22 @@ from schemas.api.scenes import SceneResource
 from schemas.api.status import ServiceStatus
 from schemas.api.uploads import UploadResource
 from service.client.drive_folder import LocalFile
-from service.client.transport import CHECK_TIMEOUT_S, IO_TIMEOUT_S, Body, Patience, Transport, TroubleError, unexpected
+from service.client.transport import (
+    CHECK_TIMEOUT_S,
+    IO_TIMEOUT_S,
+    Body,
+    RetryBudget,
+    Transport,
+    TroubleError,
+    unexpected,
+)
 from service.digests import format_digest
 
 Model = TypeVar("Model", bound=BaseModel)
-PATIENCE_S = 300.0  # a service that is being restarted, or moved
-FIRST_PATIENCE_S = 6.0
+RETRY_S = 300.0  # a service that is being restarted, or moved
+FIRST_RETRY_S = 6.0
 _TUS = {"Tus-Resumable": "1.0.0"}
-_SILENCE_S = 40.0  # an event stream says something every 15 s
+_STREAM_TIMEOUT_S = 40.0  # an event stream says something every 15 s
 
 
 @dataclass(frozen=True)
@@ -56,9 +64,9 @@ class Client:
         An API key.
     connections
         At one time.
-    patience_s
+    retry_s
         For how long one request is tried again.
-    first_patience_s
+    first_retry_s
         The same, as long as nothing has ever answered under this URL.
 
     Raises
@@ -73,12 +81,10 @@ class Client:
         key: str,
         *,
         connections: int = 8,
-        patience_s: float = PATIENCE_S,
-        first_patience_s: float = FIRST_PATIENCE_S,
+        retry_s: float = RETRY_S,
+        first_retry_s: float = FIRST_RETRY_S,
     ) -> None:
-        self._transport = Transport(
-            url, key, connections=connections, patience_s=patience_s, first_patience_s=first_patience_s
-        )
+        self._transport = Transport(url, key, connections=connections, retry_s=retry_s, first_retry_s=first_retry_s)
 
     def __enter__(self) -> Client:
         return self
@@ -110,9 +116,9 @@ class Client:
         """Sleep, unless the client is closed."""
         self._transport.closing.wait(seconds)
 
-    def patience(self) -> Patience:
+    def retry_budget(self) -> RetryBudget:
         """For a series of tries of one thing."""
-        return self._transport.patience()
+        return self._transport.retry_budget()
 
     def status(self) -> ServiceStatus:
         """How the service is."""
@@ -201,7 +207,7 @@ class Client:
         headers = {"Accept": "text/event-stream"} | ({} if after is None else {"Last-Event-ID": str(after)})
         path = f"/v1/jobs/{_part(job_id)}/events"
         try:
-            with self._transport.open("GET", path, headers=headers, read_timeout_s=_SILENCE_S) as response:
+            with self._transport.open("GET", path, headers=headers, read_timeout_s=_STREAM_TIMEOUT_S) as response:
                 yield from _events(_lines(response.iter_bytes()))
         except TroubleError:
             return

@@ -218,7 +218,7 @@ class _Download:
         with self._partial.open("r+b") as partial:
             there_bytes = partial.seek(0, os.SEEK_END)
             self._now_have(there_bytes if there_bytes <= self._file.size_bytes else 0)
-            patience = self._client.patience()
+            budget = self._client.retry_budget()
             while self._have_bytes < self._file.size_bytes:
                 before_bytes = self._received_bytes
                 try:
@@ -226,8 +226,8 @@ class _Download:
                     break
                 except TroubleError as trouble:
                     if self._received_bytes > before_bytes:
-                        patience.renew()
-                    patience.pause(trouble)
+                        budget.renew()
+                    budget.pause(trouble)
             partial.truncate(self._have_bytes)
 
     def _receive(self, partial: BinaryIO) -> None:

@@ -31,14 +31,14 @@ def scene_findings(client: Client, scene_id: str) -> list[Finding]:
     if file is None or file.size_bytes > MAX_REPORT_BYTES:
         return []
     resource = f"/v1/scenes/{quote(scene_id, safe='')}"
-    patience = client.patience()
+    budget = client.retry_budget()
     while True:
         try:
             with client.open_file(resource, REPORT_NAME, sha256=file.sha256) as (_, pieces):
                 data = b"".join(pieces)
             return _findings(data)
         except TroubleError as trouble:
-            patience.pause(trouble)
+            budget.pause(trouble)
 
 
 def _findings(report: bytes) -> list[Finding]:

@@ -9,7 +9,7 @@ from service.client.api import Client
 from service.client.drive_folder import LocalFile
 from service.client.errors import ApiError, ClientError
 from service.client.parallel import Meter
-from service.client.transport import Patience, TroubleError
+from service.client.transport import RetryBudget, TroubleError
 
 # Smaller ones are sent again from their beginning: the questions where to go on would take as long.
 FROM_BYTES = 8 << 20
@@ -40,7 +40,7 @@ class ResumableUpload:
         """The upload's id: as before, where the service still knows it; else anew."""
         if self._id:
             try:
-                self._offset(self._client.patience())
+                self._offset(self._client.retry_budget())
                 return self._id
             except ApiError as error:
                 if error.status not in _ENDED:
@@ -64,34 +64,34 @@ class ResumableUpload:
             It does not answer.
         """
         self.begin()
-        patience, reached_bytes = self._client.patience(), 0
-        while (offset := self._offset(patience)) < self._file.size_bytes:
+        budget, reached_bytes = self._client.retry_budget(), 0
+        while (offset := self._offset(budget)) < self._file.size_bytes:
             if offset > reached_bytes:  # however little of what was sent: it goes on
-                patience.renew()
+                budget.renew()
             reached_bytes = offset
             self._count(offset)
             try:
                 self._append(offset)
             except TroubleError as trouble:
-                patience.pause(trouble)
+                budget.pause(trouble)
             except ApiError as error:
                 # Another request, perhaps an earlier one of ours, is still being served, or has just been.
                 if error.code not in ("wrong-offset", "upload-locked"):
                     raise
-                patience.pause(TroubleError(error, 1.0))
+                budget.pause(TroubleError(error, 1.0))
         self._count(self._file.size_bytes)
 
     def _append(self, offset: int) -> None:
         self._client.append_to_upload(self._drive_id, self._id, offset, lambda: self._pieces(offset))
 
-    def _offset(self, patience: Patience) -> int:
+    def _offset(self, budget: RetryBudget) -> int:
         while True:
             try:
                 return self._client.upload_offset(self._drive_id, self._id)
             except ApiError as error:
                 match error.status:
                     case HTTPStatus.LOCKED:
-                        patience.pause(TroubleError(error, 1.0))
+                        budget.pause(TroubleError(error, 1.0))
                     case HTTPStatus.CONFLICT:  # an answer to HEAD has no words: this one says why, or begins anew
                         self._id = self._create()
                     case _:

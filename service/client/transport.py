@@ -39,7 +39,7 @@ Body = Callable[[], Iterator[bytes]]  # called for every try, so that each begin
 
 
 class TroubleError(ClientError):
-    """Something that may pass: `cause` is what to raise once patience is over."""
+    """Something that may pass: `cause` is raised once the retry budget is spent."""
 
     def __init__(self, cause: ClientError, retry_after_s: float | None = None) -> None:
         super().__init__(str(cause))
@@ -47,7 +47,7 @@ class TroubleError(ClientError):
         self.retry_after_s = retry_after_s
 
 
-class Patience:
+class RetryBudget:
     """Waits longer and longer between tries, and ends after `limit_s` without success."""
 
     def __init__(self, limit_s: Callable[[], float], closing: threading.Event) -> None:
@@ -56,7 +56,7 @@ class Patience:
         self.renew()
 
     def renew(self) -> None:
-        """Something worked: all patience is back."""
+        """Something worked: the whole budget is back."""
         self._began_s = time.monotonic()
         self._delay_s = FIRST_DELAY_S
 
@@ -66,7 +66,7 @@ class Patience:
         Raises
         ------
         ClientError
-            The trouble's cause, where there is no patience left.
+            The trouble's cause, where the budget is spent.
         """
         delay_s = self._delay_s * random.uniform(0.5, 1.0)  # many clients shall not come back at the same moment
         if trouble.retry_after_s is not None:
@@ -87,9 +87,9 @@ class Transport:
         Sent as bearer token, and never shown.
     connections
         At one time.
-    patience_s
+    retry_s
         For how long one request is tried again.
-    first_patience_s
+    first_retry_s
         The same, as long as nothing has ever answered: then the URL is probably wrong.
 
     Raises
@@ -99,12 +99,12 @@ class Transport:
     """
 
     def __init__(
-        self, url: str, key: str, *, connections: int, patience_s: float, first_patience_s: float | None = None
+        self, url: str, key: str, *, connections: int, retry_s: float, first_retry_s: float | None = None
     ) -> None:
         self.url = checked_url(url)
         self._answered = False
-        self._patience_s = patience_s
-        self._first_patience_s = patience_s if first_patience_s is None else first_patience_s
+        self._retry_s = retry_s
+        self._first_retry_s = retry_s if first_retry_s is None else first_retry_s
         self.closing = threading.Event()
         self._connections = _Connections()
         self._http = httpx.Client(
@@ -127,9 +127,9 @@ class Transport:
         self.stop()
         self._http.close()
 
-    def patience(self) -> Patience:
+    def retry_budget(self) -> RetryBudget:
         """For a series of tries of one thing."""
-        return Patience(lambda: self._patience_s if self._answered else self._first_patience_s, self.closing)
+        return RetryBudget(lambda: self._retry_s if self._answered else self._first_retry_s, self.closing)
 
     def request(
         self,
@@ -150,7 +150,7 @@ class Transport:
         UnreachableError
             Nothing answered.
         """
-        patience = self.patience()
+        budget = self.retry_budget()
         while True:
             try:
                 with self.open(
@@ -159,7 +159,7 @@ class Transport:
                     response.read()
                     return response
             except TroubleError as trouble:
-                patience.pause(trouble)
+                budget.pause(trouble)
 
     @contextmanager
     def open(

@@ -40,7 +40,7 @@ def _in_transaction(action: Action, settings: Settings, arguments: argparse.Name
     from service.database.connections import Database, migrate
 
     migrate(settings)
-    database = Database.of(settings)
+    database = Database.from_settings(settings)
     try:
         with database.write() as session:
             return action(session, settings, arguments)

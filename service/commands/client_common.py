@@ -27,7 +27,7 @@ exit codes: 0 done; 2 the input is at fault or the service refuses it; 3 the job
 cannot be reached; 130 interrupted"""
 
 
-class Told(Protocol):
+class CommandSummary(Protocol):
     """The part of a command's summary that says what went wrong."""
 
     error: str | None
@@ -51,7 +51,7 @@ def connect(arguments: argparse.Namespace, display: Display) -> Client:
     return client
 
 
-def talk(converse: Callable[[Display], int], summary: Told, *, job_of: Callable[[], str | None]) -> int:
+def talk(converse: Callable[[Display], int], summary: CommandSummary, *, job_of: Callable[[], str | None]) -> int:
     """Run a conversation, and say what went wrong in it; the exit code."""
     from service.client import ApiError, ClientError, UnreachableError
     from service.client.display import Display
@@ -72,7 +72,7 @@ def talk(converse: Callable[[Display], int], summary: Told, *, job_of: Callable[
             return failed(summary, display, f"interrupted.{more} The same command goes on from here.", EXIT_INTERRUPTED)
 
 
-def job_failed(job: JobResource, summary: Told, display: Display) -> int:
+def job_failed(job: JobResource, summary: CommandSummary, display: Display) -> int:
     """Say how a job ended that has no result, and give the exit code back."""
     if job.problem is None:
         text = f"job {job.id} was {job.state}. Give the same command again for another job."
@@ -106,7 +106,7 @@ def _shortened(lines: list[str]) -> list[str]:
     return [*lines[:_SHOWN_ITEMS], f"  and {len(lines) - _SHOWN_ITEMS} more"]
 
 
-def failed(summary: Told, display: Display, text: str, code: int) -> int:
+def failed(summary: CommandSummary, display: Display, text: str, code: int) -> int:
     """Say why, and give the exit code back."""
     summary.error = text.splitlines()[0]
     display.say(f"mrasfm: error: {text}" if code != EXIT_INTERRUPTED else f"mrasfm: {text}")

@@ -24,8 +24,8 @@ SEED = 1
 DRIVES = 2
 CAMERAS = 6
 EXIT_FAILED, EXIT_REFUSED, EXIT_INTERRUPTED = 1, 2, 130
-_START_PATIENCE_S = 120.0
-_STOP_PATIENCE_S = 90.0
+_START_TIMEOUT_S = 120.0
+_STOP_TIMEOUT_S = 90.0
 # -P: a folder named like our package in the current directory must not be run instead.
 _PYTHON = (sys.executable, "-P")
 _MRASFM = (*_PYTHON, "-c", "from mrasfm_engine.cli import main; raise SystemExit(main())")
@@ -166,7 +166,7 @@ class _Demo:
     def _await_ready(self, process: subprocess.Popen[bytes], port: int) -> None:
         import httpx
 
-        until_s = time.monotonic() + _START_PATIENCE_S
+        until_s = time.monotonic() + _START_TIMEOUT_S
         while time.monotonic() < until_s:
             if process.poll() is not None:
                 raise DemoError(f"the service ended with exit code {process.returncode}. {self._log()}")
@@ -175,7 +175,7 @@ class _Demo:
                     return
             except httpx.TransportError:
                 time.sleep(0.2)
-        raise DemoError(f"the service was not ready after {_START_PATIENCE_S:.0f} s. {self._log()}")
+        raise DemoError(f"the service was not ready after {_START_TIMEOUT_S:.0f} s. {self._log()}")
 
     def _log(self) -> str:
         return f"See {self._out / 'service.log'} and {self._out / 'service' / 'logs'}."
@@ -260,7 +260,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     """Stop the service in order; a second Ctrl-C, or one that hangs, is answered by force."""
     process.terminate()
     try:
-        process.wait(_STOP_PATIENCE_S)
+        process.wait(_STOP_TIMEOUT_S)
     except (subprocess.TimeoutExpired, KeyboardInterrupt):
         process.kill()
         process.wait()

@@ -36,17 +36,17 @@ class Database:
     ----------
     url
         SQLAlchemy's.
-    patience_s
+    timeout_s
         How long to wait for a lock of SQLite's, or for a server to answer; a statement gets four times as long.
     """
 
-    def __init__(self, url: str, *, patience_s: float = 30.0) -> None:
+    def __init__(self, url: str, *, timeout_s: float = 30.0) -> None:
         embedded = make_url(url).get_backend_name() == "sqlite"
-        self.engine = _sqlite(url, patience_s) if embedded else _server(url, patience_s)
+        self.engine = _sqlite(url, timeout_s) if embedded else _server(url, timeout_s)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
 
     @classmethod
-    def of(cls, settings: Settings) -> Database:
+    def from_settings(cls, settings: Settings) -> Database:
         """The database that the settings name."""
         return cls(settings.resolved_database_url)
 
@@ -109,22 +109,22 @@ def clock_us(session: Session) -> int:
     return int(session.scalars(text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")).one())
 
 
-def _server(url: str, patience_s: float) -> Engine:
+def _server(url: str, timeout_s: float) -> Engine:
     chosen = make_url(url).query.get("options", "")  # the operator's come last: they win
     options = {
-        "connect_timeout": max(2, min(10, round(patience_s))),
+        "connect_timeout": max(2, min(10, round(timeout_s))),
         # A server that has vanished without a word is noticed within half a minute; else a thread waits for ever.
         "keepalives": 1,
         "keepalives_idle": 10,
         "keepalives_interval": 5,
         "keepalives_count": 3,
         "tcp_user_timeout": 20_000,
-        "options": f"-c statement_timeout={round(4000 * patience_s)} {chosen}".rstrip(),
+        "options": f"-c statement_timeout={round(4000 * timeout_s)} {chosen}".rstrip(),
     }
     return create_engine(url, pool_pre_ping=True, connect_args=options, **_ENGINE)
 
 
-def _sqlite(url: str, patience_s: float) -> Engine:
+def _sqlite(url: str, timeout_s: float) -> Engine:
     path = make_url(url).database
     if path:
         Path(path).parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -133,8 +133,8 @@ def _sqlite(url: str, patience_s: float) -> Engine:
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, record: Any) -> None:
         connection.isolation_level = None  # transactions begin where we say, not where the driver guesses
-        connection.execute(f"PRAGMA busy_timeout={round(1000 * patience_s)}")
-        _write_ahead(connection, patience_s)
+        connection.execute(f"PRAGMA busy_timeout={round(1000 * timeout_s)}")
+        _write_ahead(connection, timeout_s)
         connection.execute("PRAGMA foreign_keys=ON")
 
     @event.listens_for(engine, "begin")
@@ -150,12 +150,12 @@ def _sqlite(url: str, patience_s: float) -> Engine:
     return engine
 
 
-def _write_ahead(connection: sqlite3.Connection, patience_s: float) -> None:
+def _write_ahead(connection: sqlite3.Connection, timeout_s: float) -> None:
     """Make readers not wait for the writer.
 
     While one process changes a new database to this mode, SQLite refuses the others at once, whatever its timeout is.
     """
-    end_s = time.monotonic() + patience_s
+    end_s = time.monotonic() + timeout_s
     while True:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
@@ -171,7 +171,7 @@ def migrate(settings: Settings) -> None:
     from alembic import command
     from alembic.config import Config
 
-    database = Database.of(settings)
+    database = Database.from_settings(settings)
     if database.engine.dialect.name == "sqlite":
         event.listen(database.engine, "connect", _ignore_references)
     config = Config()

@@ -37,7 +37,7 @@ class _Plan:
     scenes: dict[str, Scene] = field(default_factory=dict)  # by drive, as asked for
     found: dict[str, Scene] = field(default_factory=dict)  # by drive, of those that were asked for by their drives
     under_way: dict[str, Job] = field(default_factory=dict)  # by drive
-    kept: list[MapScene] = field(default_factory=list)
+    remaining: list[MapScene] = field(default_factory=list)
     removed: list[MapScene] = field(default_factory=list)
 
     @property
@@ -96,7 +96,7 @@ def create(
             "asked": asked.model_dump(mode="json", exclude_none=True),
             "require_all": asked.require_all,
             "base_version": of_map.current_version,
-            "kept_scenes": len(plan.kept),
+            "kept_scenes": len(plan.remaining),
             "remove": [scene.name for scene in plan.removed],
         },
         waiting_for=1,  # until its members are known
@@ -127,7 +127,7 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> tuple[Job, l
 def _checked(session: Session, project_id: str, asked: AggregationRequest, of_map: Map | None) -> _Plan:
     plan = _Plan()
     if of_map is not None:
-        plan.kept = maps.scenes_of(session, of_map)
+        plan.remaining = maps.scenes_of(session, of_map)
     _take_out(plan, asked.remove, of_map)
     # Rows that are locked so are not deleted; other aggregations may do the same, in whatever order.
     session.scalars(select(Scene.id).where(Scene.id.in_(asked.scenes)).with_for_update(read=True, key_share=True)).all()
@@ -144,14 +144,14 @@ def _checked(session: Session, project_id: str, asked: AggregationRequest, of_ma
     coming = len(plan.scenes) + len(plan.drives)
     if not coming and not plan.removed:
         raise _unusable("nothing-to-do", "the request names neither drives nor scenes", "Name what the map is made of.")
-    if coming + len(plan.kept) < jobs.MIN_SCENES:
-        what = f"{coming + len(plan.kept)} scene is left, a map needs {jobs.MIN_SCENES}"
+    if coming + len(plan.remaining) < jobs.MIN_SCENES:
+        what = f"{coming + len(plan.remaining)} scene is left, a map needs {jobs.MIN_SCENES}"
         raise _unusable("too-few-scenes", what, "Name more drives or scenes; a single scene needs no aggregation.")
     return plan
 
 
 def _take_out(plan: _Plan, remove: Collection[str], of_map: Map | None) -> None:
-    named = {given: scene for scene in plan.kept for given in (scene.drive_id, scene.scene_id)}
+    named = {given: scene for scene in plan.remaining for given in (scene.drive_id, scene.scene_id)}
     unknown = sorted(set(remove) - named.keys())
     if unknown:
         where = "a new map" if of_map is None else f"the current version of map {of_map.id}"
@@ -163,12 +163,12 @@ def _take_out(plan: _Plan, remove: Collection[str], of_map: Map | None) -> None:
     if twice is not None:
         raise _unusable("removed-twice", f"scene {twice.name!r} is to be taken out twice", "Name it once.")
     plan.removed = taken
-    plan.kept = [scene for scene in plan.kept if scene not in taken]
+    plan.remaining = [scene for scene in plan.remaining if scene not in taken]
 
 
 def _require_once(plan: _Plan, drive_id: str, what: str) -> None:
     """The same drive twice would fit itself everywhere."""
-    kept = next((scene for scene in plan.kept if scene.drive_id == drive_id), None)
+    kept = next((scene for scene in plan.remaining if scene.drive_id == drive_id), None)
     if kept is not None:
         remedy = f"Take the one that is there out in the same request: remove {kept.scene_id}."
         raise _unusable("drive-twice", f"{what} brings drive {drive_id}, which is in the map as {kept.name!r}", remedy)
@@ -231,7 +231,7 @@ def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
 
 def _members(session: Session, job: Job, plan: _Plan) -> Iterator[Job | None]:
     """Record what the aggregation brings; for each the job that makes its scene, None where that is there."""
-    taken = {scene.name for scene in (*plan.kept, *plan.removed)}
+    taken = {scene.name for scene in (*plan.remaining, *plan.removed)}
     for drive_id, scene in plan.scenes.items():
         name = _name(scene.name, taken)
         session.add(JobMember(job_id=job.id, drive_id=drive_id, name=name, scene_id=scene.id))

@@ -43,25 +43,27 @@ class MapShelf:
 
     Attributes
     ----------
-    slots
+    digests
         By the name of a stage's file, the digest of all that it is made of.
     """
 
     map_id: str
     project_id: str
-    slots: Mapping[str, str]
+    digests: Mapping[str, str]
 
     @staticmethod
-    def of(map_id: str, project_id: str, *, scenes: Mapping[str, str], settings: Mapping[str, Any]) -> MapShelf:
-        """Of the scenes of a map, ids by name, under some settings."""
+    def from_scenes(
+        map_id: str, project_id: str, *, scenes: Mapping[str, str], settings: Mapping[str, Any]
+    ) -> MapShelf:
+        """The shelf for scenes of a map, ids by name, under some settings."""
         under = settings_sha256(settings)
-        slots = {
+        digests = {
             checkpoint_file(seam_checkpoint(a, b)): hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
             for a, first in scenes.items()
             for b, second in scenes.items()
             if a != b
         }
-        return MapShelf(map_id, project_id, slots)
+        return MapShelf(map_id, project_id, digests)
 
 
 Shelf = DriveShelf | MapShelf
@@ -117,7 +119,7 @@ def _shelved(session: Session, shelf: Shelf) -> dict[str, _Kept]:
         of_maps.where(MapCheckpoint.project_id == shelf.project_id).order_by(MapCheckpoint.created_us)
     )
     known = {inputs: _Kept(*kept) for inputs, *kept in rows}  # the newest
-    return {name: known[inputs] for name, inputs in shelf.slots.items() if inputs in known}
+    return {name: known[inputs] for name, inputs in shelf.digests.items() if inputs in known}
 
 
 def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> bool:
@@ -140,7 +142,7 @@ def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> bo
         return False
     kept = False
     for name, file in stored.items():
-        if isinstance(shelf, MapShelf) and name not in shelf.slots:
+        if isinstance(shelf, MapShelf) and name not in shelf.digests:
             continue
         blob = blobs.record(session, project_id=owner.project_id, within_quota=False, **file.identity)
         checkpoint = _find(session, shelf, name)
@@ -174,7 +176,7 @@ def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoi
         case DriveShelf():
             return session.get(Checkpoint, (shelf.drive_id, shelf.settings_sha256, name))
         case MapShelf():
-            return session.get(MapCheckpoint, (shelf.map_id, shelf.slots[name], _SEAM))
+            return session.get(MapCheckpoint, (shelf.map_id, shelf.digests[name], _SEAM))
 
 
 def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
@@ -187,7 +189,7 @@ def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
             return MapCheckpoint(
                 map_id=shelf.map_id,
                 project_id=shelf.project_id,
-                inputs_sha256=shelf.slots[name],
+                inputs_sha256=shelf.digests[name],
                 name=_SEAM,
                 blob_id=blob_id,
             )

@@ -105,7 +105,7 @@ def ensure_first_key(settings: Settings) -> str | None:
     str or None
         The key's secret, which cannot be shown again; None where keys were made before.
     """
-    database = Database.of(settings)
+    database = Database.from_settings(settings)
     try:
         with database.write() as session:
             if session.scalar(select(ApiKey.id).limit(1)) is not None:

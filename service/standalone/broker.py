@@ -149,7 +149,7 @@ def find_server() -> Path:
     return packaged
 
 
-def answers(url: str) -> bool:
+def is_up(url: str) -> bool:
     """Whether the server answers; False while it starts or loads its data."""
     retry = Retry(NoBackoff(), 0)
     try:

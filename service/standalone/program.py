@@ -112,7 +112,7 @@ def _broker_spec(embedded: broker.EmbeddedBroker, settings: Settings) -> ChildSp
     return ChildSpec(
         name="broker",
         argv=embedded.argv,
-        is_ready=lambda: broker.answers(embedded.url),
+        is_ready=lambda: broker.is_up(embedded.url),
         repair=lambda lines: broker.set_damaged_journal_aside(_broker_folder(settings), lines),
         listens_on=(broker.HOST, embedded.port),
         port_remedy="Start again: another port is chosen then.",

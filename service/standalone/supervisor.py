@@ -32,7 +32,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FIRST_DELAY_S = 0.5  # before a restart; doubles with each failure
 LONGEST_DELAY_S = 10.0
 STABLE_AFTER_S = 60.0  # a child that lived this long starts again without waiting longer than the first time
-SETTLED_AFTER_S = 10.0  # a child without a probe has proven by then that it can start
+PROVEN_AFTER_S = 10.0  # a child without a probe has proven by then that it can start
 MAX_FAILED_STARTS = 3  # of a child that has never proven so; then it is not a crash but something to correct
 PROBE_INTERVAL_S = 0.2
 MAX_SILENT = 4  # questions in a row; a machine that was suspended or is very busy leaves one or two unanswered
@@ -146,7 +146,7 @@ class Supervisor:
             self._after_death(child)
         elif not (child.ready and child.proven):
             child.probe()
-        elif child.spec.ask is not None and not child.answers(child.spec.ask):
+        elif child.spec.ask is not None and not child.is_alive(child.spec.ask):
             self._say(f"{child.spec.name} runs but has not answered {MAX_SILENT} times, and is killed")
             child.kill()
 
@@ -278,7 +278,7 @@ class _Child:
         """See whether it is ready by now."""
         age_s = time.monotonic() - self._started_at_s
         if self.spec.is_ready is None:
-            self.proven = age_s >= SETTLED_AFTER_S
+            self.proven = age_s >= PROVEN_AFTER_S
             return
         self.ready = self.spec.is_ready()
         self.proven = self.proven or self.ready
@@ -288,7 +288,7 @@ class _Child:
                 f"What it is doing is in {self.log.path}."
             )
 
-    def answers(self, ask: Callable[[], Pulse]) -> bool:
+    def is_alive(self, ask: Callable[[], Pulse]) -> bool:
         """Ask now and then whether it lives; False once it has left too many questions unanswered."""
         now_s = time.monotonic()
         if now_s < self.ask_at_s:
@@ -315,7 +315,7 @@ class _Child:
         self.kill()  # what it started and left
         self._guard.forget(self.process.pid)
         self.note_failure()
-        ending = _ending(self.process.returncode)
+        ending = _exit_text(self.process.returncode)
         self.failed = self.process.returncode > 0
         self.process, self.ready = None, False
         if self._asked is not None:
@@ -437,7 +437,7 @@ def _sleep(wakeup: int, timeout_s: float) -> None:
             os.read(wakeup, 4096)
 
 
-def _ending(returncode: int) -> str:
+def _exit_text(returncode: int) -> str:
     if returncode >= 0:
         return f"ended with exit code {returncode}"
     try:

@@ -29,14 +29,14 @@ _CHUNK_BYTES = 1 << 20
 _DELETE_BATCH = 500
 _PREFIX = "blobs"  # of all keys that are listed
 # A store that is silent must not hold the threads of all requests for minutes, as it does by default.
-_PATIENCE = {
+_TIMEOUTS = {
     "connect_timeout": timedelta(seconds=5),
     "read_timeout": timedelta(seconds=30),  # without a byte of the answer; no request sends more than some MiB
     "timeout": timedelta(minutes=15),  # to the last byte of a large object
 }
 _RETRIES = {"max_retries": 3, "retry_timeout": timedelta(seconds=15)}
 # Whether the store can be used is asked often, and a late answer is of no use.
-_PROBE_PATIENCE = {"connect_timeout": timedelta(seconds=3), "timeout": timedelta(seconds=3)}
+_PROBE_TIMEOUTS = {"connect_timeout": timedelta(seconds=3), "timeout": timedelta(seconds=3)}
 _PROBE_RETRIES = {"max_retries": 0}
 
 Fetch = Callable[[str, Path], None]  # as `ArtifactStore.fetch`: key, target
@@ -66,8 +66,8 @@ class ArtifactStore:
             self._root = Path(unquote(urlsplit(url).path))
             self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
         else:
-            self._store = _open(url, settings, _PATIENCE, _RETRIES)
-            self._probed = _open(url, settings, _PROBE_PATIENCE, _PROBE_RETRIES)
+            self._store = _open(url, settings, _TIMEOUTS, _RETRIES)
+            self._probed = _open(url, settings, _PROBE_TIMEOUTS, _PROBE_RETRIES)
 
     @property
     def folder(self) -> Path | None:
@@ -137,14 +137,14 @@ class ArtifactStore:
             return None
         return digest.hexdigest()
 
-    def fetch(self, key: str, target: Path, *, look: Callable[[], None] = lambda: None) -> None:
+    def fetch(self, key: str, target: Path, *, check_stop: Callable[[], None] = lambda: None) -> None:
         """Put the object's bytes at `target`, read-only; without copying where the file system allows.
 
         It may be tried again: where it fails, nothing is left at `target`.
 
         Parameters
         ----------
-        look
+        check_stop
             Called between pieces; what it raises ends the transfer.
 
         Raises
@@ -161,12 +161,12 @@ class ArtifactStore:
                 with _whole_or_gone(target):
                     shutil.copy2(self._root / key, target)
             return
-        look()
+        check_stop()
         found = obstore.get(self._store, key)  # first: what is not there leaves no empty file
         with _whole_or_gone(target):
             with target.open("xb") as file:
                 for chunk in found.stream(min_chunk_size=_CHUNK_BYTES):
-                    look()
+                    check_stop()
                     file.write(chunk)
             os.chmod(target, 0o440)
 
@@ -253,8 +253,8 @@ class ArtifactStore:
             obstore.delete(self._probed, key)
 
 
-def _open(url: str, settings: Settings, patience: Mapping[str, Any], retries: Mapping[str, Any]) -> Any:
-    client = dict(patience)
+def _open(url: str, settings: Settings, timeouts: Mapping[str, Any], retries: Mapping[str, Any]) -> Any:
+    client = dict(timeouts)
     options: dict[str, Any] = {"client_options": client, "retry_config": dict(retries)}
     if url.startswith("s3"):
         options["region"] = settings.s3_region

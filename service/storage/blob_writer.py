@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,12 +65,10 @@ def store_file(
         path.unlink()
         return StoredFile(sha256=sha256, size_bytes=known.size_bytes, key=known.key, is_new=False)
     key = blobs.new_key(project_id, sha256)
-    return _adopt(artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=True)
+    return _put(artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=True)
 
 
-def _adopt(
-    artifacts: ArtifactStore, path: Path, key: str, *, sha256: str, size_bytes: int, durable: bool
-) -> StoredFile:
+def _put(artifacts: ArtifactStore, path: Path, key: str, *, sha256: str, size_bytes: int, durable: bool) -> StoredFile:
     boot = None if durable or artifacts.folder is None else boot_id()
     artifacts.put_file(path, key, durable=boot is None)
     return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, is_new=True, written_in_boot=boot)
@@ -85,9 +83,8 @@ def _find(database: Database, project_id: str, sha256: str) -> Blob | None:
         return blobs.find(session, project_id, sha256)
 
 
-@contextlib.contextmanager
-def storing(database: Database, artifacts: ArtifactStore, *, project_id: str, durable: bool) -> Iterator[Storing]:
-    """Store files that are recorded within the block, and take back what was not recorded at its end.
+class BlobWriter:
+    """Stores files that are recorded within its block, and takes back at its end what was not recorded.
 
     A request that is refused after its bytes were stored, for a quota or a conflict, leaves nothing behind.
 
@@ -96,18 +93,8 @@ def storing(database: Database, artifacts: ArtifactStore, *, project_id: str, du
     durable
         Whether the bytes survive a power cut at once; else `durability.secure_drive` has to follow.
     """
-    store = Storing(database, artifacts, project_id, durable=durable)
-    try:
-        yield store
-    finally:
-        with contextlib.suppress(Exception):  # else the reconciler collects them
-            store.take_back()
 
-
-class Storing:
-    """Stores files for one request."""
-
-    def __init__(self, database: Database, artifacts: ArtifactStore, project_id: str, *, durable: bool) -> None:
+    def __init__(self, database: Database, artifacts: ArtifactStore, *, project_id: str, durable: bool) -> None:
         self._durable = durable
         self._database = database
         self._artifacts = artifacts
@@ -115,6 +102,13 @@ class Storing:
         self._new: set[str] = set()
         self._recorded_us = now_us()
         self._unused: list[blobs.Recorded] = []
+
+    def __enter__(self) -> BlobWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Exception):  # else the reconciler collects them
+            self._rollback()
 
     def __call__(self, path: Path, *, sha256: str, size_bytes: int) -> StoredFile:
         """Make a file of the spool an object; the file is gone afterwards.
@@ -124,7 +118,7 @@ class Storing:
         """
         key = blobs.new_key(self._project_id, sha256)
         self._new.add(key)
-        return _adopt(self._artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=self._durable)
+        return _put(self._artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=self._durable)
 
     def recorded(self, key: str) -> None:
         """Note that a transaction that has committed names this object."""
@@ -159,12 +153,12 @@ class Storing:
         self._new.difference_update(blob.key for blob in self._unused)
         self._unused = []
 
-    def take_back(self) -> None:
+    def _rollback(self) -> None:
         """Forget what was recorded for nothing, and remove objects that no blob names: nobody else knows their keys."""
         for i in range(0, len(self._unused), _BATCH):
             ids = [blob.id for blob in self._unused[i : i + _BATCH]]
             with self._database.write(durable=False) as session:
-                blobs.take_back(session, self._project_id, ids, touched_us=self._recorded_us)
+                blobs.rollback(session, self._project_id, ids, touched_us=self._recorded_us)
         new = sorted(self._new)
         for i in range(0, len(new), _BATCH):
             keys = new[i : i + _BATCH]

@@ -148,7 +148,7 @@ def record_all(
     contents
         As `StoredFile.identity` has them; no two alike.
     touched_us
-        When, and what `take_back` knows them by.
+        When, and what `rollback` knows them by.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def record_all(
     return recorded
 
 
-def take_back(session: Session, project_id: str, blob_ids: Sequence[str], *, touched_us: int) -> None:
+def rollback(session: Session, project_id: str, blob_ids: Sequence[str], *, touched_us: int) -> None:
     """Forget some hundred blobs that `record_all` recorded for nothing.
 
     Those that another request has found since stay: it relies on them for a while.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 LOCK_FILE = "standalone.lock"
 # What an earlier run left behind is killed within milliseconds of its supervisor's death, but not at once.
-LOCK_PATIENCE_S = 10.0
+LOCK_TIMEOUT_S = 10.0
 LOCK_POLL_S = 0.1
 
 
@@ -62,7 +62,7 @@ def write_private_file(path: Path, text: str) -> None:
 
 
 @contextmanager
-def exclusive_use(folder: Path, *, patience_s: float = LOCK_PATIENCE_S) -> Iterator[int]:
+def exclusive_use(folder: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[int]:
     """Hold the folder for this process and the children that inherit the descriptor.
 
     The lock ends with the last process that has the descriptor open. So a new run never starts beside what an
@@ -76,14 +76,14 @@ def exclusive_use(folder: Path, *, patience_s: float = LOCK_PATIENCE_S) -> Itera
     Raises
     ------
     DataFolderError
-        Where another run, or a process that one left behind, still has the folder after `patience_s`, or where the
+        Where another run, or a process that one left behind, still has the folder after `timeout_s`, or where the
         lock cannot be written.
     """
     with _explained(folder):
         descriptor = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         with _explained(folder):
-            _wait_for_lock(descriptor, folder, patience_s)
+            _wait_for_lock(descriptor, folder, timeout_s)
             os.truncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield descriptor
@@ -91,8 +91,8 @@ def exclusive_use(folder: Path, *, patience_s: float = LOCK_PATIENCE_S) -> Itera
         os.close(descriptor)
 
 
-def _wait_for_lock(descriptor: int, folder: Path, patience_s: float) -> None:
-    deadline_s = time.monotonic() + patience_s
+def _wait_for_lock(descriptor: int, folder: Path, timeout_s: float) -> None:
+    deadline_s = time.monotonic() + timeout_s
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

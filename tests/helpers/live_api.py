@@ -70,7 +70,7 @@ class Api:
     @property
     def database(self) -> Database:
         if self._database is None:
-            self._database = Database.of(self.settings)
+            self._database = Database.from_settings(self.settings)
         return self._database
 
     def new_key(self, **quotas: int) -> tuple[str, str]:

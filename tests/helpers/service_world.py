@@ -20,7 +20,7 @@ from service.database.tables import Drive, Job, JobAttempt, JobEvent, Scene, Wor
 from service.domain import drive_files, drives, jobs
 from service.domain.keys import create_project
 from service.domain.manifest_facts import facts_of
-from service.job_queue import Wakeups
+from service.job_queue import JobQueue
 from service.settings import Settings
 from service.standalone import broker
 from service.storage.artifacts import ArtifactStore
@@ -55,7 +55,7 @@ class Broker:
 
     def start(self) -> None:
         self._process = subprocess.Popen(self._prepared.argv, stdout=subprocess.DEVNULL)
-        wait_until(lambda: broker.answers(self.url), "the broker's start")
+        wait_until(lambda: broker.is_up(self.url), "the broker's start")
 
     def kill(self) -> None:
         if self._process is not None:
@@ -75,7 +75,7 @@ class World:
             **{**SHORT_TIMES, **changed},  # type: ignore[arg-type]
         )
         migrate(self.settings)
-        self.database = Database.of(self.settings)
+        self.database = Database.from_settings(self.settings)
         self.artifacts = ArtifactStore(self.settings)
         self._logs = folder / "logs"
         self._logs.mkdir()
@@ -229,7 +229,7 @@ class World:
 
     def wake(self, job_id: str) -> None:
         """Send the job's message, as the API does."""
-        Wakeups(self.settings).send([self.job(job_id)])
+        JobQueue(self.settings).send([self.job(job_id)])
 
     def cancel(self, job_id: str) -> None:
         with self.database.write() as session:

@@ -139,7 +139,7 @@ def _on_server(url: str, statement: str) -> None:
 def database(database_settings: Settings) -> Iterator[Database]:
     """A migrated database, of either kind."""
     migrate(database_settings)
-    opened = Database.of(database_settings)
+    opened = Database.from_settings(database_settings)
     yield opened
     opened.close()
 

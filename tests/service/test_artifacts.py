@@ -205,7 +205,7 @@ def test_a_silent_store_is_no_ready_store(store_at: Callable[[int], ArtifactStor
 def test_a_silent_store_is_given_up(
     store_at: Callable[[int], ArtifactStore], silent_port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert artifacts._PATIENCE["read_timeout"].total_seconds() <= 30
-    monkeypatch.setitem(artifacts._PATIENCE, "read_timeout", timedelta(milliseconds=300))
+    assert artifacts._TIMEOUTS["read_timeout"].total_seconds() <= 30
+    monkeypatch.setitem(artifacts._TIMEOUTS, "read_timeout", timedelta(milliseconds=300))
     store = store_at(silent_port)
     assert fails_within_s(lambda: store.read(KEY)) < 20

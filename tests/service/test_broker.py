@@ -34,7 +34,7 @@ def start() -> Iterator[Start]:
         process = subprocess.Popen(prepared.argv, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         started.append(process)
         deadline_s = time.monotonic() + 60
-        while not broker.answers(prepared.url):
+        while not broker.is_up(prepared.url):
             assert process.poll() is None, "the server ended"
             assert time.monotonic() < deadline_s, "the server does not answer"
             time.sleep(0.05)
@@ -80,7 +80,7 @@ def test_queued_messages_survive_a_killed_server(tmp_path: Path, start: Start) -
     process = start(before)
     put(before.url)
     kill(process)
-    assert not broker.answers(before.url)
+    assert not broker.is_up(before.url)
 
     after = broker.prepare(tmp_path / "broker")
     start(after)
@@ -188,7 +188,7 @@ def test_only_who_knows_the_password_is_let_in(tmp_path: Path, start: Start) -> 
             pytest.raises(redis.AuthenticationError),
         ):
             client.ping()
-    assert not broker.answers(f"redis://:wrong@{broker.HOST}:{prepared.port}/0")
+    assert not broker.is_up(f"redis://:wrong@{broker.HOST}:{prepared.port}/0")
 
 
 def test_the_password_shows_nowhere(tmp_path: Path, start: Start) -> None:

@@ -29,13 +29,13 @@ def test_a_server_always_waits_for_its_disk(postgres_url: str, durable: bool) ->
 
 
 @pytest.mark.parametrize(
-    ("patience_s", "chosen", "timeout"), [(30.0, "", "2min"), (2.0, "", "8s"), (30.0, "-c statement_timeout=5s", "5s")]
+    ("timeout_s", "chosen", "timeout"), [(30.0, "", "2min"), (2.0, "", "8s"), (30.0, "-c statement_timeout=5s", "5s")]
 )
-def test_a_server_that_hangs_is_given_up(postgres_url: str, patience_s: float, chosen: str, timeout: str) -> None:
+def test_a_server_that_hangs_is_given_up(postgres_url: str, timeout_s: float, chosen: str, timeout: str) -> None:
     url = make_url(postgres_url)
     if chosen:
         url = url.update_query_dict({"options": chosen})
-    database = Database(url.render_as_string(hide_password=False), patience_s=patience_s)
+    database = Database(url.render_as_string(hide_password=False), timeout_s=timeout_s)
     with database.read() as session:
         assert session.scalar(text("SHOW statement_timeout")) == timeout
         raw = session.connection().connection.driver_connection

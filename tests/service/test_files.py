@@ -14,7 +14,7 @@ import httpx
 import pytest
 from sqlalchemy import event
 
-from service.storage.blob_writer import StoredFile, Storing
+from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.blobs import Recorded
 from tests.helpers.live_api import Api, Client, forget_all, problem_of
 from tests.helpers.tiny_drive import TinyDrive, png, png_of, tiny_drive, zip_of
@@ -216,15 +216,15 @@ def test_what_an_archive_was_refused_for_stays_with_others(api: Api, client: Cli
     path, *_, last = sorted(drive.files)
     put(client, mine, last, png(seed="in the way"))
     way_bytes = len(png(seed="in the way"))
-    record, found = Storing.record, []
+    record, found = BlobWriter.record, []
 
-    def record_and_send(self: Storing, files: Sequence[StoredFile]) -> dict[str, Recorded]:
+    def record_and_send(self: BlobWriter, files: Sequence[StoredFile]) -> dict[str, Recorded]:
         recorded = record(self, files)
         found.append(put(client, others, path, drive.files[path]).status_code)
         return recorded
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Storing, "record", record_and_send)
+        patched.setattr(BlobWriter, "record", record_and_send)
         problem_of(client.put(f"/v1/drives/{mine}/archive", content=drive.zipped()), 409, "file-exists")
     assert found == [201]
     assert api.project(client.project_id).used_bytes == used_bytes + way_bytes + len(drive.files[path])

@@ -457,7 +457,7 @@ def test_a_reader_sees_one_state(database: Database, job_id: str) -> None:
     assert job_of(database, job_id).state == JobState.RUNNING
     with database.write() as session:  # its connection has been a reader's
         job = session.get_one(Job, job_id, with_for_update=True)
-        other = Database(database.engine.url.render_as_string(hide_password=False), patience_s=0.1)
+        other = Database(database.engine.url.render_as_string(hide_password=False), timeout_s=0.1)
         with other.read() as elsewhere:
             assert elsewhere.scalar(select(Job.state).where(Job.id == job_id)) == JobState.RUNNING
         other.close()
@@ -597,7 +597,7 @@ class Transitions(RuleBasedStateMachine):
 def test_no_order_of_events_breaks_a_job(tmp_path: Path) -> None:
     chosen = settings_of(tmp_path)
     migrate(chosen)
-    database = Database.of(chosen)
+    database = Database.from_settings(chosen)
     with database.write() as session:
         project = create_project(session, "test", chosen)
         project.max_active_jobs = 10**6

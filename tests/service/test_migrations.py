@@ -47,14 +47,14 @@ def test_migrating_again_and_at_once_changes_nothing(database_settings: Settings
     for thread in threads:
         thread.join()
     assert errors == []
-    database = Database.of(database_settings)
+    database = Database.from_settings(database_settings)
     assert differences(database) == []
     database.close()
 
 
 def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
     """SQLite copies a table to change it: what refers to the old one must not go with it."""
-    database = Database.of(database_settings)
+    database = Database.from_settings(database_settings)
     _upgrade(database, "0001")
     with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
         for statement in _FIRST_RECORDS:

@@ -25,7 +25,7 @@ from service.standalone.supervisor import ChildSpec, Supervisor
 from service.storage.data_folder import DataFolderError, exclusive_use
 from tests.helpers.process_tree import children_of
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 SUPERVISOR = """
 import json, sys
@@ -86,7 +86,7 @@ while True:
 
 def wait_for(what: Callable[[], Any]) -> Any:
     """What it returns once that is true."""
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not (value := what()):
         assert time.monotonic() < deadline_s, "waited in vain"
         time.sleep(0.02)
@@ -171,7 +171,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 def stop(supervisor: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> int:
     supervisor.send_signal(number)
-    return supervisor.wait(PATIENCE_S)
+    return supervisor.wait(TIMEOUT_S)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -224,7 +224,7 @@ if not Path("{world.folder}/left.pid").exists():
 def test_ctrl_c_in_the_terminal_reaches_the_supervisor_alone(world: World) -> None:
     supervisor = world.start_ready(world.child("api"))
     os.killpg(supervisor.pid, signal.SIGINT)  # what a terminal does
-    assert supervisor.wait(PATIENCE_S) == 0
+    assert supervisor.wait(TIMEOUT_S) == 0
     assert world.events() == ["api started", "api terminated"]
 
 
@@ -250,14 +250,14 @@ def test_a_taken_port_is_named_before_anything_starts(world: World) -> None:
         supervisor = world.start(
             world.child("broker"), world.child("api", listens_on=["127.0.0.1", port], port_remedy="Take another.")
         )
-        assert supervisor.wait(PATIENCE_S) == 3
+        assert supervisor.wait(TIMEOUT_S) == 3
     assert f"api cannot start: port {port} on 127.0.0.1 is in use by another program. Take another." in world.console()
     assert world.events() == []
 
 
 def test_an_address_of_another_machine_is_named(world: World) -> None:
     supervisor = world.start(world.child("api", listens_on=["192.0.2.1", 8000]))
-    assert supervisor.wait(PATIENCE_S) == 3
+    assert supervisor.wait(TIMEOUT_S) == 3
     assert "api cannot start: port 8000 on 192.0.2.1 cannot be had" in world.console()
 
 
@@ -265,7 +265,7 @@ def test_an_address_of_another_machine_is_named(world: World) -> None:
 def test_a_child_that_never_starts_ends_everything_with_its_last_words(world: World, ready_file: str | None) -> None:
     broken = world.child("api", body="sys.exit('no such table: jobs')", ready_file=ready_file)
     supervisor = world.start(world.child("broker"), broken)
-    assert supervisor.wait(PATIENCE_S) == 3
+    assert supervisor.wait(TIMEOUT_S) == 3
     assert world.events().count("api started") == 3
     assert "api cannot start: it ended with exit code 1, 3 times." in world.console()
     assert world.console().rstrip().endswith("  api | no such table: jobs")
@@ -274,16 +274,16 @@ def test_a_child_that_never_starts_ends_everything_with_its_last_words(world: Wo
 
 def test_a_program_that_is_not_there_is_named(world: World) -> None:
     supervisor = world.start(world.child("broker"), world.child("api", argv=["/nowhere/api"], depends_on=["broker"]))
-    assert supervisor.wait(PATIENCE_S) == 3
+    assert supervisor.wait(TIMEOUT_S) == 3
     assert "api cannot start: /nowhere/api: No such file or directory" in world.console()
     assert is_gone(world.pid("broker"))
 
 
 def test_a_child_that_hangs_at_its_start_ends_everything(world: World) -> None:
     supervisor = world.start(world.child("api", ready_file=str(world.folder / "never"), start_timeout_s=0.5))
-    assert supervisor.wait(PATIENCE_S) == 3
+    assert supervisor.wait(TIMEOUT_S) == 3
     assert "api runs but is not ready after 0.5 s" in world.console()
-    with exclusive_use(world.folder, patience_s=0):  # every child holds the lock as long as it lives
+    with exclusive_use(world.folder, timeout_s=0):  # every child holds the lock as long as it lives
         pass
 
 
@@ -442,11 +442,11 @@ def test_two_do_not_share_a_folder(world: World) -> None:
     first = world.start_ready(world.child("worker"))
     with (
         pytest.raises(DataFolderError, match=rf"in use by another .*process {first.pid}\).*another folder"),
-        exclusive_use(world.folder, patience_s=0.2),
+        exclusive_use(world.folder, timeout_s=0.2),
     ):
         pass
     assert stop(first) == 0
-    with exclusive_use(world.folder, patience_s=0):
+    with exclusive_use(world.folder, timeout_s=0):
         pass
 
 
@@ -465,10 +465,10 @@ def test_the_folder_stays_locked_while_anything_of_a_killed_run_lives(tmp_path: 
     with exclusive_use(tmp_path) as lock:
         left = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"], pass_fds=[lock])
     try:
-        with pytest.raises(DataFolderError, match="in use"), exclusive_use(tmp_path, patience_s=0.2):
+        with pytest.raises(DataFolderError, match="in use"), exclusive_use(tmp_path, timeout_s=0.2):
             pass
     finally:
         left.kill()
         left.wait()
-    with exclusive_use(tmp_path, patience_s=0):
+    with exclusive_use(tmp_path, timeout_s=0):
         pass

@@ -14,7 +14,7 @@ from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from service.settings import Settings
 from tests.helpers.service_world import World
-from worker.attempt import Verdict
+from worker.attempt import StopRequest
 from worker.child_protocol import Work
 from worker.progress import Progress, ProgressMeter
 
@@ -93,9 +93,9 @@ def meter_of(work: Work = Work.RECONSTRUCTION) -> ProgressMeter:
     return ProgressMeter(work, started_s=time.monotonic())
 
 
-def go_on(progress: Progress) -> Verdict:
+def go_on(progress: Progress) -> StopRequest:
     """The tick of an attempt that nobody stops."""
-    return Verdict.GO_ON
+    return StopRequest.GO_ON
 
 
 def wait_until(is_so: Callable[[], bool], what: str) -> None:

@@ -15,7 +15,7 @@ from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.api.aggregations import AggregationRequest
 from service.database.tables import Blob, Job, MapFile, MapScene, MapVersion
 from service.domain import aggregations, jobs
-from service.job_queue import Wakeups
+from service.job_queue import JobQueue
 from tests.helpers.service_world import TERMINAL, World, is_gone, kill, wait_until
 from worker.job_execution import Runner
 
@@ -147,7 +147,7 @@ def test_a_worker_is_killed_in_the_middle(world: World, two_drives: list[Path]) 
     damaged.mkdir()
     ids.append(world.add_drive(_damaged(two_drives[0], damaged)))
     job, due = ask(world, drives=ids)
-    Wakeups(world.settings).send(due)
+    JobQueue(world.settings).send(due)
     with world.database.read() as session:
         children = {m.drive_id: m.child_id for m, _ in jobs.members_of(session, [job.id])[job.id]}
     ends = {drive_id: ended_in_time(world, str(children[drive_id])).state for drive_id in ids}

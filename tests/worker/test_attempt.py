@@ -22,7 +22,7 @@ from service.settings import Settings
 from tests.helpers import learned_graphs
 from tests.helpers.process_tree import children_of
 from tests.worker.conftest import go_on, meter_of, settings_with
-from worker.attempt import Attempt, AttemptFolder, Tick, Verdict, run_attempt
+from worker.attempt import Attempt, AttemptFolder, StopRequest, Tick, run_attempt
 from worker.child_protocol import Work
 from worker.outcomes import Cancelled, Failed, Outcome, Succeeded
 from worker.progress import Progress
@@ -51,12 +51,12 @@ def signal_once_it_works(number: signal.Signals) -> Tick:
     """Sends a signal to the child as soon as it reports a stage."""
     sent = []
 
-    def tick(progress: Progress) -> Verdict:
+    def tick(progress: Progress) -> StopRequest:
         if progress.stage and not sent:
             sent.append(number)
             (child,) = children_of(os.getpid(), "worker.child")
             os.kill(child.pid, number)
-        return Verdict.GO_ON
+        return StopRequest.GO_ON
 
     return tick
 
@@ -70,9 +70,9 @@ def test_reconstruction_and_another_that_reuses_its_stages(
 ) -> None:
     seen: list[Progress] = []
 
-    def tick(progress: Progress) -> Verdict:
+    def tick(progress: Progress) -> StopRequest:
         seen.append(progress)
-        return Verdict.GO_ON
+        return StopRequest.GO_ON
 
     outcome = attempt(small_drive, scratch, settings, tick, max_keypoints=1000, seed=5)
     assert isinstance(outcome, Succeeded)
@@ -225,8 +225,8 @@ def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> 
 def test_cancel(small_drive: Path, scratch: Path, settings: Settings) -> None:
     """By the token alone: signals would come after 20 s."""
 
-    def tick(progress: Progress) -> Verdict:
-        return Verdict.CANCEL if progress.stage else Verdict.GO_ON
+    def tick(progress: Progress) -> StopRequest:
+        return StopRequest.CANCEL if progress.stage else StopRequest.GO_ON
 
     outcome = attempt(small_drive, scratch, settings, tick)
     assert isinstance(outcome, Cancelled)

@@ -16,7 +16,7 @@ from pydantic import SecretStr
 
 from service.database.tables import Project
 from service.domain.keys import create_key
-from service.job_queue import Wakeups, task_id
+from service.job_queue import JobQueue, task_id
 from service.settings import Settings
 from tests.helpers.live_api import api_process
 from tests.helpers.service_world import FAST, TERMINAL, World, environment_of, wait_until
@@ -120,10 +120,10 @@ def test_reconstruction_asked_for_while_the_broker_is_down(
         assert client.get(where).json()["state"] == "QUEUED"
 
         world.broker.start()
-        wakeups = Wakeups(world.settings)
+        job_queue = JobQueue(world.settings)
         job_id = accepted.json()["id"]
         wait_until(
-            lambda: world.job(job_id).state != "QUEUED" or task_id(world.job(job_id)) in wakeups.waiting(),
+            lambda: world.job(job_id).state != "QUEUED" or task_id(world.job(job_id)) in job_queue.waiting(),
             "its message",
             within_s=30,
         )

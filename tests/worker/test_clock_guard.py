@@ -14,9 +14,9 @@ import worker.clock_guard
 from service.database.tables import now_us
 from service.domain import jobs
 from tests.helpers.service_world import World
-from worker.attempt import Verdict
-from worker.clock_guard import Silence
-from worker.heartbeat import Heart
+from worker.attempt import StopRequest
+from worker.clock_guard import ClockGuard
+from worker.heartbeat import Heartbeat
 from worker.progress import Progress
 from worker.reconciler import Reconciler
 
@@ -42,10 +42,10 @@ class Clocks:
         self.wall_s += seconds
         self.monotonic_s += seconds
 
-    def counts(self, silence: Silence, *, waits_s: float = 0.0) -> bool:
-        silence.ask()
+    def counts(self, clock_guard: ClockGuard, *, waits_s: float = 0.0) -> bool:
+        clock_guard.ask()
         self.go_on(waits_s)
-        return silence.counts(int(self.wall_s * 1e6))
+        return clock_guard.counts(int(self.wall_s * 1e6))
 
 
 @pytest.fixture
@@ -53,38 +53,38 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
     return Clocks(monkeypatch)
 
 
-def test_silence_counts_while_nothing_happens(clocks: Clocks) -> None:
-    silence = Silence(LEASE_S)
+def test_a_silent_worker_counts_while_nothing_happens(clocks: Clocks) -> None:
+    clock_guard = ClockGuard(LEASE_S)
     for _ in range(20):
-        assert clocks.counts(silence)
+        assert clocks.counts(clock_guard)
         clocks.go_on(300.0)  # a pass may take its time
 
 
 @pytest.mark.parametrize("step_s", [60.0, -3600.0])
-def test_silence_after_a_step_of_the_clock(clocks: Clocks, step_s: float) -> None:
-    silence = Silence(LEASE_S)
-    assert clocks.counts(silence)
+def test_a_silent_worker_after_a_step_of_the_clock(clocks: Clocks, step_s: float) -> None:
+    clock_guard = ClockGuard(LEASE_S)
+    assert clocks.counts(clock_guard)
     for _ in range(3):
         clocks.wall_s += step_s
-        assert not clocks.counts(silence)
+        assert not clocks.counts(clock_guard)
         clocks.go_on(5.0)
     clocks.go_on(LEASE_S - 6.0)
-    assert not clocks.counts(silence)
+    assert not clocks.counts(clock_guard)
     clocks.go_on(2.0)
-    assert clocks.counts(silence)
+    assert clocks.counts(clock_guard)
 
 
-def test_silence_after_a_database_that_was_away(clocks: Clocks) -> None:
+def test_a_silent_worker_after_a_database_that_was_away(clocks: Clocks) -> None:
     """Where every turn takes long, a dead worker's jobs are free all the same."""
-    silence = Silence(LEASE_S)
-    silence.ask()  # and got no answer
+    clock_guard = ClockGuard(LEASE_S)
+    clock_guard.ask()  # and got no answer
     clocks.go_on(20.0)
-    assert not clocks.counts(silence)
+    assert not clocks.counts(clock_guard)
     clocks.go_on(LEASE_S)
-    assert clocks.counts(silence)
-    assert not clocks.counts(silence, waits_s=15.0)
+    assert clocks.counts(clock_guard)
+    assert not clocks.counts(clock_guard, waits_s=15.0)
     clocks.go_on(LEASE_S)
-    assert clocks.counts(silence, waits_s=15.0)
+    assert clocks.counts(clock_guard, waits_s=15.0)
 
 
 def test_step_of_the_clock(world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,20 +139,20 @@ def test_database_that_is_locked_for_longer_than_a_lease(world: World, brief_dri
     """A stage goes on: whoever locks the database keeps the others from taking its job, too."""
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     hasty = world.settings.model_copy(update={"heartbeat_seconds": 0.05, "lease_seconds": 0.5})
-    impatient = service.database.connections.Database(world.settings.resolved_database_url, patience_s=0.1)
+    impatient = service.database.connections.Database(world.settings.resolved_database_url, timeout_s=0.1)
     with world.database.write() as session:
         held = jobs.claim(session, job_id, owner="a worker", lease_us=500_000)
     assert held is not None
-    with Heart(impatient, held, hasty) as heart:
+    with Heartbeat(impatient, held, hasty) as heartbeat:
         lock = sqlite3.connect(world.settings.data_dir / "mrasfm.sqlite3", isolation_level=None)
         lock.execute("BEGIN IMMEDIATE")
         ends_s = time.monotonic() + 2.0
         while time.monotonic() < ends_s:
-            assert heart.tell(Progress()) is Verdict.GO_ON
+            assert heartbeat.tell(Progress()) is StopRequest.GO_ON
             time.sleep(0.05)
         lock.execute("ROLLBACK")
         lock.close()
         time.sleep(0.5)
-        assert heart.tell(Progress()) is Verdict.GO_ON
+        assert heartbeat.tell(Progress()) is StopRequest.GO_ON
     assert (world.job(job_id).heartbeat_us or 0) > now_us() - 2_000_000
     impatient.close()

@@ -15,7 +15,7 @@ from pydantic import SecretStr
 
 from schemas.api.problems import PROBLEM_TYPE
 from service.database.tables import Blob, Checkpoint, SceneFile
-from service.job_queue import Wakeups
+from service.job_queue import JobQueue
 from service.settings import Settings
 from tests.helpers.service_world import SHORT_TIMES, World, environment_of, is_gone, kill, wait_until
 
@@ -275,7 +275,7 @@ def test_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:
     world.start_worker()
     assert_one_scene(world, job_id, ["released", "succeeded"])
     assert (world.job(job_id).attempt, world.job(job_id).blame) == (2, 0)
-    wait_until(lambda: not Wakeups(world.settings).waiting(), "no message is left behind")
+    wait_until(lambda: not JobQueue(world.settings).waiting(), "no message is left behind")
 
 
 @pytest.mark.parametrize("signals", [["SIGTERM", "SIGTERM"], ["SIGQUIT"], ["SIGTERM", "SIGQUIT"]])

@@ -21,7 +21,7 @@ from worker.engine_settings import engine_config
 from worker.log_paths import LogPaths
 from worker.oom import MemoryKills, memory_kills
 from worker.outcomes import Abandoned, Cancelled, Ending, Failed, Succeeded, outcome_of
-from worker.termination import SHUT_DOWN_GRACE_S, Escalation, StopReason
+from worker.termination import SHUT_DOWN_GRACE_S, StopReason, Termination
 
 GOOD = ChildResult(report={"sound": True})
 
@@ -110,47 +110,47 @@ def test_real_time_signal_has_no_name() -> None:
     assert "with signal 47" in failed(returncode=-47).what
 
 
-def test_escalation_takes_its_steps_in_time(tmp_path: Path) -> None:
+def test_termination_takes_its_steps_in_time(tmp_path: Path) -> None:
     sent: list[signal.Signals] = []
-    escalation = Escalation(
+    termination = Termination(
         sent.append, tmp_path / "cancel", settings_with(tmp_path, terminate_after_seconds=10, kill_after_seconds=30)
     )
-    escalation.advance(5.0)
+    termination.advance(5.0)
     assert not (tmp_path / "cancel").exists()
-    escalation.stop(StopReason.CANCEL, 100.0)
-    escalation.advance(100.0)
+    termination.stop(StopReason.CANCEL, 100.0)
+    termination.advance(100.0)
     assert (tmp_path / "cancel").exists()
-    escalation.stop(StopReason.CANCEL, 105.0)  # asked again at every tick: the clock runs on
-    escalation.stop(StopReason.TIMEOUT, 105.0)
-    assert escalation.reason is StopReason.CANCEL
-    escalation.advance(109.9)
+    termination.stop(StopReason.CANCEL, 105.0)  # asked again at every tick: the clock runs on
+    termination.stop(StopReason.TIMEOUT, 105.0)
+    assert termination.reason is StopReason.CANCEL
+    termination.advance(109.9)
     assert sent == []
-    escalation.advance(110.0)
+    termination.advance(110.0)
     assert sent == [signal.SIGTERM]
-    escalation.advance(129.9)
-    escalation.advance(130.0)
-    escalation.advance(200.0)
+    termination.advance(129.9)
+    termination.advance(130.0)
+    termination.advance(200.0)
     assert sent == [signal.SIGTERM, signal.SIGKILL]
 
 
 def test_stronger_reasons_take_over(tmp_path: Path) -> None:
     sent: list[signal.Signals] = []
-    escalation = Escalation(sent.append, tmp_path / "cancel", settings_with(tmp_path))
-    escalation.stop(StopReason.TIMEOUT, 100.0)
-    escalation.stop(StopReason.SHUT_DOWN, 101.0)
-    escalation.advance(101.0 + SHUT_DOWN_GRACE_S - 0.1)
+    termination = Termination(sent.append, tmp_path / "cancel", settings_with(tmp_path))
+    termination.stop(StopReason.TIMEOUT, 100.0)
+    termination.stop(StopReason.SHUT_DOWN, 101.0)
+    termination.advance(101.0 + SHUT_DOWN_GRACE_S - 0.1)
     assert sent == []
-    escalation.stop(StopReason.FENCED, 102.0)
-    escalation.stop(StopReason.SHUT_DOWN, 102.0)
-    escalation.advance(102.0)
-    assert (escalation.reason, sent) == (StopReason.FENCED, [signal.SIGKILL])
+    termination.stop(StopReason.FENCED, 102.0)
+    termination.stop(StopReason.SHUT_DOWN, 102.0)
+    termination.advance(102.0)
+    assert (termination.reason, sent) == (StopReason.FENCED, [signal.SIGKILL])
 
 
-def test_escalation_on_a_full_disk_goes_on_to_signals(tmp_path: Path) -> None:
+def test_termination_on_a_full_disk_goes_on_to_signals(tmp_path: Path) -> None:
     sent: list[signal.Signals] = []
-    escalation = Escalation(sent.append, tmp_path / "no-folder" / "cancel", settings_with(tmp_path))
-    escalation.stop(StopReason.CANCEL, 0.0)
-    escalation.advance(25.0)
+    termination = Termination(sent.append, tmp_path / "no-folder" / "cancel", settings_with(tmp_path))
+    termination.stop(StopReason.CANCEL, 0.0)
+    termination.advance(25.0)
     assert sent == [signal.SIGTERM]
 
 

@@ -27,9 +27,9 @@ from service.storage.process_folder import process_folder
 from tests.helpers.damaged_images import cut
 from tests.helpers.live_api import LIMITS
 from tests.helpers.service_world import World, is_gone, wait_until
-from worker.attempt import AttemptFolder, Verdict
-from worker.commit_with_retry import settle
-from worker.heartbeat import Heart
+from worker.attempt import AttemptFolder, StopRequest
+from worker.commit_with_retry import commit_with_retry
+from worker.heartbeat import Heartbeat
 from worker.job_execution import Runner
 from worker.oom import MemoryKills, memory_kills
 from worker.progress import Progress
@@ -315,7 +315,7 @@ def test_what_is_not_the_databases_fault_is_not_tried_again(world: World, brief_
         session.execute(insert(Job).values(id=job_id, project_id=None, kind="x", drive_id="x"))
 
     with pytest.raises(IntegrityError):
-        settle(world.database, held, wrong)
+        commit_with_retry(world.database, held, wrong)
     assert tries == [True]
 
 
@@ -326,7 +326,7 @@ def test_database_that_stays_away(world: World, brief_drive: Path) -> None:
         session.execute(text("SELECT * FROM nowhere"))
 
     with pytest.raises(OperationalError):
-        settle(world.database, held, fails, patience_s=0.5)
+        commit_with_retry(world.database, held, fails, budget_s=0.5)
 
 
 def claimed(world: World, job_id: str) -> jobs.Claim:
@@ -340,24 +340,24 @@ def test_request_to_cancel_is_seen_between_heartbeats(world: World, brief_drive:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     rarely = world.settings.model_copy(update={"heartbeat_seconds": 600.0, "lease_seconds": 3600.0})
     held = claimed(world, job_id)
-    with Heart(world.database, held, rarely) as heart:
-        assert heart.tell(Progress()) is Verdict.GO_ON
+    with Heartbeat(world.database, held, rarely) as heartbeat:
+        assert heartbeat.tell(Progress()) is StopRequest.GO_ON
         world.cancel(job_id)
-        wait_until(lambda: heart.tell(Progress()) is Verdict.CANCEL, "the heart's look")
+        wait_until(lambda: heartbeat.tell(Progress()) is StopRequest.CANCEL, "the heartbeat's answer")
         with world.database.write() as session:
             jobs.cancelled(session, held)
-        wait_until(lambda: heart.tell(Progress()) is Verdict.FENCED, "the heart's end")
+        wait_until(lambda: heartbeat.tell(Progress()) is StopRequest.FENCED, "the heartbeat's end")
 
 
 def test_new_guess_at_the_end_is_no_news(world: World, brief_drive: Path) -> None:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     often = world.settings.model_copy(update={"heartbeat_seconds": 0.05})
-    with Heart(world.database, claimed(world, job_id), often) as heart:
-        heart.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 2.0)))
+    with Heartbeat(world.database, claimed(world, job_id), often) as heartbeat:
+        heartbeat.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 2.0)))
         wait_until(lambda: world.events(job_id)[-1].kind == "progress", "the first progress")
         first, beaten_us = world.events(job_id)[-1], world.job(job_id).heartbeat_us or 0
         for guess_s in range(5):
-            heart.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 3.0 + guess_s)))
+            heartbeat.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 3.0 + guess_s)))
             time.sleep(0.1)
         wait_until(lambda: (world.job(job_id).heartbeat_us or 0) > beaten_us, "another heartbeat")
     assert world.events(job_id)[-1].id == first.id

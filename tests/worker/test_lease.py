@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.job_queue import Wakeups
+from service.job_queue import JobQueue
 from tests.helpers.service_world import World, wait_until
 
 VISIBILITY_TIMEOUT_S = 6.0
@@ -52,6 +52,6 @@ def test_long_job_runs_once(make_world: Callable[..., World], brief_drive: Path)
         assert (job.state, job.attempt, job.fence) == ("SUCCEEDED", 1, 1)
         assert world.outcomes(job_id) == ["succeeded"]
         assert [scene.id for scene in world.scenes()] == [job.scene_id]
-    wait_until(lambda: Wakeups(renewed.settings).waiting() == set(), "the acknowledgement")
+    wait_until(lambda: JobQueue(renewed.settings).waiting() == set(), "the acknowledgement")
     assert "nothing to do" not in renewed.log()
     assert "nothing to do" in other.log(), "without renewal the message comes again"

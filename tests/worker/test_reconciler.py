@@ -16,7 +16,7 @@ from sqlalchemy import insert, update
 import worker.reconciler
 from service.database.tables import Blob, Drive, IdempotencyKey, Job, JobEvent, Project, Scene, new_id, now_us
 from service.domain import jobs
-from service.job_queue import QUEUES, Wakeups
+from service.job_queue import QUEUES, JobQueue
 from service.storage import garbage_collection
 from service.storage.blob_writer import file_sha256, store_file
 from tests.helpers.service_world import World, wait_until
@@ -56,7 +56,7 @@ def test_lost_message(world: World, brief_drive: Path) -> None:
     for _ in range(10):
         reconciler.reconcile_jobs()
         assert queued(world) == 3
-    assert Wakeups(world.settings).waiting() == {f"{job_id}.1" for job_id in job_ids}
+    assert JobQueue(world.settings).waiting() == {f"{job_id}.1" for job_id in job_ids}
     assert all(world.job(job_id).enqueued_us for job_id in job_ids)
 
 
@@ -85,7 +85,7 @@ def test_many_jobs_wait(world: World) -> None:
     for _ in range(2):
         reconciler.reconcile_jobs()
         assert queued(world) == count
-    assert Wakeups(world.settings).waiting() == {f"{row['id']}.1" for row in rows}
+    assert JobQueue(world.settings).waiting() == {f"{row['id']}.1" for row in rows}
     with world.database.read() as session:
         assert session.query(Job).filter(Job.enqueued_us.is_(None)).count() == 0
 
@@ -125,7 +125,7 @@ def test_delivered_message_is_not_sent_again(world: World, brief_drive: Path) ->
     world.start_worker()
     job_id = world.ask(world.add_drive(brief_drive))
     child = world.hold(job_id)
-    assert Wakeups(world.settings).waiting() == {f"{job_id}.1"}
+    assert JobQueue(world.settings).waiting() == {f"{job_id}.1"}
     for _ in range(5):
         Reconciler(world.settings).reconcile_jobs()
     assert queued(world) == 0
@@ -161,7 +161,7 @@ def test_silent_worker(world: World, brief_drive: Path) -> None:
         flush(world)
         reconciler.reconcile_jobs()
         expected = set() if attempt == 3 else {f"{job_id}.{attempt + 1}"}
-        assert Wakeups(world.settings).waiting() == expected
+        assert JobQueue(world.settings).waiting() == expected
     job = world.job(job_id)
     assert job.state == "FAILED"
     assert job.problem is not None

@@ -228,7 +228,7 @@ def test_checkpoint_that_cannot_be_kept(
     with caplog.at_level(logging.WARNING, "mrasfm.worker"), keeper(world, shelf, tmp_path):
         wait_until(lambda: len(errors) == 1, "the first try")
         time.sleep(0.5)
-        assert len(errors) == 1, "not again at every look"
+        assert len(errors) == 1, "not again at every poll"
         errors.clear()
     assert len(hashed) == 1
     assert [record.exc_info is not None for record in caplog.records] == [True]
@@ -242,7 +242,7 @@ def test_checkpoint_that_nobody_finds_again_is_no_progress(world: World, brief_d
     (tmp_path / "stages").mkdir()
     (tmp_path / "stages" / "features.npz").write_bytes(b"features")
     drive_id = world.add_drive(brief_drive)
-    gone = MapShelf.of("map_gone", world.project_id, scenes={}, settings={})
+    gone = MapShelf.from_scenes("map_gone", world.project_id, scenes={}, settings={})
     with keeper(world, gone, tmp_path, drive_id=drive_id):
         pass
     with world.database.read() as session:
@@ -277,7 +277,7 @@ def test_pauses_grow(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "stages" / "features.npz").write_bytes(b"features")
     for second in range(1300):
         clock[0] = float(second)
-        made._look()
+        made._poll()
     assert tries == [0.0, 2.0, 6.0, 14.0, 30.0, 62.0, 126.0, 254.0, 510.0, 810.0, 1110.0]
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from service.settings import Settings
 from tests.worker.conftest import go_on, is_gone, meter_of, settings_with, wait_until
-from worker.attempt import AttemptFolder, Command, Tick, Verdict, supervise
+from worker.attempt import AttemptFolder, Command, StopRequest, Tick, supervise
 from worker.child_output import FILE_BYTES, TAIL_BYTES
 from worker.outcomes import Abandoned, Cancelled, Failed, Outcome
 from worker.progress import Progress
@@ -90,11 +90,11 @@ def test_stubborn_child_is_stopped_step_by_step(scratch: Path, tmp_path: Path) -
     impatient = settings_with(tmp_path, terminate_after_seconds=1.0, kill_after_seconds=2.0)
     stopped_s: list[float] = []
 
-    def tick(progress: Progress) -> Verdict:
+    def tick(progress: Progress) -> StopRequest:
         if progress.stage != "mapping":
-            return Verdict.GO_ON
+            return StopRequest.GO_ON
         stopped_s.append(time.monotonic())
-        return Verdict.CANCEL
+        return StopRequest.CANCEL
 
     outcome = run(STUBBORN, scratch, impatient, tick)
     assert isinstance(outcome, Cancelled)
@@ -114,7 +114,7 @@ def test_stubborn_child_runs_out_of_time(scratch: Path, tmp_path: Path) -> None:
 
 
 def test_fenced_attempt_is_killed_at_once(scratch: Path, settings: Settings) -> None:
-    outcome = run(STUBBORN, scratch, settings, lambda p: Verdict.FENCED if p.stage else Verdict.GO_ON)
+    outcome = run(STUBBORN, scratch, settings, lambda p: StopRequest.FENCED if p.stage else StopRequest.GO_ON)
     assert outcome == Abandoned(reason=StopReason.FENCED)
     assert notes(scratch)[1:] == []
     assert is_gone(noted_pid(scratch))
@@ -122,13 +122,13 @@ def test_fenced_attempt_is_killed_at_once(scratch: Path, settings: Settings) -> 
 
 def test_shut_down_overtakes_a_cancel(scratch: Path, settings: Settings) -> None:
     """Killed a few seconds after it was asked, not after the 40 s of a cancel."""
-    verdicts: list[Verdict] = []
+    verdicts: list[StopRequest] = []
 
-    def tick(progress: Progress) -> Verdict:
+    def tick(progress: Progress) -> StopRequest:
         if progress.stage:
-            verdicts.append(Verdict.SHUT_DOWN if verdicts else Verdict.CANCEL)
+            verdicts.append(StopRequest.SHUT_DOWN if verdicts else StopRequest.CANCEL)
             return verdicts[-1]
-        return Verdict.GO_ON
+        return StopRequest.GO_ON
 
     begun_s = time.monotonic()
     outcome = run(STUBBORN, scratch, settings, tick)
@@ -138,10 +138,10 @@ def test_shut_down_overtakes_a_cancel(scratch: Path, settings: Settings) -> None
 
 
 def test_tick_that_fails_leaves_no_child(scratch: Path, settings: Settings) -> None:
-    def tick(progress: Progress) -> Verdict:
+    def tick(progress: Progress) -> StopRequest:
         if progress.stage:
             raise ConnectionError("the database is gone")
-        return Verdict.GO_ON
+        return StopRequest.GO_ON
 
     with pytest.raises(ConnectionError):
         run(STUBBORN, scratch, settings, tick)
@@ -201,9 +201,9 @@ def test_what_is_reported_last_is_not_lost(scratch: Path, settings: Settings) ->
 def test_child_that_closes_its_pipes_is_still_watched(scratch: Path, settings: Settings) -> None:
     ticks: list[Progress] = []
 
-    def tick(progress: Progress) -> Verdict:
+    def tick(progress: Progress) -> StopRequest:
         ticks.append(progress)
-        return Verdict.GO_ON
+        return StopRequest.GO_ON
 
     run("import os, time; os.closerange(0, 100); time.sleep(1.5)", scratch, settings, tick)
     assert 3 <= len(ticks) <= 40

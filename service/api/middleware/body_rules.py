@@ -36,7 +36,7 @@ class BodyRules:
             return
         coming, silent = True, False
 
-        async def patient_receive() -> Message:
+        async def timed_receive() -> Message:
             nonlocal coming, silent
             if silent:
                 raise _silent(self._idle_s)
@@ -51,7 +51,7 @@ class BodyRules:
             coming = message["type"] == "http.request" and message.get("more_body", False)
             return message
 
-        await self._app(scope, patient_receive, send)
+        await self._app(scope, timed_receive, send)
 
 
 def _silent(idle_s: float) -> ServiceError:

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from schemas.api.aggregations import AggregationRequest
 from schemas.api.jobs import JobResource
 from service.api.context import Context
-from service.api.dependencies import CallerDep, ContextDep, OnceDep, answer, expiry_us
+from service.api.dependencies import CallerDep, ContextDep, IdempotentDep, answer, expiry_us
 from service.api.http.body_reading import json_body
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import gives, problems
@@ -34,7 +34,7 @@ ACCEPTED = gives(202, "The job is recorded and will run", "Location", "Retry-Aft
     openapi_extra=describe(AggregationRequest),
 )
 def create_aggregation(
-    once: OnceDep,
+    once: IdempotentDep,
     caller: CallerDep,
     context: ContextDep,
     body: Annotated[Body[AggregationRequest], Depends(read_request, scope="function")],

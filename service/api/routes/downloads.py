@@ -101,9 +101,9 @@ async def send_file(context: Context, request: Request, blob: Blob, *, media_typ
     return StreamingResponse(pieces, status_code=200 if asked is None else 206, headers=headers, media_type=media_type)
 
 
-def download_name(of: str, path: str) -> str:
-    """Says what the file is of: a folder of downloads holds many a points.ply."""
-    return f"{of}-{re.sub('/+', '-', path)}"
+def download_name(owner: str, path: str) -> str:
+    """The file's name with its owner: a folder of downloads holds many a points.ply."""
+    return f"{owner}-{re.sub('/+', '-', path)}"
 
 
 async def _begun(pieces: AsyncIterator[bytes]) -> AsyncIterator[bytes]:

@@ -14,7 +14,7 @@ from schemas.api.drives import DriveResource, DriveState, PreflightResource
 from schemas.api.resource import Finding, Page
 from schemas.drive import DriveManifest
 from service.api.context import Context
-from service.api.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, expiry_us, moment
+from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us, moment
 from service.api.http.body_reading import parsed_body
 from service.api.http.paging import cursor_of, position_of
 from service.api.http.request_bodies import BODY, Body, describe, json_content
@@ -27,7 +27,7 @@ from service.domain.drives import Stored
 from service.domain.idempotency import Answer
 from service.domain.manifest_facts import ManifestFacts
 from service.errors import ServiceError
-from service.storage.blob_writer import StoredFile, Storing, storing
+from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.durability import secure_drive
 from service.storage.garbage_collection import collect_unused
 from service.storage.spool import SpoolWriter
@@ -46,7 +46,7 @@ read_facts = parsed_body(partial(read_manifest, what=BODY), lambda settings: set
     openapi_extra=describe(DriveManifest),
 )
 async def create_drive(
-    once: OnceDep,
+    once: IdempotentDep,
     caller: CallerDep,
     context: ContextDep,
     body: Annotated[Body[ManifestFacts], Depends(read_facts, scope="function")],
@@ -55,7 +55,7 @@ async def create_drive(
 
     def create() -> Response:
         rows = drives.rows_of(body.value)
-        with storing(context.database, context.artifacts, project_id=caller.project_id, durable=True) as store:
+        with BlobWriter(context.database, context.artifacts, project_id=caller.project_id, durable=True) as store:
             stored = _store_manifest(context, store, body.raw)
 
             def effect(session: Session) -> Answer:
@@ -74,7 +74,7 @@ async def create_drive(
     return await run_in_threadpool(create)
 
 
-def _store_manifest(context: Context, store: Storing, raw: bytes) -> StoredFile:
+def _store_manifest(context: Context, store: BlobWriter, raw: bytes) -> StoredFile:
     writer = SpoolWriter(context.settings.spool_dir, min_free_bytes=context.settings.min_free_disk_bytes)
     try:
         spooled = writer.finish(raw)
@@ -144,7 +144,7 @@ def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, backgrou
         **problems(401, 404, 409, 422, 429, 503),
     },
 )
-async def commit_drive(drive_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
+async def commit_drive(drive_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep) -> Response:
     """Freeze a drive whose files are all there, check its manifest, and start the check of its images.
 
     A drive whose manifest has errors stays open; nothing of it is lost.

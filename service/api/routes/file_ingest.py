@@ -18,7 +18,7 @@ from service.database.tables import Blob, DriveFile, Project
 from service.domain import drive_files, drives
 from service.errors import ServiceError
 from service.storage import blobs
-from service.storage.blob_writer import storing
+from service.storage.blob_writer import BlobWriter
 from service.storage.spool import Spooled
 from service.storage.uploads.archive import unpack
 from service.storage.uploads.archive_limits import ArchiveLimits
@@ -91,7 +91,7 @@ def keep_file(
     except ServiceError:
         require_wanted(context, project_id, drive_id, path)  # that there is no such drive matters more
         raise
-    with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
+    with BlobWriter(context.database, context.artifacts, project_id=project_id, durable=False) as store:
         stored = store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
 
         def record(session: Session) -> tuple[drive_files.Slot, blobs.Recorded | None]:
@@ -136,7 +136,7 @@ def keep_archive(context: Context, project_id: str, drive_id: str, archive: Spoo
 def _keep_all(
     context: Context, project_id: str, drive_id: str, unpacked: list[tuple[str, Spooled]], replace: bool
 ) -> StoredFiles:
-    with storing(context.database, context.artifacts, project_id=project_id, durable=False) as store:
+    with BlobWriter(context.database, context.artifacts, project_id=project_id, durable=False) as store:
         stored = [
             (name, store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes))
             for name, spooled in unpacked

@@ -18,7 +18,7 @@ from starlette.requests import ClientDisconnect
 from schemas.api.drives import DeclaredFiles, DeclareFiles, DriveFileResource, StoredFiles
 from schemas.api.resource import Page
 from service.api.context import Context
-from service.api.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer
+from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer
 from service.api.http.body_reading import json_body
 from service.api.http.paging import cursor_of, position_of
 from service.api.http.request_bodies import Body, describe, describe_bytes
@@ -84,7 +84,7 @@ def list_files(
 )
 def declare_files(
     drive_id: str,
-    once: OnceDep,
+    once: IdempotentDep,
     caller: CallerDep,
     body: Annotated[Body[DeclareFiles], Depends(read_declaration, scope="function")],
 ) -> Response:

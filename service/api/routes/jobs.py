@@ -16,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
 from service.api.context import Context
-from service.api.dependencies import CallerDep, ContextDep, Cursor, Limit, OnceDep, answer, expiry_us
+from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us
 from service.api.http.paging import cursor_of, position_of
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
@@ -104,7 +104,7 @@ def get_job(
     responses={**gives(202, "It has ended, or will", "Location"), **problems(401, 404, 409, 422)},
 )
 def cancel_job(
-    job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep, background: BackgroundTasks
+    job_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep, background: BackgroundTasks
 ) -> Response:
     """Ask for a job's end. One that waits ends at once; one that runs is told to stop, and killed if it does not.
 
@@ -128,7 +128,7 @@ def cancel_job(
     summary="Do a job again",
     responses={**ACCEPTED, **problems(401, 404, 409, 413, 422, 429)},
 )
-def retry_job(job_id: str, once: OnceDep, caller: CallerDep, context: ContextDep) -> Response:
+def retry_job(job_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep) -> Response:
     """Do again what failed or was cancelled, as a new job. Finished stages are reused."""
 
     def effect(session: Session) -> Answer:

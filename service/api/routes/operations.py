@@ -47,7 +47,7 @@ def get_status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
     """What works and what does not, and what that means for you."""
     broker, reasons = True, []
     try:
-        context.wakeups.require_broker()
+        context.job_queue.require_broker()
     except BrokerError:
         broker = False
         reasons.append("the broker does not answer: jobs are accepted and start when it is back")

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from schemas.api.drives import DriveState, PreflightState
 from schemas.api.jobs import JobKind, JobResource, ReconstructionRequest
 from schemas.api.resource import Finding
-from service.api.dependencies import CallerDep, ContextDep, OnceDep, expiry_us
+from service.api.dependencies import CallerDep, ContextDep, IdempotentDep, expiry_us
 from service.api.http.body_reading import json_body
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import problems
@@ -35,7 +35,7 @@ read_request = json_body(ReconstructionRequest, lambda settings: settings.max_js
     openapi_extra=describe(ReconstructionRequest),
 )
 def create_reconstruction(
-    once: OnceDep,
+    once: IdempotentDep,
     caller: CallerDep,
     context: ContextDep,
     body: Annotated[Body[ReconstructionRequest], Depends(read_request, scope="function")],

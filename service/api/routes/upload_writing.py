@@ -26,11 +26,11 @@ from service.storage.uploads.resumable import Appender, Hash, PartialFile, appen
 _MAY_PASS = frozenset({408, 413, 423, 429, 500, 503, 507})
 # How long a request waits for another to let go of an upload: somebody may just have looked how far it is, and a
 # client that comes back is sooner here than the end of its broken connection.
-_PATIENCE_S = 1.0
+_LOCK_TIMEOUT_S = 1.0
 _POLL_S = 0.05
 
 
-async def look(context: Context, project_id: str, drive_id: str, upload_id: str) -> tuple[Upload, int]:
+async def current_offset(context: Context, project_id: str, drive_id: str, upload_id: str) -> tuple[Upload, int]:
     """An upload and how far it is for good.
 
     One that was killed between its last byte and its end is ended now: a client that sees all bytes there will not
@@ -127,7 +127,7 @@ class UploadWriting:
             held.file.close()
 
     async def _begun(self, offset: int, length: int | None, checksum: Checksum | None) -> _Held:
-        end_s = anyio.current_time() + _PATIENCE_S
+        end_s = anyio.current_time() + _LOCK_TIMEOUT_S
         while True:
             try:
                 return await anyio.to_thread.run_sync(partial(self._begin, offset, length, checksum))

@@ -11,10 +11,10 @@ from fastapi.routing import APIRoute
 from sqlalchemy.orm import Session
 
 from schemas.api.uploads import UploadResource
-from service.api.dependencies import CallerDep, ContextDep, OnceDep, answer, moment
+from service.api.dependencies import CallerDep, ContextDep, IdempotentDep, answer, moment
 from service.api.http import tus
 from service.api.http.responses import gives, problems
-from service.api.routes.upload_writing import UploadWriting, discard, look
+from service.api.routes.upload_writing import UploadWriting, current_offset, discard
 from service.database.tables import Upload, now_us
 from service.domain import drives, uploads
 from service.domain.idempotency import Answer
@@ -80,7 +80,7 @@ def get_upload_protocol(drive_id: str, caller: CallerDep, context: ContextDep, r
 )
 def create_upload(
     drive_id: str,
-    once: OnceDep,
+    once: IdempotentDep,
     caller: CallerDep,
     context: ContextDep,
     tus_resumable: Resumable = None,
@@ -160,7 +160,7 @@ async def get_upload_offset(
 ) -> Response:
     """Where to go on. All bytes up to `Upload-Offset` are here, also after a crash of the service or its machine."""
     tus.require_version(tus_resumable)
-    upload, offset = await look(context, caller.project_id, drive_id, upload_id)
+    upload, offset = await current_offset(context, caller.project_id, drive_id, upload_id)
     headers = {**_headers(upload, offset), "Upload-Length": str(upload.size_bytes), "Cache-Control": "no-store"}
     if upload.given_metadata:
         headers["Upload-Metadata"] = upload.given_metadata

@@ -14,7 +14,7 @@ from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.connections import clock_us
 from service.database.tables import Drive, Job, JobState, now_us
 from service.domain.jobs._blame import FULL_BLAME, NO_BLAME, RetryLimits
-from service.domain.jobs._dependencies import settle_child
+from service.domain.jobs._dependencies import resolve_child
 from service.domain.jobs._queries import Claim, change, close_attempts, held_by, locked, require, tell_state
 
 
@@ -161,7 +161,7 @@ def after_end(session: Session, job_id: str) -> None:
     tell_state(session, job_id)
     job = session.get_one(Job, job_id, populate_existing=True)
     if job.kind == JobKind.RECONSTRUCTION:
-        settle_child(session, job)
+        resolve_child(session, job)
     if job.kind == JobKind.PREFLIGHT and job.state != JobState.SUCCEEDED:
         pending = (Drive.preflight_job_id == job_id) & (Drive.preflight_state == PreflightState.PENDING)
         session.execute(update(Drive).where(pending).values(preflight_state=PreflightState.UNKNOWN))

@@ -24,16 +24,16 @@ _OPEN = JobMember.child_id.is_not(None) & JobMember.scene_id.is_(None) & JobMemb
 _WAITS = (Job.state == JobState.QUEUED) & (Job.waiting_for > 0)
 
 
-def settle_child(session: Session, child: Job) -> None:
+def resolve_child(session: Session, child: Job) -> None:
     """Note how a job ended in the aggregations that wait for it; those that wait for no other may begin."""
     waiting = select(JobMember).where(JobMember.child_id == child.id, _OPEN).order_by(JobMember.job_id)
     for member in session.scalars(waiting).all():
-        _settle(member, child)
+        _resolve(member, child)
         session.flush()
         look_at(session, member.job_id)
 
 
-def _settle(member: JobMember, child: Job | None) -> None:
+def _resolve(member: JobMember, child: Job | None) -> None:
     if child is not None and child.scene_id is not None:
         member.scene_id = child.scene_id
     elif child is not None and child.problem is not None:
@@ -114,10 +114,10 @@ def _tell(session: Session, parent_id: str) -> None:
     parent = session.get_one(Job, parent_id, populate_existing=True)
     statement = select(JobMember, Job.percent).outerjoin(Job, Job.id == JobMember.child_id)
     rows = session.execute(statement.where(JobMember.job_id == parent_id)).all()
-    settled = [member.scene_id is not None or member.problem is not None for member, _ in rows]
+    resolved = [member.scene_id is not None or member.problem is not None for member, _ in rows]
     children = [
-        100.0 if is_settled else percent or 0.0
-        for (member, percent), is_settled in zip(rows, settled, strict=True)
+        100.0 if is_resolved else percent or 0.0
+        for (member, percent), is_resolved in zip(rows, resolved, strict=True)
         if member.child_id is not None
     ]
     if not children:
@@ -125,7 +125,7 @@ def _tell(session: Session, parent_id: str) -> None:
     percent = parent.children_percent * sum(children) / (100.0 * len(children))
     values = {
         "stage": CHILDREN_STAGE,
-        "done": sum(settled),
+        "done": sum(resolved),
         "total": len(rows),
         "unit": "scenes",
         "percent": round(max(percent, parent.percent), 2),
@@ -142,7 +142,7 @@ def tend(session: Session) -> None:
     ended = or_(Job.id.is_(None), Job.state.in_(TERMINAL))
     statement = select(JobMember, Job).outerjoin(Job, Job.id == JobMember.child_id).where(_OPEN, ended)
     for member, child in session.execute(statement.where(JobMember.job_id.in_(waiting))).all():
-        _settle(member, child)
+        _resolve(member, child)
     session.flush()
     for parent_id in waiting:
         if not session.scalar(select(exists().where(JobMember.job_id == parent_id, _OPEN))):

@@ -80,7 +80,7 @@ def _unpack_zip(stream: BinaryIO, unpacking: _Unpacking, limits: ArchiveLimits) 
     entries = [(name, info) for name, info in archive.entries if not is_ignored(name)]
     for name, _ in entries:
         unpacking.names.add(name)
-    unpacking.names.settle()  # before anything is unpacked
+    unpacking.names.resolve()  # before anything is unpacked
     for name, info in entries:
         unpacking.write(name, info.file_size, archive.read(name, info))
 
@@ -122,7 +122,7 @@ class _Unpacking:
     def finish(self, same_manifest: SameManifest) -> list[tuple[str, Spooled]]:
         """The drive's files by their names in it."""
         result = []
-        for name, file in self.names.settle().items():
+        for name, file in self.names.resolve().items():
             spooled = self._files[name]
             if file == MANIFEST_NAME:
                 self._check_manifest(name, spooled, same_manifest)

@@ -84,7 +84,7 @@ class EntryNames:
         self._names.append(name)
         return self._file(name) is not None or self._file(_without_top(name)) is not None
 
-    def settle(self) -> dict[str, str]:
+    def resolve(self) -> dict[str, str]:
         """For each name that was added, the file of the drive: one common top folder does not count.
 
         Raises

@@ -36,7 +36,7 @@ def connect() -> Iterator[Connect]:
     """A function that makes a library client of a test client's project."""
     with ExitStack() as opened:
 
-        def make(of: TestClient, *, url: str | None = None, patience_s: float = 30.0) -> Client:
-            return opened.enter_context(Client(url or of.api.url, of.key, patience_s=patience_s))
+        def make(of: TestClient, *, url: str | None = None, retry_s: float = 30.0) -> Client:
+            return opened.enter_context(Client(url or of.api.url, of.key, retry_s=retry_s))
 
         yield make

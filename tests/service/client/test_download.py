@@ -82,7 +82,7 @@ def interrupted(shop: Shop, connect: Connect, scene_id: str, out: Path) -> Path:
     cut = Cut(b"GET /v1/scenes/" + scene_id.encode() + b"/files/points", answer_bytes=1_000_000, times=1)
     refuse = Cut(cut.part, answer_bytes=0, times=1000)
     with bad_network(shop.client.api.url, cut, refuse) as network:
-        library = connect(shop.client, url=network.url, patience_s=0.3)
+        library = connect(shop.client, url=network.url, retry_s=0.3)
         with pytest.raises(Exception, match="cannot be reached"):
             download_scene(library, scene_id, out)
     partial = partial_of(out)

@@ -157,8 +157,8 @@ def test_requests_that_came_too_slowly_are_sent_again(client: Client, connect: C
         upload_drive(connect(client, url=network.url), DriveFolder.read(drive))
         cuts[0].times = 1000
         with pytest.raises(ApiError) as ended:
-            connect(client, url=network.url, patience_s=0.5).create_drive(tiny_drive().raw)
-    assert ended.value.status == 408, "patience ends here too"
+            connect(client, url=network.url, retry_s=0.5).create_drive(tiny_drive().raw)
+    assert ended.value.status == 408, "retries end here too"
     assert [len(cut.seen) for cut in cuts[1:]] == [2, 2, 2]
     assert [(shown["state"], shown["files_stored"]) for shown in drives_of(client)] == [("COMMITTED", 6)]
 
@@ -285,10 +285,10 @@ def test_work_that_cannot_be_ended_is_not_waited_for() -> None:
     assert time.monotonic() - began_s < 10
 
 
-def test_patience_ends() -> None:
+def test_retries_end() -> None:
     url = f"http://127.0.0.1:{free_port()}"
     with (
-        LibraryClient(url, "key", first_patience_s=0.5) as library,
+        LibraryClient(url, "key", first_retry_s=0.5) as library,
         pytest.raises(UnreachableError, match=r"cannot be reached.*Check the URL"),
     ):
         library.status()
@@ -337,7 +337,7 @@ def test_no_address_in_the_folder_is_given_the_key(
 @pytest.mark.parametrize("target", ["{url}/x", "//{host}/x", "v1/drives", "", "http:/x"])
 def test_only_paths_of_the_service_are_asked_for(client: Client, stranger: Recorder, target: str) -> None:
     target = target.format(url=stranger.url, host=stranger.url.removeprefix("http://"))
-    transport = Transport(client.api.url, client.key, connections=1, patience_s=0.0)
+    transport = Transport(client.api.url, client.key, connections=1, retry_s=0.0)
     with closing(transport), pytest.raises(ClientError, match="is not a path"):
         transport.request("GET", target)
     assert stranger.requests == []

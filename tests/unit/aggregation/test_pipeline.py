@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import pytest
 
+from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.pipeline import reconstruct
 from tests.helpers.export_example import make_scene
 
@@ -31,3 +35,26 @@ def test_no_map_over_a_scene_and_no_scene_over_a_map(tmp_path: Path) -> None:
     (one / "map.json").write_text("{}")
     with pytest.raises(InputError, match="holds a map"):
         reconstruct(tmp_path / "nowhere", one, EngineConfig())
+
+
+def test_a_map_of_another_version_is_refused_by_name(tmp_path: Path) -> None:
+    one, two, into = (tmp_path / name for name in ("one", "two", "map"))
+    for folder in (one, two):
+        write_scene(make_scene(folder=folder.name), folder, REPORT)
+    scene = read_scene(one, "one")
+    document = {"version": 1, "scenes": [{"name": "one", "fingerprint": scene.fingerprint}]}
+    into.mkdir()
+    (into / "report.json").write_text("{}")
+
+    def refusal(version: int, *, without: str) -> InputError:
+        arrays, documents = scene.pack()
+        del arrays[without]
+        StageStore(into / "scenes").save("one", scene.fingerprint, arrays, documents)
+        (into / "map.json").write_text(json.dumps({**document, "version": version}))
+        with pytest.raises(InputError) as raised:
+            aggregate([two], tmp_path / "out", EngineConfig(), into=into)
+        assert raised.value.code == "map-version"
+        return raised.value
+
+    assert "map.json is of version 2, not of 1" in refusal(2, without="points_m").what
+    assert re.search("scenes/one.npz: .*points_m", refusal(1, without="points_m").what)
