@@ -70,7 +70,7 @@ class Run:
 
     @property
     def feature_settings(self) -> object:
-        """What the features depend on: settings, and the models by their hashes."""
+        """Dependencies of the features: settings, and the models by their hashes."""
         config = self.config
         models = self.components.fingerprint_of("extractor", "segmenter")
         return [config.features.model_dump(), config.semantics.model_dump(), models]
@@ -134,7 +134,7 @@ def preflight(run: Run) -> None:
 
 
 def prior(run: Run) -> PriorTrajectory:
-    """Where the units roughly are."""
+    """Read the prior trajectory of the units."""
     result = prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
     run.report["prior"] = {
         "source": result.source,
@@ -296,7 +296,7 @@ def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
 
 
 def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
-    """What `pack_pairs` packed."""
+    """Restore the matches from `pack_pairs`."""
     stops = np.cumsum(arrays["ends"][:, 2])
     return [
         PairMatches(
@@ -391,5 +391,5 @@ def pictures(run: Run, result: Scene) -> dict[str, bytes]:
 
 
 def store_of(out: Path) -> StageStore:
-    """Where a scene's folder keeps its finished stages."""
+    """Store of finished stages in a scene's folder."""
     return StageStore(out / CHECKPOINT_FOLDER)

@@ -57,10 +57,10 @@ def seam_checkpoint(a: str, b: str) -> str:
 
 
 def is_read_by_aggregation(path: str) -> bool:
-    """Whether an aggregation reads this file of a scene."""
+    """Return whether an aggregation reads this file of a scene."""
     return not path.startswith((f"{PICTURES_FOLDER}/", f"{TEXT_MODEL_FOLDER}/"))
 
 
 def is_read_by_next_version(path: str) -> bool:
-    """Whether an aggregation that goes on from a map's version reads this file of it."""
+    """Return whether an aggregation that goes on from a map's version reads this file of it."""
     return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))

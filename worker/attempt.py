@@ -38,7 +38,7 @@ Command = Callable[[int], Sequence[str]]
 
 
 class StopRequest(StrEnum):
-    """What becomes of an attempt under way."""
+    """Request to stop an attempt under way."""
 
     GO_ON = "go on"
     CANCEL = "cancel"
@@ -57,7 +57,7 @@ Tick = Callable[[Progress], StopRequest]
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What is to be done.
+    """Description of an attempt.
 
     Attributes
     ----------
@@ -96,17 +96,17 @@ class AttemptFolder:
 
     @property
     def finished_stages(self) -> Path:
-        """Where finished stages lie, one `NAME.npz` each: put there before to be reused, taken from there after."""
+        """Folder of finished stages, one `NAME.npz` each: put there before to be reused, taken from there after."""
         return self.out / CHECKPOINT_FOLDER
 
     @property
     def request(self) -> Path:
-        """What the child is asked."""
+        """File with the child's request."""
         return self.root / "request.json"
 
     @property
     def result(self) -> Path:
-        """What it answers."""
+        """File with the child's result."""
         return self.root / "result.json"
 
     @property
@@ -121,7 +121,7 @@ class AttemptFolder:
 
     @property
     def output(self) -> Path:
-        """What it prints."""
+        """File with the child's output."""
         return self.root / "child.log"
 
 

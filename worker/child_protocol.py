@@ -1,4 +1,4 @@
-"""What a supervisor and its child process tell each other, as files in the attempt's folder.
+"""Messages between a supervisor and its child process, as files in the attempt's folder.
 
 Only the standard library: the child reads its request before it loads anything else.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 
 class Work(StrEnum):
-    """What a child is asked to do."""
+    """Work of a child."""
 
     RECONSTRUCTION = "reconstruction"
     PREFLIGHT = "preflight"
@@ -22,7 +22,7 @@ class Work(StrEnum):
 
 
 class ErrorKind(StrEnum):
-    """Which of the engine's errors ended the child's work."""
+    """Kind of the engine's error that ended the child's work."""
 
     INPUT = "input"
     RECONSTRUCTION = "reconstruction"
@@ -33,7 +33,7 @@ class ErrorKind(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ChildRequest:
-    """What one child process does.
+    """Request to one child process.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class ChildError:
 
 @dataclass(frozen=True, kw_only=True)
 class ChildResult:
-    """How a child's work ended: with a report, or with an error."""
+    """Result of a child's work: a report, or an error."""
 
     report: dict[str, Any] | None = None
     error: ChildError | None = None

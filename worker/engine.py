@@ -46,7 +46,7 @@ def work(request: ChildRequest) -> ChildResult:
 
 
 class CancelFile:
-    """Whether somebody has put the file there that asks to stop; once so, always so.
+    """File that asks the child to stop; once there, it counts for good.
 
     The engine asks thousands of times a second, the disk is asked a few times.
     """
@@ -57,7 +57,7 @@ class CancelFile:
         self._look_at_s = 0.0
 
     def __call__(self) -> bool:
-        """Whether to stop."""
+        """Return whether to stop."""
         now_s = time.monotonic()
         if not self._found and now_s >= self._look_at_s:
             self._look_at_s = now_s + CANCEL_INTERVAL_S
@@ -103,7 +103,7 @@ def _aggregate(
 
 
 def _problem(found: dict[str, Any]) -> dict[str, Any]:
-    """Why a scene is not in the map."""
+    """Problem of a scene that is not in the map."""
     problem = Problem(
         type=PROBLEM_TYPE + found["code"],
         title="The scene fits into no map",
@@ -115,7 +115,7 @@ def _problem(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _figures(document: dict[str, Any]) -> dict[str, Any]:
-    """What of `map.json` is recorded with the map's version."""
+    """Figures of `map.json` that are recorded with the map's version."""
     return {
         "scenes": len(document["scenes"]),
         "seams": sum(bool(seam["accepted"]) for seam in document["seams"]),
@@ -124,7 +124,7 @@ def _figures(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _written_report(out: Path) -> dict[str, Any]:
-    """What was written, and not what was returned: the file has been through the writer's conversions."""
+    """Read the report that was written: the file has been through the writer's conversions."""
     written: dict[str, Any] = json.loads((out / REPORT_FILE).read_text(encoding="utf-8"))
     return written
 

@@ -1,4 +1,4 @@
-"""What of the engine's settings a request may set."""
+"""Engine settings that a request may set."""
 
 from __future__ import annotations
 

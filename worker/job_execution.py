@@ -1,4 +1,4 @@
-"""What a worker does with a message: claim the job, run its attempt, and record what came of it."""
+"""Execution of a job: claim it, run its attempt, and record the outcome."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ class Runner:
         return keeper
 
     def _stop_check(self, heartbeat: Heartbeat, meter: ProgressMeter) -> CheckStop:
-        """What ends the worker's own steps where a child would be stopped."""
+        """Make the check that ends the worker's own steps where a child would be stopped."""
 
         def check_stop() -> None:
             verdict = self._tick(heartbeat, meter.at(time.monotonic()))

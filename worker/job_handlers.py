@@ -1,4 +1,4 @@
-"""What the kinds of jobs differ in: what a stage works on, where its finished stages are kept, what is published."""
+"""Differences between the kinds of jobs: inputs, checkpoints and results."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class JobHandler(Protocol):
 
     @property
     def shelf(self) -> Shelf | None:
-        """Where its finished stages are kept, once it is laid out."""
+        """Shelf of the job's finished stages."""
 
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
         """Bring what it works on into the attempt's folder.
@@ -56,7 +56,7 @@ class JobHandler(Protocol):
 
 
 def handler_of(database: Database, held: jobs.Claim) -> JobHandler:
-    """Of a job's kind."""
+    """Make the handler of a job's kind."""
     of_kind = MapAssignment if held.kind is JobKind.AGGREGATION else DriveAssignment
     return of_kind(database, held)
 
@@ -70,7 +70,7 @@ class DriveAssignment:
 
     @property
     def shelf(self) -> Shelf | None:
-        """Of the drive under these settings; a check shares no stages."""
+        """Shelf of the drive under these settings; a check shares no stages."""
         if self._held.kind is not JobKind.RECONSTRUCTION:
             return None
         return DriveShelf(self._drive_id, settings_sha256(self._held.settings))
@@ -110,7 +110,7 @@ class MapAssignment:
 
     @property
     def shelf(self) -> Shelf | None:
-        """Of every pair of its scenes, under these settings."""
+        """Shelf of every pair of its scenes, under these settings."""
         held = self._held
         ids = self._inputs.scene_ids
         return MapShelf.from_scenes(held.map_id or "", held.project_id, scenes=ids, settings=held.settings)

@@ -1,4 +1,4 @@
-"""How an attempt ended, in words that its user can act on."""
+"""Outcome of an attempt, in words that its user can act on."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ Outcome = Succeeded | Failed | Cancelled | Abandoned
 
 @dataclass(frozen=True, kw_only=True)
 class Ending:
-    """What a supervisor saw of a child.
+    """End of a child as its supervisor saw it.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Ending:
 
 
 def outcome_of(ending: Ending) -> Outcome:
-    """What an ending means for the attempt."""
+    """Outcome of an attempt from the end of its child."""
     match ending.stopped_for:
         case StopReason.SHUT_DOWN | StopReason.FENCED | StopReason.ORPHANED as reason:
             return Abandoned(reason=reason)

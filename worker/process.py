@@ -75,7 +75,7 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """Of the child, and of its process group."""
+        """Id of the child, and of its process group."""
         return self._process.pid
 
     def pump(self, timeout_s: float) -> list[StageReport]:
@@ -104,7 +104,7 @@ class ChildProcess:
         return []
 
     def has_exited(self) -> bool:
-        """Whether the child is a zombie. It stays one until `close`: so its group's id names no other processes."""
+        """The child is a zombie. It stays one until `close`: so its group's id names no other processes."""
         try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
         except ChildProcessError:

@@ -1,4 +1,4 @@
-"""How far an attempt is as a whole: percent and time to the end, from the engine's reports on its stages."""
+"""Progress of an attempt as a whole: percent and time to the end, from the engine's reports on its stages."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _DOUBT = 1.0  # at the beginning the end may be twice as far, or half; at the en
 
 @dataclass(frozen=True)
 class Progress:
-    """How far an attempt is.
+    """Progress of an attempt.
 
     Attributes
     ----------

@@ -79,7 +79,7 @@ def retry(step: Callable[[], T], *, budget_s: float = RETRY_BUDGET_S, check_stop
 
 
 def may_pass(error: Exception) -> bool:
-    """Whether a connection, a lock, a server or a full disk is at fault, and not what was asked of it."""
+    """Return whether a connection, a lock, a server or a full disk is at fault, and not the request itself."""
     if isinstance(error, DBAPIError):
         return error.connection_invalidated or isinstance(error, (OperationalError, InterfaceError))
     if isinstance(error, OSError):

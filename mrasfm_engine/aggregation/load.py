@@ -255,7 +255,7 @@ def _arrays(
 
 
 def features_kind(report: dict[str, Any]) -> str:
-    """Which extractor, and which model of it, made a scene's descriptors: others cannot be compared with them."""
+    """Return the extractor, and its model, of a scene's descriptors: others cannot be compared with them."""
     extractor = report.get("settings", {}).get("features", {}).get("extractor", "sift")
     model = report.get("models", {}).get("extractor", {}).get("sha256", "")
     return f"{extractor} {model}".strip()

@@ -1,4 +1,4 @@
-"""What is said and written of a map: `map.json`, pictures of its seams, and findings."""
+"""Report of a map: `map.json`, pictures of its seams, and findings."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _seam(result: MapResult, number: int, pictures: Collection[str]) -> dict[str
 
 
 def _moved(result: MapResult, seam: Seam) -> float:
-    """How far, at the seam, the map is from what the seam alone says."""
+    """Difference, at the seam, between the map's transform and the seam's own."""
     (a, b), poses, at = result.ends_of(seam), result.map_from_scene, seam.place_b_m[None]
     lies = se3.apply(se3.inverse(poses[a]) @ poses[b], at)
     return float(np.linalg.norm(lies - se3.apply(seam.a_from_b, at)))

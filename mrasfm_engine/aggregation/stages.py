@@ -212,7 +212,7 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
 
 
 def _of_one_drive(a: SourceScene, b: SourceScene) -> bool:
-    """Whether two scenes were made of the same recording, perhaps under other settings."""
+    """Return whether two scenes were made of the same recording, perhaps under other settings."""
     if a.fingerprint == b.fingerprint:
         return True
     if a.manifest.frames != b.manifest.frames or a.manifest.gnss != b.manifest.gnss:
@@ -236,7 +236,7 @@ def _require_one(found: Sequence[SourceScene], name: str, code: str, what: str, 
 
 
 def association(run: Run, found: Sequence[SourceScene]) -> Association:
-    """Where positions put the scenes, and which are to be compared."""
+    """Place the scenes by their positions, and choose the pairs to compare."""
     started = time.perf_counter()
     run.begin(Stage.ASSOCIATION)
     result = associate(found, run.config.aggregation)
@@ -296,7 +296,7 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
 
 
 def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
-    """What a seam depends on: both scenes' content, in this order, settings, models and code; not their names."""
+    """Fingerprint of a seam: both scenes' content, in this order, settings, models and version; not their names."""
     config = run.config
     settings = [
         config.matching.model_dump(),

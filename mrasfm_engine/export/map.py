@@ -38,7 +38,7 @@ REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
 
 @dataclass(frozen=True, kw_only=True)
 class MapContent:
-    """What is written."""
+    """Content of a map's folder."""
 
     scene: Scene  # of all drives together
     scene_of_unit: list[str]

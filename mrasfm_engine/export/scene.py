@@ -164,7 +164,7 @@ def check_scene(scene: Scene) -> None:
 
 
 def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
-    """What must not be, and whether it is not; a later check relies on the earlier ones."""
+    """Conditions that a scene must meet, and whether it does; a later check relies on the earlier ones."""
     images, units, points = len(scene.drive.images), len(scene.drive.manifest.frames), len(scene.points_m)
     shapes = [
         (scene.world_from_rig.shape, (units, 4, 4)),

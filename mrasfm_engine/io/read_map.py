@@ -1,4 +1,4 @@
-"""What other parts read back of a written map."""
+"""Reader of a written map, for evaluation and pictures."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MapPoses:
 
 
 def is_map(folder: Path) -> bool:
-    """Whether a folder holds a map, not a scene."""
+    """Return whether a folder holds a map, not a scene."""
     return (folder / MAP_FILE).is_file()
 
 

@@ -59,7 +59,7 @@ class StageStore:
         self._folder = folder
 
     def has(self, name: str, key: str) -> bool:
-        """Whether a stage has been finished with this fingerprint, without reading its arrays."""
+        """Return whether a stage has been finished with this fingerprint, without reading its arrays."""
         return self._read(name, key, arrays=False) is not None
 
     def load(self, name: str, key: str) -> tuple[Arrays, dict[str, Any]] | None:

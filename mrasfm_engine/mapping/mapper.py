@@ -206,7 +206,7 @@ class Mapper:
         return (a, b) if self.image_unit[pair.image_a] == unit else (b, a)
 
     def visible_counts(self) -> Ints:
-        """How many keypoints with a point every unit has (units,); not to be written to."""
+        """Number of keypoints with a point in every unit (units,); not to be written to."""
         changed = np.flatnonzero(self.triangulated != self._visible_of)
         count_members(self.tracks, changed, self.triangulated, self.keypoints.unit, self._visible)
         self._visible_of[changed] = self.triangulated[changed]
@@ -293,8 +293,9 @@ class Mapper:
         return members[self.is_inlier[members]]
 
     def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
-        """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by
-        point, the points' tracks, and the keypoints' points as rows of these."""
+        """Observations of an adjustment of some units: keypoints that observe their points (or all points), sorted by
+        point, the points' tracks, and the keypoints' points as rows of these.
+        """
         everything = everything or bool((free_units | ~self.registered).all())
         seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
         rows = self.observation_rows(None if seen is None else seen[self.triangulated[seen]])

@@ -284,7 +284,7 @@ def _child(session: Session, drive: Drive, job: Job) -> Job:
 
 
 def _rejection(drive: Drive) -> Problem:
-    """Why a drive whose check found errors cannot be reconstructed."""
+    """Problem of a drive whose check found errors, and which cannot be reconstructed."""
     errors = [finding for finding in drive.findings if finding.get("severity") == "error"]
     first = errors[0] if errors else {}
     return Problem(

@@ -102,7 +102,7 @@ def _forget(session: Session, blob_id: str) -> None:
 
 @dataclass(frozen=True)
 class _Kept:
-    """Where a finished stage's bytes are."""
+    """Location of a finished stage's bytes."""
 
     id: str
     key: str

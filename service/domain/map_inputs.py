@@ -1,4 +1,4 @@
-"""What an aggregation works on: files of scenes, and of the version that it goes on from."""
+"""Inputs of an aggregation: files of scenes, and of the version that it goes on from."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class StoredArtifact:
 
 @dataclass(frozen=True, kw_only=True)
 class MapInputs:
-    """Of one aggregation.
+    """Inputs of one aggregation.
 
     Attributes
     ----------

@@ -71,7 +71,7 @@ class ArtifactStore:
 
     @property
     def folder(self) -> Path | None:
-        """Where the objects lie on this machine, or None where they lie elsewhere."""
+        """Folder of the objects on this machine, or None where they lie elsewhere."""
         return self._root
 
     def put_file(self, path: Path, key: str, *, durable: bool = True) -> None:
@@ -220,7 +220,7 @@ class ArtifactStore:
                 obstore.delete(self._store, wanted[i : i + _DELETE_BATCH])
 
     def objects(self) -> Iterator[StoredObject]:
-        """What lies where blobs do, in no order; in a bucket that is shared not all of it is ours."""
+        """List the objects under the blobs' prefix, in no order; in a shared bucket not all of them are ours."""
         if self._root is not None:
             for path in (self._root / _PREFIX).rglob("*"):
                 with contextlib.suppress(FileNotFoundError):

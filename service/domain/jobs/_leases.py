@@ -29,7 +29,7 @@ from service.domain.jobs._queries import (
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressNote:
-    """How far an attempt is; `percent` is of the attempt itself, without the jobs that it waited for.
+    """Progress of an attempt; `percent` is of the attempt itself, without the jobs that it waited for.
 
     `engine_ran` says whether the engine has begun in it.
     """
@@ -121,7 +121,7 @@ def heartbeat(session: Session, held: Claim, *, lease_us: int, note: ProgressNot
 
 
 def cancel_requested(session: Session, held: Claim) -> bool:
-    """Whether somebody asked to cancel the job; asked between heartbeats, and writes nothing.
+    """Return whether somebody asked to cancel the job; asked between heartbeats, and writes nothing.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def cancel_requested(session: Session, held: Claim) -> bool:
 
 
 def has_succeeded(session: Session, held: Claim) -> bool:
-    """Whether this holder, and no other, has ended the job as succeeded."""
+    """Return whether this holder, and no other, has ended the job as succeeded."""
     by_holder = (Job.state == JobState.SUCCEEDED) & (Job.fence == held.fence)
     return session.scalar(select(Job.id).where(Job.id == held.job_id, by_holder)) is not None
 
