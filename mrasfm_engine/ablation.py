@@ -1,4 +1,4 @@
-"""What every part of the method is worth: a drive reconstructed whole, and once more without each part.
+"""Measure the worth of every part of the method: reconstruct a drive whole, and once more without each part.
 
 All reconstructions share the stages that the part does not affect, so that nothing else differs.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.types import StageProgress
+from schemas.artifacts import Stage
 
 
 def reconstruct(
@@ -24,6 +25,7 @@ def reconstruct(
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
     is_new: bool = False,
+    content_sha256: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Reconstruct a drive and write the scene into the folder `out`.
 
@@ -40,6 +42,9 @@ def reconstruct(
         Asked now and then; where it answers True the run ends with CancelledError.
     is_new
         Whether the folder is a user's, and no drive that was accepted before: see `read_drive`.
+    content_sha256
+        SHA-256 of the drive's files by name, where the caller knows them: finished stages are found again by the
+        contents of their input. Else the files are read for it.
 
     Returns
     -------
@@ -58,7 +63,7 @@ def reconstruct(
             code="not-a-scene",
         )
     drive = read_drive(drive_folder, is_new=is_new)
-    run = stages.Run(drive, config, stages.store_of(out), progress, cancel)
+    run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
     with watched_compilation() as compiled:
@@ -74,7 +79,7 @@ def reconstruct(
     if cancel():
         raise CancelledError
     run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
-    run.begin("export")
+    run.begin(Stage.EXPORT)
     write_scene(scene, out, run.report, pictures)
-    run.progress("export", 1, 1)
+    run.progress(Stage.EXPORT, 1, 1)
     return run.report

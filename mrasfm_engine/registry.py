@@ -49,7 +49,7 @@ class LoadedModel:
 
 @dataclass(frozen=True)
 class Components:
-    """What finds and matches keypoints in this run. Building them is all that reads models."""
+    """Extractor, matcher and segmenter of this run. Building them is all that reads models."""
 
     extractor: Extractor
     matcher: Matcher

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.findings import as_json
 from mrasfm_engine.io import left_out_images
-from mrasfm_engine.io.stage_store import Arrays, StageStore, code_version, drive_fingerprint, fingerprint
+from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
 from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
@@ -38,16 +38,16 @@ from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import count_classes
-from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
+from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import CountProgress, StageProgress
 from mrasfm_engine.visualization.pictures import draw_pictures
+from schemas.artifacts import CHECKPOINT_FOLDER, Stage
 
 PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
-STATE_ARRAYS = (
-    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
-    "band_rotation", "band_position_m",
-)  # fmt: skip
+# Raise a stage's version with every change after which the same input and settings give another result: what was
+# finished under an older version is done again, with all that follows from it.
+VERSIONS = {Stage.FEATURES: 1, Stage.MATCHES: 1, Stage.MAPPING: 1}
 
 
 @dataclass
@@ -59,8 +59,9 @@ class Run:
     store: StageStore
     progress: StageProgress
     cancel: Callable[[], bool]
+    content_sha256: Mapping[str, str] | None = None  # of the drive's files by name, where the caller knows them
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
-    key: str = ""  # fingerprint of what has been done so far; of the files of the drive where it is empty
+    key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
 
     @cached_property
     def components(self) -> Components:
@@ -69,29 +70,34 @@ class Run:
 
     @property
     def feature_settings(self) -> object:
-        """What the features depend on: settings, and the models by their hashes."""
+        """Dependencies of the features: settings, and the models by their hashes."""
         config = self.config
         models = self.components.fingerprint_of("extractor", "segmenter")
         return [config.features.model_dump(), config.semantics.model_dump(), models]
 
-    def step(self, stage: str) -> CountProgress:
+    def step(self, stage: Stage) -> CountProgress:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
 
-    def begin(self, stage: str) -> None:
+    def begin(self, stage: Stage) -> None:
         """Tell that a stage begins, of which nothing is done yet."""
         self.progress(stage, 0, 0)
 
-    def next_key(self, name: str, settings: object) -> str:
+    @cached_property
+    def drive_key(self) -> str:
+        """Fingerprint of the drive's manifest and files."""
+        return drive_fingerprint(self.drive, self.content_sha256, threads=self.config.threads)
+
+    def next_key(self, stage: Stage, settings: object) -> str:
         """The fingerprint of a stage that follows those done so far."""
-        return fingerprint(self.key or drive_fingerprint(self.drive), name, settings, code_version())
+        return fingerprint(self.key or self.drive_key, stage, settings, VERSIONS[stage])
 
     def stage(
-        self, name: str, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]
+        self, name: Stage, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]
     ) -> tuple[Arrays, dict[str, Any]]:
         """Do a stage, or take its result from the store.
 
-        A stage's fingerprint covers the one before it, its own settings and the engine's version.
+        A stage's fingerprint covers the one before it, its own settings and its version.
         """
         if self.cancel():
             raise CancelledError
@@ -118,15 +124,17 @@ def load_models(run: Run) -> None:
 
 def preflight(run: Run) -> None:
     """Check manifest, files and a sample of the images; refuse what cannot work before any long work."""
-    run.begin("preflight")
-    findings = inspect_drive(run.drive, use_gnss=run.config.use_gnss, progress=run.step("preflight"), cancel=run.cancel)
+    run.begin(Stage.PREFLIGHT)
+    findings = inspect_drive(
+        run.drive, use_gnss=run.config.use_gnss, progress=run.step(Stage.PREFLIGHT), cancel=run.cancel
+    )
     run.report["findings"] = [as_json(finding) for finding in findings]
     require_sound(findings)
-    run.progress("preflight", 1, 1)
+    run.progress(Stage.PREFLIGHT, 1, 1)
 
 
 def prior(run: Run) -> PriorTrajectory:
-    """Where the units roughly are."""
+    """Read the prior trajectory of the units."""
     result = prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
     run.report["prior"] = {
         "source": result.source,
@@ -139,7 +147,7 @@ def prior(run: Run) -> PriorTrajectory:
 def probe(run: Run) -> None:
     """On the first units: is the calibration the right way round?"""
     images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
-    known = run.store.has("features", run.next_key("features", run.feature_settings))
+    known = run.store.has("features", run.next_key(Stage.FEATURES, run.feature_settings))
     if len(run.drive.cameras) < 2 or known:
         return
     first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
@@ -165,7 +173,7 @@ def features(run: Run) -> list[ImageFeatures]:
             threads=run.config.threads,
             segmenter=run.components.segmenter,
             class_margin_px=run.config.features.class_margin_px,
-            progress=run.step("features"),
+            progress=run.step(Stage.FEATURES),
             cancel=run.cancel,
         )
         arrays = _pack_features(found)
@@ -187,7 +195,7 @@ def features(run: Run) -> list[ImageFeatures]:
             ],
         }
 
-    arrays, report = run.stage("features", run.feature_settings, work)
+    arrays, report = run.stage(Stage.FEATURES, run.feature_settings, work)
     left_out = {image["file"]: Incomplete(image["reason"]) for image in report["images_left_out"]}
     _say_left_out(run, left_out)
     if len(left_out) == len(run.drive.images):
@@ -254,7 +262,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             run.components.matcher,
             run.config.matching,
             threads=run.config.threads,
-            progress=run.step("matches"),
+            progress=run.step(Stage.MATCHES),
             cancel=run.cancel,
         )
         return pack_pairs(result.pairs), {
@@ -268,7 +276,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
 
     settings = [section.model_dump() for section in (run.config.pairs, run.config.matching, run.config.gnss)]
     settings.append({"use_gnss": run.config.use_gnss, "models": run.components.fingerprint_of("matcher")})
-    arrays, report = run.stage("matches", settings, work)
+    arrays, report = run.stage(Stage.MATCHES, settings, work)
     if not report["verified_pairs"]:
         raise ReconstructionError(
             f"nothing matches: none of {report['candidate_pairs']} image pairs has a verified match",
@@ -288,7 +296,7 @@ def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
 
 
 def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
-    """What `pack_pairs` packed."""
+    """Restore the matches from `pack_pairs`."""
     stops = np.cumsum(arrays["ends"][:, 2])
     return [
         PairMatches(
@@ -313,35 +321,15 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             pairs,
             known.world_from_rig,
             run.config,
-            progress=run.step("mapping"),
+            progress=run.step(Stage.MAPPING),
             cancel=run.cancel,
         )
         mapper.missing |= np.array([f.left_out is not None for f in found])
-        arrays = {
-            "of_keypoint": mapper.tracks.of_keypoint,
-            "registered": mapper.registered,
-            "keyframe": mapper.keyframe,
-            "solved": mapper.triangulated,
-            "kept": mapper.is_inlier,
-            "missing": mapper.missing,
-            "has_own_pose": mapper.motion.own_poses[0],
-            "unit_from_image": mapper.motion.own_poses[1],
-            **{name: getattr(mapper.state, name) for name in STATE_ARRAYS},
-        }
-        return arrays, mapping_report.describe(mapper, log)
+        return mapper.to_arrays(), mapping_report.describe(mapper, log)
 
     settings = (run.config.mapping.model_dump(), run.config.bundle_adjustment.model_dump(), run.config.seed)
-    arrays, _ = run.stage("mapping", settings, work)
-    mapper = Mapper(run.drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), run.config)
-    mapper.registered, mapper.triangulated, mapper.is_inlier = arrays["registered"], arrays["solved"], arrays["kept"]
-    mapper.keyframe = arrays["keyframe"]
-    mapper.state = replace(mapper.state, **{name: arrays[name] for name in STATE_ARRAYS})
-    mapper.missing = arrays["missing"]
-    if known.world_from_rig is not None:
-        mapper.motion.follow_prior(known.world_from_rig)
-    for image in np.flatnonzero(arrays["has_own_pose"]):
-        mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
-    return mapper
+    arrays, _ = run.stage(Stage.MAPPING, settings, work)
+    return Mapper.from_arrays(run.drive, keypoints, run.config, known.world_from_rig, arrays)
 
 
 def scene(
@@ -349,13 +337,13 @@ def scene(
 ) -> Scene:
     """Georeferencing, the final adjustment with all priors, and how certain the result is."""
     started = time.perf_counter()
-    run.begin("refinement")
+    run.begin(Stage.REFINEMENT)
     refinement = refine(
         mapper,
         gnss=known.gnss,
         antenna_in_rig_m=known.antenna_in_rig_m,
         rough_world_from_rig=known.rough_world_from_rig,
-        progress=run.step("refinement"),
+        progress=run.step(Stage.REFINEMENT),
         cancel=run.cancel,
     )
     between = register_between_keyframes(mapper, max_error_px=run.config.mapping.filter_error_px)
@@ -371,7 +359,7 @@ def scene(
     run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(mapper)]
     run.report["stages"].append(
         {
-            "stage": "refinement",
+            "stage": Stage.REFINEMENT,
             "seconds": round(time.perf_counter() - started, 3),
             "reused": False,
             **mapping_report.describe_refinement(mapper, refinement),
@@ -379,7 +367,7 @@ def scene(
         }
     )
     result = build_scene(mapper, refinement, found, pairs, known, notes=run.drive.manifest.notes)
-    run.progress("refinement", 1, 1)
+    run.progress(Stage.REFINEMENT, 1, 1)
     return result
 
 
@@ -391,17 +379,17 @@ def pictures(run: Run, result: Scene) -> dict[str, bytes]:
     def step(done: int, total: int) -> None:
         if run.cancel():
             raise CancelledError
-        run.progress("pictures", done, total)
+        run.progress(Stage.PICTURES, done, total)
 
     started = time.perf_counter()
-    run.begin("pictures")
+    run.begin(Stage.PICTURES)
     files, report = draw_pictures(result, seed=run.config.seed, progress=step)
     seconds = round(time.perf_counter() - started, 3)
-    run.report["stages"].append({"stage": "pictures", "seconds": seconds, "reused": False, **report})
-    run.progress("pictures", 1, 1)
+    run.report["stages"].append({"stage": Stage.PICTURES, "seconds": seconds, "reused": False, **report})
+    run.progress(Stage.PICTURES, 1, 1)
     return files
 
 
 def store_of(out: Path) -> StageStore:
-    """Where a scene's folder keeps its finished stages."""
-    return StageStore(out / ".stages")
+    """Store of finished stages in a scene's folder."""
+    return StageStore(out / CHECKPOINT_FOLDER)

@@ -78,7 +78,7 @@ class BodyAxes(StrEnum):
 
 
 class SemanticClass(StrEnum):
-    """What the engine distinguishes; a label map sends a mask's ids to these."""
+    """Classes that the engine distinguishes; a label map sends a mask's ids to these."""
 
     STATIC = "static"
     ROAD = "road"
@@ -267,7 +267,7 @@ class RoughTrajectory(_Model):
 
 
 class LabelMap(_Model):
-    """What the ids in the masks mean. Ids that are not listed are refused by name when a mask holds them."""
+    """Meaning of the ids in the masks. Ids that are not listed are refused by name when a mask holds them."""
 
     ids: dict[Annotated[int, Field(ge=0, le=255)], SemanticClass] = Field(
         description="by id, which JSON writes as a string"

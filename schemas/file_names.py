@@ -54,7 +54,7 @@ def _told_apart(path: str, other: str) -> str:
 
 
 def _any_is_a_folder(files: Collection[str]) -> bool:
-    """Whether one of these paths, or the manifest's, is a folder of another.
+    """Return whether one of these paths, or the manifest's, is a folder of another.
 
     Only the innermost folders are kept: all of them together may take a hundred times the memory of the paths.
     """

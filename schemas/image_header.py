@@ -1,4 +1,4 @@
-"""What the header and the last bytes of a JPEG or PNG file say about it, without decoding it.
+"""Headers and last bytes of JPEG and PNG files, without decoding.
 
 Memory and time are bounded whatever the bytes are: files come from outside.
 """
@@ -31,7 +31,7 @@ _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a segment
 
 
 class ImageKind(StrEnum):
-    """How a file's pixels are stored."""
+    """Format of a file's pixels."""
 
     GRAY = "gray"
     GRAY_ALPHA = "gray and alpha"
@@ -53,7 +53,7 @@ _JPEG_KINDS = {1: ImageKind.GRAY, 3: ImageKind.RGB, 4: ImageKind.CMYK}
 
 @dataclass(frozen=True, kw_only=True)
 class ImageHeader:
-    """What is known of an image without decoding it."""
+    """Properties of an image that are known without decoding it."""
 
     format: str  # "JPEG" or "PNG"
     width: int
@@ -147,7 +147,7 @@ def _exactly(stream: BinaryIO, count: int) -> bytes:
 
 
 def _ends_with(stream: BinaryIO, marker: bytes) -> bool:
-    """Whether the end marker comes after the stream's position: at the end usually, else anywhere."""
+    """Return whether the end marker comes after the stream's position: at the end usually, else anywhere."""
     data_start = stream.tell()
     size = stream.seek(0, SEEK_END)
     stream.seek(max(data_start, size - _TAIL_BYTES))

@@ -94,7 +94,7 @@ def file_problems(manifest: DriveManifest) -> Iterator[FieldProblem]:
 
 
 def _numbers_in_another_form(document: Any) -> list[FieldProblem]:
-    """Of a manifest, what pydantic takes for the number that is meant."""
+    """Find numbers of a manifest that pydantic takes for the number that is meant."""
     if not isinstance(document, dict):
         return []
     problems = []

@@ -1,4 +1,4 @@
-"""What can go wrong in the service: one exception that carries the problem details it is answered with."""
+"""The service's error: one exception that carries the problem details of its answer."""
 
 from __future__ import annotations
 

@@ -186,17 +186,17 @@ class Settings(BaseSettings):
 
     @cached_property
     def spool_dir(self) -> Path:
-        """Where bytes from outside wait until they are checked."""
+        """Folder of bytes from outside until they are checked."""
         return self.data_dir.resolve() / "spool"
 
     @cached_property
     def uploads_dir(self) -> Path:
-        """Where the bytes of resumable uploads gather until all are there; of the spool's file system."""
+        """Folder of the bytes of resumable uploads until all are there; on the spool's file system."""
         return self.data_dir.resolve() / "uploads"
 
     @cached_property
     def metrics_dir(self) -> Path:
-        """Where the processes of one API count together."""
+        """Folder in which the processes of one API share their metrics."""
         return self.data_dir.resolve() / "metrics"
 
     @cached_property
@@ -206,5 +206,5 @@ class Settings(BaseSettings):
 
     @cached_property
     def scratch_dir(self) -> Path:
-        """Where stages work."""
+        """Folder of the attempts' files."""
         return self.data_dir.resolve() / "scratch"

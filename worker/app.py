@@ -41,7 +41,7 @@ class ShutdownFlag:
         self._byte[0] = 1
 
     def is_set(self) -> bool:
-        """True where the worker was told to stop."""
+        """Return whether the worker was told to stop."""
         return self._byte[0] == 1
 
 

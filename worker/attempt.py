@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mrasfm_engine.config import EngineConfig
+from schemas.artifacts import CHECKPOINT_FOLDER
 from service.settings import Settings
 from worker.child_output import ChildOutput
 from worker.child_protocol import Attempt, ChildRequest, ChildResult
@@ -55,7 +56,7 @@ class AttemptFolder:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.out = root / "scene"
-        self.finished_stages = self.out / ".stages"
+        self.finished_stages = self.out / CHECKPOINT_FOLDER
         self.request = root / "request.json"
         self.result = root / "result.json"
         self.cancel = root / "cancel"

@@ -1,4 +1,4 @@
-"""The output of a child process: a bounded file for whoever looks into its folder, and the tail for the outcome."""
+"""Output of a child process: a bounded file for whoever looks into its folder, and the tail for the outcome."""
 
 from __future__ import annotations
 

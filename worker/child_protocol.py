@@ -29,8 +29,9 @@ class Attempt:
     Attributes
     ----------
     drive
-        Folder with `drive.json` and the files it names; None for an aggregation. Finished stages are found again
-        only where the files' times of modification are those of the last time.
+        Folder with `drive.json` and the files it names; None for an aggregation.
+    content_sha256
+        SHA-256 of these files by name: what finished stages are found again by.
     settings
         As in the API's `ReconstructionSettings`.
     scenes, into, remove
@@ -45,6 +46,7 @@ class Attempt:
     work: Work
     settings: Mapping[str, Any]
     drive: Path | None = None
+    content_sha256: Mapping[str, str] | None = None
     scenes: Mapping[str, Path] = field(default_factory=dict)
     into: Path | None = None
     remove: Sequence[str] = field(default_factory=list)
@@ -60,7 +62,7 @@ class ChildRequest(Attempt):
     Attributes
     ----------
     out
-        Folder of the scene or map; finished stages lie in its `.stages`.
+        Folder of the scene or map; finished stages lie in its `CHECKPOINT_FOLDER`.
     cancel_file
         The child ends its work where this file exists.
     result_file

@@ -26,7 +26,7 @@ class ClockGuard:
             self._asked_s = time.monotonic()
 
     def counts(self, clock_us: int) -> bool:
-        """True where leases that have run out may be taken as such; called when the turn to write is there.
+        """Return whether leases that have run out may be taken as such; called when the turn to write is there.
 
         Parameters
         ----------

@@ -19,6 +19,7 @@ from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage
 from worker.child_protocol import ChildError, ChildRequest, ChildResult, Work
 from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter
@@ -63,13 +64,25 @@ class CancelFile:
 def _reconstruct(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    reconstruct(_drive_of(request), request.out, config, progress=progress, cancel=cancelled)
+    reconstruct(
+        _drive_of(request),
+        request.out,
+        config,
+        progress=progress,
+        cancel=cancelled,
+        content_sha256=request.content_sha256,
+    )
     return _written_report(request.out)
 
 
 def _aggregate(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
+    def complete(report: dict[str, Any]) -> None:
+        """Name the drives without a scene: the engine knows of those alone that fit into no map."""
+        unfit = [{**request.members[found["scene"]], "problem": _problem(found)} for found in report.pop("left_out")]
+        report["failed_drives"] = [*request.failed, *unfit]
+
     aggregate(
         request.scenes,
         request.out,
@@ -79,20 +92,14 @@ def _aggregate(
         leave_out=request.leave_out,
         progress=progress,
         cancel=cancelled,
+        complete_report=complete,
     )
-    written = _written_report(request.out)
-    unfit = [{**request.members[found["scene"]], "problem": _problem(found)} for found in written.pop("left_out")]
-    written["failed_drives"] = [*request.failed, *unfit]
-    # The engine does not know of drives that it was not given; who reads the map's report shall.
-    path = request.out / "report.json"
-    partial = path.with_name(".report.json.partial")
-    partial.write_text(json.dumps(written, indent=1, allow_nan=False), encoding="utf-8")
-    partial.replace(path)
-    return {**written, "map": _figures(json.loads((request.out / "map.json").read_text(encoding="utf-8")))}
+    figures = _figures(json.loads((request.out / MAP_FILE).read_text(encoding="utf-8")))
+    return {**_written_report(request.out), "map": figures}
 
 
 def _problem(found: dict[str, Any]) -> dict[str, Any]:
-    """Why a scene is not in the map."""
+    """Problem of a scene that is not in the map."""
     problem = Problem(
         type=PROBLEM_TYPE + found["code"],
         title="The scene fits into no map",
@@ -114,7 +121,7 @@ def _figures(document: dict[str, Any]) -> dict[str, Any]:
 
 def _written_report(out: Path) -> dict[str, Any]:
     """The report as written, and not as returned: the file has been through the writer's conversions."""
-    written: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    written: dict[str, Any] = json.loads((out / REPORT_FILE).read_text(encoding="utf-8"))
     return written
 
 
@@ -127,15 +134,22 @@ def _preflight(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
     """The findings of a reconstruction's first seconds: manifest, files, images, and the calibration's direction."""
-    run = stages.Run(read_drive(_drive_of(request)), config, stages.store_of(request.out), progress, cancelled)
-    findings = inspect_drive(run.drive, use_gnss=config.use_gnss, progress=run.step("preflight"), cancel=cancelled)
+    run = stages.Run(
+        read_drive(_drive_of(request)),
+        config,
+        stages.store_of(request.out),
+        progress,
+        cancelled,
+        request.content_sha256,
+    )
+    findings = inspect_drive(run.drive, use_gnss=config.use_gnss, progress=run.step(Stage.PREFLIGHT), cancel=cancelled)
     if is_sound(findings):
-        progress("calibration", 0, 1)
+        progress(Stage.CALIBRATION, 0, 1)
         try:
             stages.probe(run)
         except InputError as problem:
             findings.insert(0, error(problem.code, _without_paths(problem.what, request), problem.remedy))
-        progress("calibration", 1, 1)
+        progress(Stage.CALIBRATION, 1, 1)
     if cancelled():
         raise CancelledError
     return {"findings": [as_json(finding) for finding in findings], "sound": is_sound(findings)}

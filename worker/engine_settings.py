@@ -1,4 +1,4 @@
-"""The engine's settings that a request may set."""
+"""Engine settings that a request may set."""
 
 from __future__ import annotations
 

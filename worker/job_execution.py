@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.api.resource import Finding
+from schemas.artifacts import Stage
 from service.database.connections import Database
 from service.domain import jobs
 from service.domain.drive_checkout import DriveGoneError
@@ -166,7 +167,7 @@ class _Execution:
 
     def _attempt(self, folder: AttemptFolder) -> Outcome:
         check_stop = self._check_stop
-        count = partial(self._meter.update, "fetch")
+        count = partial(self._meter.update, Stage.FETCH)
         try:
             attempt = watched(lambda: self._handler.lay_out(folder, self._fetch, count), check_stop)
         except DriveGoneError:
@@ -175,7 +176,7 @@ class _Execution:
                 what=f"drive {self._held.drive_id} was deleted",
                 remedy="Upload it again.",
                 retryable=False,
-                stage="fetch",
+                stage=Stage.FETCH,
             )
         with self._finished_stages(folder):
             return run_attempt(
@@ -198,8 +199,8 @@ class _Execution:
         watched(lambda: keeper.restore(self._fetch), self._check_stop)
         return keeper
 
-    def _fetch(self, key: str, target: Path, sha256: str) -> None:
-        self._retry(lambda: self._artifacts.fetch(key, target, sha256, check_stop=self._check_stop))
+    def _fetch(self, key: str, target: Path) -> None:
+        self._retry(lambda: self._artifacts.fetch(key, target, check_stop=self._check_stop))
 
     def _retry(self, step: Callable[[], T]) -> T:
         return retry(step, budget_s=self._settings.storage_patience_seconds, check_stop=self._check_stop)
@@ -274,7 +275,7 @@ class _Execution:
         files = {}
         for i, (name, path) in enumerate(found):
             files[name] = self._store(path)
-            self._meter.update("publish", i + 1, len(found))
+            self._meter.update(Stage.PUBLISH, i + 1, len(found))
         self._check_stop()
         made = self._commit(lambda session: self._handler.publish(session, done, files, self._settings))
         log.info("published", extra={"fields": made or {}})

@@ -51,8 +51,9 @@ class DriveHandler:
             Where the drive was deleted.
         """
         drive = folder.root / "drive"
-        materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
-        return Attempt(work=Work(self._held.kind.lower()), drive=drive, settings=self._held.settings)
+        contents = materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
+        work, settings = Work(self._held.kind.lower()), self._held.settings
+        return Attempt(work=work, drive=drive, content_sha256=contents, settings=settings)
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
@@ -96,7 +97,7 @@ class AggregationHandler:
         wanted += [(root / "base" / file.path, file) for file in inputs.base]
         for i, (target, file) in enumerate(wanted):
             target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            fetch(file.key, target, file.sha256)
+            fetch(file.key, target)
             progress(i + 1, len(wanted))
         return Attempt(
             work=Work.AGGREGATION,

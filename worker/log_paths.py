@@ -64,7 +64,7 @@ def _shown_as(folders: Iterable[Path], how: Callable[[Path], tuple[str, str]]) -
 
 
 def _package_folders() -> list[Path]:
-    """The folders of installed packages, ours among them; then the environment around them."""
+    """Folders of installed packages, ours among them; then the environment around them."""
     installed = [*site.getsitepackages(), site.getusersitepackages(), *map(sysconfig.get_path, ("purelib", "platlib"))]
     ours = Path(__file__).parents[1]
     return [ours, *map(Path, [*installed, sys.prefix, sys.base_prefix])]

@@ -1,4 +1,4 @@
-"""The kernel's count of processes that it killed for lack of memory around this one."""
+"""The kernel's count of kills for lack of memory around this process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MemoryKills:
     count: int
 
     def since(self, before: MemoryKills | None) -> int | None:
-        """The number killed since an earlier moment; None where that is another counter's, or is not known."""
+        """Number of kills since an earlier count; None where that is another counter's, or is not known."""
         if before is None or before.counter != self.counter or before.count > self.count:
             return None
         return self.count - before.count
@@ -46,7 +46,7 @@ class MemoryKills:
 
     @classmethod
     def read(cls, path: Path) -> MemoryKills | None:
-        """The count that `write` left; None where it did not come so far."""
+        """Read the count that `write` left; None where it did not come so far."""
         with suppress(OSError, ValueError, TypeError):
             found = cls(**json.loads(path.read_text(encoding="utf-8")))
             if isinstance(found.counter, str) and isinstance(found.count, int):
@@ -68,7 +68,7 @@ def memory_kills(*, proc: Path = _PROC, mounts: Path = _MOUNTS) -> MemoryKills |
 
 
 def kills_since(before: MemoryKills | None) -> int | None:
-    """The number that the kernel has killed since; None where it does not say."""
+    """Number of kills since then; None where the kernel does not say."""
     now = memory_kills()
     return None if now is None else now.since(before)
 

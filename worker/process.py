@@ -74,7 +74,7 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """The id of the child, and of its process group."""
+        """Id of the child, and of its process group."""
         return self._process.pid
 
     def pump(self, timeout_s: float) -> list[StageReport]:
@@ -103,7 +103,7 @@ class ChildProcess:
         return []
 
     def has_exited(self) -> bool:
-        """True once the child is a zombie. It stays one until `close`: so its group's id names no other processes."""
+        """The child is a zombie. It stays one until `close`: so its group's id names no other processes."""
         try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
         except ChildProcessError:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
+from schemas.artifacts import CHECKPOINTED, Stage
 from service.domain.jobs import ProgressNote
 from worker.child_protocol import Work
 
@@ -14,44 +15,43 @@ from worker.child_protocol import Work
 WEIGHTS: Mapping[Work, Mapping[str, float]] = MappingProxyType(
     {
         Work.RECONSTRUCTION: {
-            "fetch": 3.0,
-            "preflight": 4.0,
-            "features": 32.0,
-            "matches": 25.0,
-            "mapping": 20.0,
-            "refinement": 6.0,
-            "pictures": 3.0,
-            "export": 4.0,
-            "publish": 3.0,
+            Stage.FETCH: 3.0,
+            Stage.PREFLIGHT: 4.0,
+            Stage.FEATURES: 32.0,
+            Stage.MATCHES: 25.0,
+            Stage.MAPPING: 20.0,
+            Stage.REFINEMENT: 6.0,
+            Stage.PICTURES: 3.0,
+            Stage.EXPORT: 4.0,
+            Stage.PUBLISH: 3.0,
         },
         Work.AGGREGATION: {
-            "fetch": 4.0,
-            "scenes": 8.0,
-            "association": 1.0,
-            "seams": 52.0,
-            "joint": 5.0,
-            "adjustment": 16.0,
-            "pictures": 4.0,
-            "export": 6.0,
-            "publish": 4.0,
+            Stage.FETCH: 4.0,
+            Stage.SCENES: 8.0,
+            Stage.ASSOCIATION: 1.0,
+            Stage.SEAMS: 52.0,
+            Stage.JOINT: 5.0,
+            Stage.ADJUSTMENT: 16.0,
+            Stage.PICTURES: 4.0,
+            Stage.EXPORT: 6.0,
+            Stage.PUBLISH: 4.0,
         },
-        Work.PREFLIGHT: {"fetch": 20.0, "preflight": 30.0, "calibration": 50.0},
+        Work.PREFLIGHT: {Stage.FETCH: 20.0, Stage.PREFLIGHT: 30.0, Stage.CALIBRATION: 50.0},
     }
 )
 UNITS: Mapping[str, str] = MappingProxyType(
     {
-        "fetch": "files",
-        "scenes": "scenes",
-        "preflight": "files",
-        "features": "images",
-        "matches": "pairs",
-        "mapping": "units",  # rigid units: all cameras at one instant
-        "refinement": "rounds",
-        "pictures": "images",
-        "publish": "files",
+        Stage.FETCH: "files",
+        Stage.SCENES: "scenes",
+        Stage.PREFLIGHT: "files",
+        Stage.FEATURES: "images",
+        Stage.MATCHES: "pairs",
+        Stage.MAPPING: "units",  # rigid units: all cameras at one instant
+        Stage.REFINEMENT: "rounds",
+        Stage.PICTURES: "images",
+        Stage.PUBLISH: "files",
     }
 )
-REUSABLE = frozenset({"features", "matches", "mapping"})
 
 _MIN_EARNED = 5.0  # percent that must have been worked for before a time to the end means something
 _MIN_ELAPSED_S = 3.0
@@ -79,7 +79,7 @@ class ProgressMeter:
         """Take in a report. Stages that are not known count nothing."""
         now = self._note
         # The engine ends each of these with "1 of 1"; one that begins so was finished before.
-        ends = done == total == 1 and stage in REUSABLE
+        ends = done == total == 1 and stage in CHECKPOINTED
         reused = ends and stage != now.stage
         if reused:
             self._skipped += self._weights.get(stage, 0.0)
@@ -92,7 +92,7 @@ class ProgressMeter:
             unit=None if reused else UNITS.get(stage),
             percent=max(now.percent, self._percent(stage, done, total)),
             reused=(*now.reused, stage) if reused else now.reused,
-            engine_ran=stage != "fetch",
+            engine_ran=stage != Stage.FETCH,
         )
 
     @property

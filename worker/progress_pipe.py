@@ -11,7 +11,7 @@ INTERVAL_S = 0.2
 
 
 class StageReport(NamedTuple):
-    """The progress of a stage, in the engine's own count."""
+    """Progress of a stage, in the engine's own count."""
 
     stage: str
     done: int

@@ -15,7 +15,7 @@ SHUT_DOWN_GRACE_S = 3.0
 
 
 class StopReason(IntEnum):
-    """Why an attempt is stopped. A higher one takes the place of a lower one."""
+    """Reason to stop an attempt. A higher one takes the place of a lower one."""
 
     CANCEL = 1
     TIMEOUT = 2

@@ -112,7 +112,7 @@ class Assembly:
 
     @property
     def simultaneous(self) -> bool:
-        """Whether all images are taken at their unit's timestamp."""
+        """All images are taken at their unit's timestamp."""
         return not any(len(s.unit_from_image) for s in self.scenes)
 
     def state(self, world_from_scene: Floats) -> State:

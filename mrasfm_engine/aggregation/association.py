@@ -1,4 +1,4 @@
-"""Which scenes may see one another: everything by positions, before any image is compared."""
+"""Candidate pairs of scenes, from positions alone, before any image is compared."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Assoc
 
 
 def coarse_transform(a: SourceScene, b: SourceScene) -> Floats:
-    """How b lies in a (4, 4) by the positions of both."""
+    """Transform a_from_b (4, 4) by the positions of both scenes."""
     return _composed(se3.inverse(a.ecef_from_local), b.ecef_from_local)
 
 
@@ -74,7 +74,7 @@ def _pairs(scenes: Sequence[SourceScene], config: AggregationConfig) -> list[tup
 def choose_pairs(
     count: int, scores: Mapping[tuple[int, int], tuple[float, ...]], candidates: int
 ) -> list[tuple[int, int]]:
-    """Of scored pairs of scenes those of which one is among the other's candidates, and as many between their groups.
+    """Choose scored pairs of scenes of which one is among the other's candidates, and as many between their groups.
 
     Scenes of one street fill each other's lists: without the latter, those of the street across would be compared with
     none of them.

@@ -1,4 +1,4 @@
-"""What a map's last adjustment knows of every drive's calibration.
+"""Priors on every drive's calibration in a map's last adjustment.
 
 Each drive has its own. A short one tells little of it, and the shape of its scene leans on that little: two scenes with
 calibrations a tenth of a degree off each their own way cannot both be rigid where they share points, and what gives way
@@ -21,7 +21,7 @@ MAX_COUPLINGS = 500_000  # of cameras that vary with units and with one another:
 def calibration_priors(
     assembly: Assembly, state: State, free_units: Bools, config: BundleAdjustmentConfig
 ) -> list[CameraPosePrior]:
-    """What scenes say of their cameras, one prior for each drive whose calibration may settle.
+    """Make one prior for each drive whose calibration may vary, from the uncertainty that its scenes state.
 
     They are the drives whose scenes refined it and that have units that vary. A scene's certainty rests on all its
     units; observations of those that vary count in the adjustment anyway, so only the others' share is kept. In a map

@@ -1,4 +1,4 @@
-"""Which images of two scenes may show the same: overlap of their footprints on the ground.
+"""Overlap of images' footprints on the ground: images of two scenes that may show the same.
 
 A camera's footprint are the places on the ground, seen from the rig at its usual height, that it sees within some
 depth. The homography from the ground to an image is what its pose and calibration make it; here it is applied to a few

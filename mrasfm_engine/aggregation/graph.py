@@ -19,7 +19,7 @@ LEAST_SIGMA_DEG, LEAST_SIGMA_M = 0.02, 0.01  # of a seam: scenes are bent by mor
 
 @dataclass(frozen=True, kw_only=True)
 class Closing:
-    """How far a seam that closes a loop is from what the other seams say."""
+    """Misclosure of a seam that closes a loop: its transform against the chain of the other seams."""
 
     seam: int
     shift_m: float
@@ -28,7 +28,7 @@ class Closing:
 
     @property
     def plausible(self) -> bool:
-        """Whether errors of good seams may add up to it."""
+        """Return whether the errors of good seams can add up to this misclosure."""
         return self.shift_m <= MAX_CLOSING_M * self.length and self.turn_deg <= MAX_CLOSING_DEG * self.length
 
 

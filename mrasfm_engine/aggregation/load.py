@@ -23,7 +23,6 @@ from schemas import Camera, DriveManifest, Pose
 SCHEMA_VERSION = 1
 MIN_UNITS = 2
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-BETWEEN_NAMES = "~"  # in what is called after two scenes: no name has it, and URLs and shells take it as it is
 NEEDED = (
     "report.json", "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply", "features.db",
     "model/images.bin", "model/points3D.bin",
@@ -256,7 +255,7 @@ def _arrays(
 
 
 def features_kind(report: dict[str, Any]) -> str:
-    """Which extractor, and which model of it, made a scene's descriptors: others cannot be compared with them."""
+    """Return the extractor, and its model, of a scene's descriptors: others cannot be compared with them."""
     extractor = report.get("settings", {}).get("features", {}).get("extractor", "sift")
     model = report.get("models", {}).get("extractor", {}).get("sha256", "")
     return f"{extractor} {model}".strip()

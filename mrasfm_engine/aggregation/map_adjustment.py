@@ -154,7 +154,7 @@ def _options(config: EngineConfig) -> SolverOptions:
 
 
 def _free_units(assembly: Assembly, problem: Problem, joined: Bools, config: EngineConfig) -> Bools:
-    """Which units (u,) vary: all registered ones, those that see what is shared, or none."""
+    """Select the units (u,) that vary: all registered ones, those that observe shared points, or none."""
     which = config.aggregation.final_adjustment
     if which == "none":
         return np.zeros(len(assembly.registered), dtype=np.bool_)

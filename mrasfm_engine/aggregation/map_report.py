@@ -1,4 +1,4 @@
-"""What is said and written of a map: `map.json`, pictures of its seams, and findings."""
+"""Report of a map: `map.json`, pictures of its seams, and findings."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.export.calibration import document_in_map
 from mrasfm_engine.export.map import MapContent
 from mrasfm_engine.export.picture_files import png_of
-from mrasfm_engine.export.scene import PICTURES
 from mrasfm_engine.findings import warning
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
+from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
 
 CONNECTED, BY_POSITIONS = "connected", "placed by positions"
 BEFORE, AFTER = "before", "after"
@@ -100,7 +100,7 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
         pictures=pictures,
         scenes={s.name: (s.fingerprint, *s.pack()) for s in result.scenes},
         seams={
-            stages.seam_name(seam.a, seam.b): (
+            seam_name(seam.a, seam.b): (
                 stages.seam_key(run, by_name[seam.a], by_name[seam.b]),
                 *seam.pack(),
             )
@@ -177,14 +177,14 @@ def _seam(result: MapResult, number: int, pictures: Collection[str]) -> dict[str
         }
     shown = {when: name for when in (BEFORE, AFTER) if (name := _picture_name(seam, when)) in pictures}
     if shown:
-        document["pictures"] = {when: f"{PICTURES}/{name}" for when, name in shown.items()}
+        document["pictures"] = {when: f"{PICTURES_FOLDER}/{name}" for when, name in shown.items()}
     if closing is not None:
         document["closes_loop"] = {"shift_m": closing.shift_m, "turn_deg": closing.turn_deg, "seams": closing.length}
     return document
 
 
 def _moved(result: MapResult, seam: Seam) -> float:
-    """How far, at the seam, the map is from what the seam alone says."""
+    """Difference, at the seam, between the map's transform and the seam's own."""
     (a, b), poses, at = result.ends_of(seam), result.map_from_scene, seam.place_b_m[None]
     lies = se3.apply(se3.inverse(poses[a]) @ poses[b], at)
     return float(np.linalg.norm(lies - se3.apply(seam.a_from_b, at)))
@@ -193,7 +193,7 @@ def _moved(result: MapResult, seam: Seam) -> float:
 def map_pictures(run: stages.Run, result: MapResult) -> dict[str, bytes]:
     """Pictures of every accepted seam, as positions put its scenes and in the map, as PNG files by name."""
     started = time.perf_counter()
-    run.begin("pictures")
+    run.begin(Stage.PICTURES)
     pictures: dict[str, bytes] = {}
     shown = [seam for seam in result.seams if seam.accepted]
     for done, seam in enumerate(shown, 1):
@@ -201,13 +201,13 @@ def map_pictures(run: stages.Run, result: MapResult) -> dict[str, bytes]:
             raise CancelledError
         for when, picture in _seam_pictures(result, seam).items():
             pictures[_picture_name(seam, when)] = png_of(picture)
-        run.progress("pictures", done, len(shown))
-    run.ended("pictures", started, pictures=len(pictures))
+        run.progress(Stage.PICTURES, done, len(shown))
+    run.ended(Stage.PICTURES, started, pictures=len(pictures))
     return pictures
 
 
 def _picture_name(seam: Seam, when: str) -> str:
-    return f"seam-{stages.seam_name(seam.a, seam.b)}-{when}.png"
+    return f"seam-{seam_name(seam.a, seam.b)}-{when}.png"
 
 
 def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:

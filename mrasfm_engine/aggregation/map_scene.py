@@ -75,7 +75,7 @@ def _joined_drive(assembly: Assembly) -> Drive:
 
 
 def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]:
-    """Of all cameras of all drives, as the map has them; how certain they are their scenes say."""
+    """Calibrations of all cameras of all drives in the map; their scenes state how certain they are."""
     cameras = [camera for scene in assembly.scenes for camera in scene.drive.cameras]
     unknown = np.full(3, np.nan)
     return [

@@ -1,4 +1,4 @@
-"""Which images of two scenes are matched: few, and where their footprints on the ground overlap.
+"""Image pairs between two scenes: few, and where their footprints on the ground overlap.
 
 How two scenes lie to one another is known at first from their positions only, metres wrong. So a few units of one are
 compared with all that the other may have seen from around there; when it is known how they lie, images are paired by
@@ -50,7 +50,7 @@ def _length_m(scene: SourceScene) -> float:
 
 
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
-    """How near the ways of two scenes come to one another, horizontally, as they lie."""
+    """Smallest horizontal distance between the trajectories of two scenes."""
     way = b.way_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
     return float(np.min(cKDTree(a.way_m[:, :2]).query(way[:, :2])[0]))
 
@@ -121,7 +121,7 @@ def guided_pairs(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggre
 
 
 def common_view(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> float:
-    """How much of one scene the other one sees as they lie, in images: the best overlaps of all images, added."""
+    """Overlap of two scenes, in images: the best overlaps of all images, added."""
     pairs, score = _overlapping(a, b, a_from_b, config)
     best = [np.zeros(len(scene.image_unit)) for scene in (a, b)]
     for side in (0, 1):

@@ -27,6 +27,7 @@ from mrasfm_engine.export.publishing import COMPLETE_MARK
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.types import Floats, StageProgress
+from schemas.artifacts import CHECKPOINT_FOLDER, Stage
 
 
 def aggregate(
@@ -39,6 +40,7 @@ def aggregate(
     leave_out: bool = False,
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
+    complete_report: Callable[[dict[str, Any]], None] = lambda report: None,
 ) -> dict[str, Any]:
     """Put scenes together to a map, and write it into the folder `out`.
 
@@ -60,6 +62,8 @@ def aggregate(
         Called as progress(stage, done, total).
     cancel
         Asked now and then; where it answers True the run ends with CancelledError.
+    complete_report
+        Called with the report before it is written: what the caller alone knows can be added.
 
     Returns
     -------
@@ -80,7 +84,7 @@ def aggregate(
             code="not-a-map",
         )
     named = name_scenes(scenes)
-    run = stages.Run(config, StageStore(out / ".stages"), into, progress, cancel)
+    run = stages.Run(config, StageStore(out / CHECKPOINT_FOLDER), into, progress, cancel)
     run.report["settings"] = config.model_dump(mode="json")
     found = stages.scenes(run, named, remove, leave_out=leave_out)
     known = stages.association(run, found)
@@ -91,9 +95,10 @@ def aggregate(
     pictures = map_pictures(run, result) if config.output.pictures else {}
     if cancel():
         raise CancelledError
-    run.begin("export")
+    run.begin(Stage.EXPORT)
+    complete_report(run.report)
     report = write_map(map_content(run, result, pictures), out, run.report)
-    run.progress("export", 1, 1)
+    run.progress(Stage.EXPORT, 1, 1)
     return report
 
 
@@ -127,7 +132,7 @@ def _join_scenes(
     chains: Sequence[Chain],
 ) -> MapResult:
     started = time.perf_counter()
-    run.begin("joint")
+    run.begin(Stage.JOINT)
     poses, chained = known.map_from_scene.copy(), known.map_from_scene.copy()
     middle = np.stack([scene.midpoint_m for scene in found])
     reports = []
@@ -150,7 +155,7 @@ def _join_scenes(
         poses[members] = map_from_first @ joint.first_from_scene
         chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
-    run.ended("joint", started, loops=sum(len(chain.closings) for chain in chains))
+    run.ended(Stage.JOINT, started, loops=sum(len(chain.closings) for chain in chains))
     adjusted = _adjust_map(run, found, known, graph, poses)
     return MapResult(
         scenes=found,
@@ -175,7 +180,7 @@ def _adjust_map(
     run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
 ) -> AdjustedMap:
     started = time.perf_counter()
-    run.begin("adjustment")
+    run.begin(Stage.ADJUSTMENT)
     assembly = Assembly(scenes=found)
     positions = {
         k: p
@@ -186,7 +191,7 @@ def _adjust_map(
     owner = joined_owner(assembly, _seams_among(graph, found, range(len(found))))
     adjusted = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
     run.ended(
-        "adjustment",
+        Stage.ADJUSTMENT,
         started,
         free_units=adjusted.free_units,
         free_cameras=adjusted.free_cameras,

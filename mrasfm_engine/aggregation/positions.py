@@ -1,4 +1,4 @@
-"""What a drive's receiver says in the map's frame, and by how much all of it is off."""
+"""A drive's GNSS positions in the map's frame, with the offset that all of them share."""
 
 from __future__ import annotations
 

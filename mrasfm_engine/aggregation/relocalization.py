@@ -1,4 +1,4 @@
-"""How one scene lies in another, from the poses of several of its units, and whether these agree.
+"""Relocalisation of several units of one scene in another, and the transform on which they agree.
 
 Every unit of scene b that sees points of scene a gets a pose there by one PnP over its cameras, and with it says how
 all of b lies in a: a_from_b = a_from_rig * inverse(b_from_rig). One unit alone can be wrong: a facade that repeats
@@ -34,7 +34,7 @@ TRIALS = 2000
 
 @dataclass(frozen=True, kw_only=True)
 class Sightings:
-    """What units of scene b see of scene a: image points of b and points of a that they show."""
+    """Observations of scene a's points in images of scene b."""
 
     unit: Ints  # (n,) of b
     image: Ints  # (n,) of b
@@ -50,7 +50,7 @@ class Sightings:
 
 @dataclass(frozen=True, kw_only=True)
 class Relocalization:
-    """How b lies in a, and who says so; without a transform they do not agree, and the reason says why."""
+    """Transform from b to a with the units that agree on it; where they do not agree, the reason says why."""
 
     a_from_b: Floats | None
     reason: str
@@ -92,7 +92,7 @@ class Relocaliser:
         return reprojection_errors_focal(self._kind, self._params, camera, points, seen.xy_px)
 
     def hypothesis(self, unit: int, seen: Sightings) -> Floats | None:
-        """How b lies in a (4, 4) by one unit alone."""
+        """Transform a_from_b (4, 4) by one unit alone."""
         own = seen.select(seen.unit == unit)
         if len(own.unit) < self._config.min_unit_inliers:
             return None
@@ -155,7 +155,7 @@ class Relocaliser:
         return units[good], fits
 
     def relocalise(self, seen: Sightings) -> Relocalization:
-        """How b lies in a by all units that see points of a."""
+        """Find the transform a_from_b on which the units that observe points of a agree."""
         units, counts = np.unique(seen.unit, return_counts=True)
         asked = units[counts >= self._config.min_unit_inliers]
         if not self._config.agreeing_units and len(asked):

@@ -62,7 +62,7 @@ class Seam:
 
     @staticmethod
     def unpack(a: str, b: str, arrays: Arrays, documents: dict[str, Any]) -> Seam:
-        """What `pack` packed, of scenes with these names."""
+        """Restore a seam from `pack`, for scenes with these names."""
         return Seam(
             a=a, b=b, accepted=documents["accepted"], reason=documents["reason"], quality=documents["quality"], **arrays
         )
@@ -222,7 +222,7 @@ def _why_not(
     strict: bool,
     config: EngineConfig,
 ) -> str:
-    """Why a seam cannot be trusted; empty where it can."""
+    """Reason against trusting a seam; empty where there is none."""
     settings = config.aggregation
     if quality["inliers"] < settings.min_inliers:
         return f"only {quality['inliers']} points are shared, {settings.min_inliers} are needed"

@@ -60,7 +60,7 @@ def merge_points(assembly: Assembly, matches: CrossMatches, fits: Bools) -> Shar
 
 
 def matches_fit(assembly: Assembly, state: State, matches: CrossMatches, max_error_focal: float) -> Bools:
-    """Which matches (n,) join points that both scenes see where the other has them, to a share of the focal length."""
+    """Return which matches (n,) join points that both scenes place alike, to a share of the focal length."""
     a, b = assembly.scenes
     point_a = a.keypoint_point[matches.a]
     point_b = b.keypoint_point[matches.b] + assembly.first_point[1]
@@ -93,7 +93,7 @@ class Tracks:
 
     @property
     def count(self) -> int:
-        """How many joined points there are."""
+        """Number of joined points."""
         return int(self.owner.max()) + 1 if len(self.owner) else 0
 
 
@@ -108,7 +108,7 @@ def tracks_of(assembly: Assembly, owner_of_point: Ints) -> Tracks:
 
 
 def joined_points_m(state: State, tracks: Tracks) -> Floats:
-    """Where joined points (count, 3) begin: in the middle of those that they are made of."""
+    """Initial joined points (count, 3): the middle of the points that they are made of."""
     sums = np.zeros((tracks.count, 3))
     np.add.at(sums, tracks.owner, state.points_m[tracks.members])
     result: Floats = sums / np.bincount(tracks.owner, minlength=tracks.count)[:, None].clip(1)
@@ -153,7 +153,7 @@ def transform_problem(
 
 
 def moved_scenes(assembly: Assembly, world_from_scene: Floats, solution: State) -> Floats:
-    """Where scenes (scenes, 4, 4) lie after an adjustment in which they moved as one each."""
+    """Poses (scenes, 4, 4) of scenes after an adjustment in which each moved rigidly."""
     result = world_from_scene.copy()
     for k, scene in enumerate(assembly.scenes):
         unit = int(np.flatnonzero(scene.unit_registered)[0])

@@ -90,7 +90,7 @@ class SourceScene:
 
     @cached_property
     def descriptor_row(self) -> Ints:
-        """Where the descriptor of a keypoint (n,) is, -1 for none."""
+        """Row of each keypoint's (n,) descriptor, -1 for none."""
         known = self.keypoint_point >= 0
         return np.where(known, np.cumsum(known) - 1, -1)
 
@@ -144,7 +144,7 @@ class SourceScene:
 
     @staticmethod
     def unpack(name: str, arrays: Arrays, documents: dict[str, Any]) -> SourceScene:
-        """What `pack` packed, under a name."""
+        """Restore a scene from `pack`, under a name."""
         known = {field.name for field in fields(SourceScene)}
         rest = {key: value for key, value in documents.items() if key in known and key != "manifest"}
         manifest = DriveManifest.model_validate(documents["manifest"])

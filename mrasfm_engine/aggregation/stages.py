@@ -14,20 +14,20 @@ import numpy as np
 
 from mrasfm_engine import __version__
 from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
-from mrasfm_engine.aggregation.load import BETWEEN_NAMES, read_scene
+from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.export.map import SCENES_FOLDER, SEAMS_FOLDER
 from mrasfm_engine.findings import Finding, as_json, warning
-from mrasfm_engine.io.read_map import MAP_FILE
-from mrasfm_engine.io.stage_store import StageStore, code_version, fingerprint
+from mrasfm_engine.io.stage_store import StageStore, fingerprint
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.types import CountProgress, StageProgress
+from schemas.artifacts import MAP_FILE, SCENES_FOLDER, SEAMS_FOLDER, Stage, seam_checkpoint, seam_name
 
 FAR_APART_M = 50_000.0
 MIN_SCENES = 2
+SEAM_VERSION = 1  # see `mrasfm_engine.stages.VERSIONS`
 
 
 @dataclass
@@ -48,15 +48,15 @@ class Run:
         """The matcher; its model is loaded when first asked for, once."""
         return load_components(self.config, None)
 
-    def step(self, stage: str) -> CountProgress:
+    def step(self, stage: Stage) -> CountProgress:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
 
-    def begin(self, stage: str) -> None:
+    def begin(self, stage: Stage) -> None:
         """Tell that a stage begins, of which nothing is done yet."""
         self.progress(stage, 0, 0)
 
-    def ended(self, stage: str, started_s: float, **figures: Any) -> None:
+    def ended(self, stage: Stage, started_s: float, **figures: Any) -> None:
         """Note a stage in the report."""
         seconds = round(time.perf_counter() - started_s, 3)
         self.report["stages"].append({"stage": stage, "seconds": seconds, "reused": False, **figures})
@@ -74,7 +74,7 @@ def scenes(
 ) -> list[SourceScene]:
     """All scenes of the map, those that it has already too; checked against one another."""
     started = time.perf_counter()
-    run.begin("scenes")
+    run.begin(Stage.SCENES)
     kept = {} if run.into is None else _scenes_of_map(run.into)
     for number, name in enumerate(remove):
         if name not in kept or name in remove[:number]:
@@ -100,7 +100,7 @@ def scenes(
             if not leave_out:
                 raise
             unfit[name] = error
-        run.progress("scenes", done, len(folders))
+        run.progress(Stage.SCENES, done, len(folders))
     if unfit and (len(unfit) == len(folders) or len(result) < MIN_SCENES):
         raise next(iter(unfit.values()))
     run.report["left_out"] = [
@@ -108,7 +108,7 @@ def scenes(
     ]
     result.sort(key=lambda scene: scene.name)
     _check_together(run, result)
-    run.ended("scenes", started, scenes=len(result), taken_from_the_map=len(kept))
+    run.ended(Stage.SCENES, started, scenes=len(result), taken_from_the_map=len(kept))
     return result
 
 
@@ -212,7 +212,7 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
 
 
 def _of_one_drive(a: SourceScene, b: SourceScene) -> bool:
-    """Whether two scenes were made of the same recording, perhaps under other settings."""
+    """Return whether two scenes were made of the same recording, perhaps under other settings."""
     if a.fingerprint == b.fingerprint:
         return True
     if a.manifest.frames != b.manifest.frames or a.manifest.gnss != b.manifest.gnss:
@@ -236,9 +236,9 @@ def _require_one(found: Sequence[SourceScene], name: str, code: str, what: str, 
 
 
 def association(run: Run, found: Sequence[SourceScene]) -> Association:
-    """Where positions put the scenes, and which are to be compared."""
+    """Place the scenes by their positions, and choose the pairs to compare."""
     started = time.perf_counter()
-    run.begin("association")
+    run.begin(Stage.ASSOCIATION)
     result = associate(found, run.config.aggregation)
     middle = np.array([m[:3, 3] for m in result.map_from_scene])
     if np.abs(middle - middle[result.reference]).max() > FAR_APART_M:
@@ -249,7 +249,7 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
                 "They are in one map, in the frame of the reference; check that this is meant.",
             )
         )
-    run.ended("association", started, reference=found[result.reference].name, pairs=len(result.pairs))
+    run.ended(Stage.ASSOCIATION, started, reference=found[result.reference].name, pairs=len(result.pairs))
     return result
 
 
@@ -263,13 +263,13 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
         if run.cancel():
             raise CancelledError
         a, b = found[i], found[j]
-        key, name = seam_key(run, a, b), seam_name(a.name, b.name)
-        kept = run.store.load(f"seam-{name}", key)
+        key, name = seam_key(run, a, b), seam_checkpoint(a.name, b.name)
+        kept = run.store.load(name, key)
         if kept is None and older is not None:
-            kept = older.load(name, key)
+            kept = older.load(seam_name(a.name, b.name), key)
         if kept is None:
             if reused == number:  # the first that is not there
-                run.begin("seams")
+                run.begin(Stage.SEAMS)
             seam = find_seam(
                 a,
                 b,
@@ -283,25 +283,20 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
             )
             if run.cancel():
                 raise CancelledError  # else a seam that is half adjusted would pass for a finished one
-            run.store.save(f"seam-{name}", key, *seam.pack())
+            run.store.save(name, key, *seam.pack())
         else:
             seam = Seam.unpack(a.name, b.name, *kept)
             reused += 1
         result.append(seam)
         if reused <= number:
-            run.progress("seams", 100 * (number + 1), 100 * total)
-    run.ended("seams", started, pairs=total, pairs_reused=reused, accepted=sum(s.accepted for s in result))
+            run.progress(Stage.SEAMS, 100 * (number + 1), 100 * total)
+    run.ended(Stage.SEAMS, started, pairs=total, pairs_reused=reused, accepted=sum(s.accepted for s in result))
     run.report["stages"][-1]["reused"] = reused == total
     return result
 
 
-def seam_name(a: str, b: str) -> str:
-    """Of a seam's files: of no other two scenes, whatever they are called."""
-    return f"{a}{BETWEEN_NAMES}{b}"
-
-
 def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
-    """What a seam depends on: both scenes' content, in this order, settings, models and code; not their names."""
+    """Fingerprint of a seam: both scenes' content, in this order, settings, models and version; not their names."""
     config = run.config
     settings = [
         config.matching.model_dump(),
@@ -311,4 +306,4 @@ def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
     ]
     aggregation = config.aggregation.model_dump(exclude={"candidates", "multi_scene_adjustment", "final_adjustment"})
     models = run.components.fingerprint_of("matcher")
-    return fingerprint(a.fingerprint, b.fingerprint, settings, aggregation, models, code_version())
+    return fingerprint(a.fingerprint, b.fingerprint, settings, aggregation, models, SEAM_VERSION)

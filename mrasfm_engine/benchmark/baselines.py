@@ -27,7 +27,7 @@ SMALL_INITIAL_ANGLE_DEG = 4.0
 
 
 class Baseline(StrEnum):
-    """Which of COLMAP's mappers, and what it is told about the calibration it gets."""
+    """COLMAP's mappers, with free or fixed calibration."""
 
     GLOBAL = "global"  # its defaults: focal lengths and poses of the cameras vary
     GLOBAL_FIXED_CALIBRATION = "global, calibration fixed"
@@ -37,7 +37,7 @@ class Baseline(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class PeerResult:
-    """What a mapper made of a scene's matches.
+    """Reconstruction of a scene's matches by a baseline method.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What is measured: the stages of a reconstruction, each call to run in a process of its own."""
+"""Measured work: the stages of a reconstruction, each call to run in its own process."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Mapped:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulated:
-    """What there is of a simulated route, and its true poses (units, 4, 4)."""
+    """A simulated route and its true poses (units, 4, 4)."""
 
     images: int
     keypoints: int

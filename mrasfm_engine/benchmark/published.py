@@ -22,7 +22,7 @@ class KittiError:
 
 @dataclass(frozen=True)
 class KittiFigures:
-    """What is published of one sequence."""
+    """Published figures of one sequence."""
 
     by_method: Mapping[str, KittiError]
     mrasfm_minutes: float

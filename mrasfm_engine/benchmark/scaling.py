@@ -1,4 +1,4 @@
-"""How time, memory and error grow with the length of a route: simulated, without images."""
+"""Scaling of time, memory and error with the length of a simulated route, without images."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ DATABASE = "features.db"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How to measure.
+    """Settings of a measurement.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ GREY = 128  # nobody looks at the points' colours
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedDrive:
-    """What mapping begins with, and the truth. Keypoints have no descriptors: they are matched already."""
+    """Input of mapping, and the truth. Keypoints have no descriptors: they are matched already."""
 
     drive: Drive
     features: list[ImageFeatures]

@@ -37,7 +37,7 @@ FULL = 0.8  # of all places: where so many are taken, no order leaves others emp
 
 @dataclass(frozen=True, kw_only=True)
 class BlockPattern:
-    """Which blocks of the lower triangle a symmetric matrix has, by block columns: every diagonal one at least."""
+    """Blocks of the lower triangle of a symmetric matrix, by block columns: every diagonal one at least."""
 
     first: Ints  # (columns + 1,)
     row: Ints  # rows of column j: row[first[j]:first[j + 1]], ascending from j
@@ -52,7 +52,7 @@ class BlockPattern:
 
     @property
     def columns(self) -> int:
-        """How many block columns there are."""
+        """Number of block columns."""
         return len(self.first) - 1
 
     def column_of_block(self) -> Ints:
@@ -303,7 +303,7 @@ class BlockFactor:
         return x[position].reshape(right.shape)
 
     def pivots(self) -> Floats:
-        """What was left of each diagonal entry when its turn came (columns, 6)."""
+        """Pivot of every diagonal entry (columns, 6)."""
         on = self.elimination.factor.first[:-1][self.elimination.position]
         result: Floats = np.diagonal(self.blocks[on], axis1=1, axis2=2) ** 2
         return result

@@ -139,7 +139,7 @@ def linearise(
 
 @njit(cache=True, inline="always")
 def _find(blocks: Any, begin: int, end: int, block: int) -> int:
-    """Where in blocks[begin:end] a block is, counted from begin; -1 where it is not."""
+    """Index of a block in blocks[begin:end], counted from begin; -1 where it is not there."""
     for i in range(begin, end):
         if blocks[i] == block:
             return i - begin

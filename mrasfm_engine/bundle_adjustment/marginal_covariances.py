@@ -1,4 +1,4 @@
-"""How well the adjustment knows what it estimated: marginal covariances, and scale."""
+"""Marginal covariances of the adjusted poses and calibration, and the uncertainty of scale."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _inverse(matrix: Floats) -> tuple[Floats, Bools]:
 
 
 def _scale_functional(position: Floats) -> Floats:
-    """What a step (6 units,) of the units changes of the trajectory's size, relative to it."""
+    """Derivative of the trajectory's size by a step (6 units,) of the units, relative to the size."""
     centred = position - position.mean(0)
     functional = np.zeros((len(position), UNIT_DOF))
     functional[:, 3:] = centred / max(float((centred**2).sum()), 1e-12)

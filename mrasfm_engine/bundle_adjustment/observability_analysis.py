@@ -1,4 +1,5 @@
-"""What the drive says of the cameras' poses in the rig, and what is only their prior.
+"""Observability of the cameras' poses in the rig: directions that the drive determines, and those that rest on the
+prior.
 
 Two motions of the cameras change no image, whatever the drive: all cameras moved by one transform (the units move by
 its inverse), and all moved away from their mean place by one factor (units and points move along). The adjustment holds
@@ -23,7 +24,7 @@ MIN_OWN_SHARE = 0.1  # of a direction's prior variance that is left when the mot
 
 @dataclass(frozen=True, kw_only=True)
 class Observability:
-    """Which directions of `rig_from_cam` a drive observes, about and along the rig's axes."""
+    """Directions of `rig_from_cam` that a drive observes, about and along the rig's axes."""
 
     observed: Bools  # (c, 6) rotations, then translations, of a camera among the others
     ratio: (
@@ -42,7 +43,7 @@ class Observability:
 
     @property
     def scale_in_words(self) -> str:
-        """What the size of the rig rests on."""
+        """Source of the rig's size, in words."""
         if self.scale_observed:
             return "observed by positions"
         return "only the prior" if self.scale_only_prior else "the prior and positions"

@@ -1,4 +1,4 @@
-"""Which points poses are estimated from, where there are far more than needed.
+"""Sampling of the points from which poses are estimated, where there are far more than needed.
 
 Long tracks tie a unit to others; observations all over an image hold its rotation and position apart. So the tracks
 with most observations are asked first, and one is taken if any of its images still wants an observation in the cell of

@@ -147,7 +147,7 @@ def point_costs(
     unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
     obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any, scale2: float, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
-    """What points lo..hi cost: sums of log(1 + r^2 / scale^2) over their observations."""
+    """Compute the cost of points lo..hi: sums of log(1 + r^2 / scale^2) over their observations."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for p in range(lo, hi):
         costs[p] = _point_cost(

@@ -91,7 +91,7 @@ def _corrections(rotation: Floats, position_m: Floats, from_rotation: Floats, fr
 
 
 def _cost_of_rig(r: Floats, held: Bools, gauge: Floats, loss_scale: float) -> float:
-    """Of a rig's corrections over their sigmas (n, 6), and of their mean, in which they have weights gauge (n, 6).
+    """Cost of a rig's corrections over their sigmas (n, 6), and of their weighted mean over gauge (n, 6).
 
     Of a camera's own there is a Cauchy loss over those that are not held, and squares of the rest.
     """

@@ -1,4 +1,4 @@
-"""What camera set bundle adjustment adjusts.
+"""Variables and observations of camera set bundle adjustment.
 
 Variables are the poses of rigid units, `rig_from_cam` and one focal factor of every camera, and points. A pose is
 stored as rotation and position of the moving frame in the fixed one (`world_from_rig`, `rig_from_cam`), so that a step
@@ -48,13 +48,13 @@ class Observations:
 
     @property
     def num_free_points(self) -> int:
-        """How many points may move."""
+        """Number of points that may move."""
         return self.num_points if self.fixed is None else self.num_points - int(self.fixed.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowBandMotion:
-    """How row bands follow the trajectory of the units that are adjusted."""
+    """Motion of row bands with the trajectory of the units that are adjusted."""
 
     support: Ints  # (s, 3) units whose steps move a row band; -1 where weight is 0
     weight: Floats  # (s, 3) by how much; (1, 0, 0) where it is held to its unit
@@ -72,7 +72,7 @@ class RowBandMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Which variables are free, and where their steps stand in the reduced vector."""
+    """Free variables, and the places of their steps in the reduced vector."""
 
     unit_slot: Ints  # (u,) -1 where fixed
     camera_slot: Ints  # (c,) -1 where fixed
@@ -97,11 +97,11 @@ class Layout:
         return UNIT_DOF * self.num_units + CAMERA_DOF * self.num_cameras
 
     def unit_offsets(self, units: Ints) -> Ints:
-        """Where the steps of (free) units begin."""
+        """First index of each (free) unit's step."""
         return UNIT_DOF * self.unit_slot[units]
 
     def camera_offsets(self, cameras: Ints) -> Ints:
-        """Where the steps of (free) cameras begin."""
+        """First index of each (free) camera's step."""
         return UNIT_DOF * self.num_units + CAMERA_DOF * self.camera_slot[cameras]
 
     def held(self) -> Ints:

@@ -30,7 +30,7 @@ TINY = 1e-12  # damps what nothing observes
 
 @dataclass(frozen=True, kw_only=True)
 class Extra:
-    """What terms that are not image observations add: one block a unit, and the cameras' square."""
+    """Sums of the terms that are not image observations: one block per unit, and the cameras' square."""
 
     units: Floats  # (units, 6, 6)
     cameras: Floats  # (7 cameras, 7 cameras)
@@ -199,7 +199,7 @@ class Eliminated:
         return smallest
 
     def inverse(self) -> tuple[Floats, Floats]:
-        """Of the whole matrix's inverse the units' diagonal blocks (units, 6, 6) and the cameras' part (f, f)."""
+        """Diagonal blocks (units, 6, 6) of the units and the cameras' part (f, f) of the whole matrix's inverse."""
         units = self.factor.inverse_diagonal()
         if self.cameras is None:
             return units, np.zeros((0, 0))

@@ -30,14 +30,14 @@ from mrasfm_engine.types import Floats, Ints
 
 @dataclass(frozen=True, kw_only=True)
 class RigidGroups:
-    """Which units move together. Every free unit belongs to a set; a set's units are all free."""
+    """Units that move together. Every free unit belongs to a set; a set's units are all free."""
 
     of_unit: Ints  # (u,) -1 for fixed units
     count: int
 
     @property
     def size(self) -> int:
-        """How many unknowns all sets have."""
+        """Number of unknowns of all sets."""
         return UNIT_DOF * self.count
 
     def pivots(self, state: State) -> Floats:

@@ -1,4 +1,4 @@
-"""Which units and cameras the points of an adjustment couple: found once a problem, used in every iteration.
+"""Sparsity of the Schur complement: the units and cameras that points couple, found once for all iterations.
 
 A point that is eliminated couples all blocks (free units and cameras) that observe it. Points with the same blocks make
 a group, whose places in the reduced system are looked up once. Groups are in the order of their first unit, so that
@@ -150,7 +150,7 @@ def _blocks_of_points(
 
 @njit(cache=True)
 def _group_starts(points: Any, blocks: Any, first_block: Any) -> Any:
-    """Where in the ordered points a group begins: where the blocks are not those of the point before."""
+    """Find the points, in their order, at which a group begins: those whose blocks differ from the point's before."""
     starts = np.empty(len(points) + 1, np.int64)
     count = 0
     for i in range(len(points)):
@@ -170,7 +170,7 @@ def _group_starts(points: Any, blocks: Any, first_block: Any) -> Any:
 
 
 def _blocks_of_groups(points: Ints, first_point: Ints, blocks: Ints, first_block: Ints) -> tuple[Ints, Ints]:
-    """Of one point each: all have the same."""
+    """Blocks of each group's first point: its other points have the same."""
     leader = points[first_point[:-1]]
     lengths = (first_block[1:] - first_block[:-1])[leader]
     starts = np.concatenate([[0], np.cumsum(lengths)])

@@ -27,7 +27,7 @@ MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says litt
 
 
 class Termination(StrEnum):
-    """Why the solver stopped."""
+    """Reason for which the solver stopped."""
 
     CONVERGED = "converged"
     ITERATIONS = "iteration limit"
@@ -53,7 +53,7 @@ class SolverOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """How a solve went."""
+    """Course of a solve."""
 
     initial_cost: float
     final_cost: float
@@ -162,7 +162,7 @@ class Problem:
 
     @cached_property
     def structure(self) -> SchurStructure:
-        """Which blocks the points couple; the same for every state."""
+        """Blocks that the points couple; the same for every state."""
         return SchurStructure.from_observations(self.observations, self.layout, self.motion)
 
     def normal_equations(self, state: State, damping: float) -> ReducedCameraSystem:
@@ -206,7 +206,7 @@ class Problem:
 
     @property
     def unknowns(self) -> int:
-        """How many unknowns the reduced vector really has."""
+        """Number of unknowns of the reduced vector."""
         return self.layout.size - len(self.layout.held()) if self.sets is None else self.sets.size
 
     def points_after(self, state: State, system: ReducedCameraSystem, step: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""What `mrasfm bench` prints of published data sets, beside what is published of them."""
+"""Output of `mrasfm bench` for published data sets, beside the published figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mrasfm_engine.commands.bench_output import Document, comparison_document, m
 
 @dataclass(frozen=True)
 class KittiOutput:
-    """Of sequences of KITTI odometry, beside what is published."""
+    """Table of sequences of KITTI odometry, beside the published figures."""
 
     results: Sequence[SceneResult]
 
@@ -61,7 +61,7 @@ class KittiOutput:
 
 @dataclass(frozen=True)
 class NuScenesOutput:
-    """Of scenes of nuScenes, beside what is published."""
+    """Table of scenes of nuScenes, beside the published figures."""
 
     results: Sequence[SceneResult]
 
@@ -147,7 +147,7 @@ def _medians(row: Row | None) -> str:
 
 
 def _minutes(result: SceneResult) -> str:
-    """Of all our stages; of those alone that were not taken from an earlier run there is no sum."""
+    """Minutes of all our stages; without a sum where some were taken from an earlier run."""
     if result.comparison is None:
         return "-"
     prepared = result.comparison.prepared

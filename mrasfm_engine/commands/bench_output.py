@@ -1,4 +1,4 @@
-"""What `mrasfm bench` prints of a drive and of routes: tables for people, documents for programs."""
+"""Output of `mrasfm bench` for a drive and for routes: tables for people, documents for programs."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MEGABYTE = 1e6
 
 
 def versions(config: EngineConfig) -> Document:
-    """Who measured: what a figure is compared under."""
+    """Versions and machine of a measurement."""
     return {"mrasfm": __version__, "pycolmap": pycolmap.__version__, "threads": config.threads}
 
 
 @dataclass(frozen=True)
 class DriveOutput:
-    """Of one drive."""
+    """Table of one drive."""
 
     comparison: Comparison
 
@@ -55,7 +55,7 @@ class DriveOutput:
 
 @dataclass(frozen=True)
 class GrowthOutput:
-    """Of simulated routes."""
+    """Table of simulated routes."""
 
     routes: Sequence[Growth]
 

@@ -31,7 +31,7 @@ class MapErrors:
 
 
 def evaluate_map(folder: Path, words: list[str]) -> tuple[dict[str, Any], Table]:
-    """What `--json` prints, and the table.
+    """Compare a map with true poses: the document of `--json`, and the table.
 
     Parameters
     ----------

@@ -96,7 +96,7 @@ def _say(report: dict[str, Any], out: Path) -> None:
 
 
 def _verdicts(calibration: dict[str, Any]) -> list[str]:
-    """What the refined calibration rests on, a line for cameras that have the same in common."""
+    """Lines on what the refined calibration rests on, one for all cameras with the same answer."""
     if not calibration["adjusted"] or "observed" not in calibration:
         return []
     by_directions: dict[tuple[str, ...], list[str]] = {}

@@ -1,4 +1,4 @@
-"""How far the stages are, on standard error: bars on a terminal, plain lines where nobody watches."""
+"""Progress of the stages on standard error: bars on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far estimated camera poses and a camera set's calibration are from the true ones."""
+"""Errors of estimated camera poses and of a camera set's calibration."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ TOLERANCE_US = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class PoseErrors:
-    """Of a scene against the vehicle's true poses and the true calibration.
+    """Errors of a scene against the vehicle's true poses and the true calibration.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How far two scenes of a map are from where they truly lie to one another, at the seam between them."""
+"""Error of the relative pose of two scenes of a map, at the seam between them."""
 
 from __future__ import annotations
 

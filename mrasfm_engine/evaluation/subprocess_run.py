@@ -25,7 +25,7 @@ END_S = 10.0  # that a process may take to end after its result is there
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessResult(Generic[Result]):
-    """What a process left behind.
+    """Result of a process.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the true one."""
+"""Errors of an estimated trajectory."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def _difference(given: Floats, refined: Floats) -> dict[str, Any]:
 
 
 def verdict_in_words(refined: CameraCalibration) -> list[str]:
-    """Of the six directions of a camera: what its value rests on."""
+    """Source of the value of each of a camera's six directions, in words."""
     return [OBSERVED if observed else ONLY_PRIOR for observed in refined.observed]
 
 

@@ -45,7 +45,7 @@ def write_text_model(binary_folder: Path, folder: Path) -> None:
 
 
 def text_model_fits(scene: Scene) -> bool:
-    """Whether COLMAP's text format can hold the image names: it ends a name at the first space."""
+    """Return whether COLMAP's text format can hold the image names: it ends a name at the first space."""
     return not any(any(c.isspace() for c in image.file) for image in scene.drive.images)
 
 

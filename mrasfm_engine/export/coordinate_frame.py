@@ -33,7 +33,7 @@ FILES = {
 
 
 def frame_document(scene: Scene) -> dict[str, Any]:
-    """Which frame every file is in and, for a georeferenced scene, where on the earth that frame lies.
+    """Describe the frame of all files and, for a georeferenced scene, its place on the earth.
 
     Without georeference the geodetic fields are absent, not zero.
     """

@@ -20,26 +20,25 @@ from numpy.typing import NDArray
 from mrasfm_engine.export import check, check_colmap, colmap, coordinate_frame, picture_files, ply, pose_files
 from mrasfm_engine.export.check import checking, require, require_close
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
-from mrasfm_engine.export.scene import PICTURES, check_scene, summary, write_json
-from mrasfm_engine.io.read_map import MAP_FILE
+from mrasfm_engine.export.scene import check_scene, summary, write_json
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
 from schemas import Pose
+from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER
 
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
 
 CALIBRATION_FOLDER = "calibration"
-SCENES_FOLDER, SEAMS_FOLDER = "scenes", "seams"
-REPLACED = (PICTURES, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
+REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapContent:
-    """What is written."""
+    """Content of a map's folder."""
 
     scene: Scene  # of all drives together
     scene_of_unit: list[str]
@@ -73,7 +72,7 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
 
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:
     scene = content.scene
-    picture_files.write_pictures(content.pictures, work / PICTURES)
+    picture_files.write_pictures(content.pictures, work / PICTURES_FOLDER)
     model, text = work / "model", work / "model" / "text"
     text.mkdir(parents=True)
     colmap.write_model(scene, model)

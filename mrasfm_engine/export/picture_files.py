@@ -61,5 +61,5 @@ def write_pictures(pictures: Mapping[str, bytes], folder: Path) -> None:
 
 
 def size_bytes(pictures: Mapping[str, bytes]) -> int:
-    """What the files take."""
+    """Size of the files."""
     return sum(len(data) for data in pictures.values())

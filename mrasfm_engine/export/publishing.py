@@ -12,8 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mrasfm_engine.errors import StorageError
+from schemas.artifacts import REPORT_FILE
 
-COMPLETE_MARK = "report.json"
+COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
 
 

@@ -33,8 +33,8 @@ from mrasfm_engine.export import (
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
+from schemas.artifacts import PICTURES_FOLDER
 
-PICTURES = "pictures"
 NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
@@ -65,8 +65,8 @@ def write_scene(
     """
     check_scene(scene)
     needed = _size_bytes(scene) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=(PICTURES, ROAD_FILE)) as work:
-        picture_files.write_pictures(pictures, work / PICTURES)
+    with publishing(out, needed, replaced=(PICTURES_FOLDER, ROAD_FILE)) as work:
+        picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
         _write(scene, work, report)
 
 
@@ -164,7 +164,7 @@ def check_scene(scene: Scene) -> None:
 
 
 def _consistency(scene: Scene) -> Iterator[tuple[str, bool]]:
-    """What must not be, and whether it is not; a later check relies on the earlier ones."""
+    """Conditions that a scene must meet, and whether it does; a later check relies on the earlier ones."""
     images, units, points = len(scene.drive.images), len(scene.drive.manifest.frames), len(scene.points_m)
     shapes = [
         (scene.world_from_rig.shape, (units, 4, 4)),

@@ -27,7 +27,7 @@ MOST_ASKED = 65536  # keypoints of one tile
 
 @dataclass(frozen=True)
 class Detections:
-    """What a network finds in one image or tile."""
+    """Keypoints that a network finds in one image or tile."""
 
     xy_px: Floats32  # (n, 2), top left pixel's centre at (0.5, 0.5)
     descriptors: Floats32  # (n, D)
@@ -104,7 +104,7 @@ class NetworkExtractor:
         return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _detect(self, pixels: Bytes, tile: Tile, usable: Callable[[Floats32], Bools]) -> Detections:
-        """What of a tile's detections counts: in its core, not masked, not too weak; in pixels of the scaled image."""
+        """Detections of a tile that lie in its core, are not masked and not too weak; in pixels of the scaled image."""
         wanted = self._config.max_keypoints
         while True:
             found = self._detector.detect(pixels, wanted, self._config.min_score)

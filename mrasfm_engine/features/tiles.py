@@ -32,7 +32,7 @@ class Tile:
     core_rows: tuple[float, float]
 
     def owns(self, xy_px: Floats32) -> Bools:
-        """Which keypoints (n, 2), in image pixels, lie in the core."""
+        """Return which keypoints (n, 2), in image pixels, lie in the core."""
         x, y = xy_px[:, 0], xy_px[:, 1]
         result: Bools = (
             (x >= self.core_columns[0])
@@ -78,7 +78,7 @@ def cut(image: Bytes, tile: Tile, window: tuple[int, int]) -> Bytes:
 
 
 def duplicates(xy_px: Floats32, scores: Floats32, tile: Ints) -> Bools:
-    """Which keypoints (n,) another tile has found better: near the border of two cores both can see one corner."""
+    """Return which keypoints (n,) another tile has found better: near a border both tiles can see one corner."""
     result = np.zeros(len(xy_px), dtype=np.bool_)
     if len(xy_px) < 2:
         return result

@@ -24,7 +24,7 @@ TRUTH_NAME = "truth.tum"
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSummary:
-    """What an import has written."""
+    """Summary of a written drive."""
 
     layout: str
     drive: Path

@@ -26,7 +26,7 @@ CAMERAS = ("image_0", "image_1", "image_2", "image_3")
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder has this layout."""
+    """Return whether the folder has this layout."""
     return (folder / "calib.txt").is_file() and any((folder / name).is_dir() for name in CAMERAS)
 
 

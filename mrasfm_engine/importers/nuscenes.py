@@ -86,7 +86,7 @@ Row = TypeVar("Row", bound=_Row)
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder has this layout."""
+    """Return whether the folder has this layout."""
     return bool(_versions(folder))
 
 

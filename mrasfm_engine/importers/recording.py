@@ -1,4 +1,4 @@
-"""What every importer produces: a recording in the engine's axes, before anything is written."""
+"""Common result of the importers: a recording in the engine's axes, before anything is written."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class _RigFile(BaseModel):
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder has this layout."""
+    """Return whether the folder has this layout."""
     return (folder / "rig.json").is_file()
 
 

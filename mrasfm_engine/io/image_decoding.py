@@ -142,7 +142,7 @@ def _truncated(path: Path) -> IncompleteImageError:
 
 
 def _ends_early(png: bytes) -> bool:
-    """Whether the compressed pixels of a PNG file are sound as far as they go, and go not to their end."""
+    """Return whether the compressed pixels of a PNG file are sound as far as they go, but end early."""
     inflater = zlib.decompressobj()
     at = _PNG_SIGNATURE_BYTES
     try:

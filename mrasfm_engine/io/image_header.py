@@ -1,4 +1,4 @@
-"""What the header and the last bytes of a JPEG or PNG file say about it, without decoding it."""
+"""Headers of JPEG and PNG files: format, size and completeness, without decoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of images that were not used, as some of their pixels are missing or corrupt."""
+"""Findings on images that were not used, as some of their pixels are missing or corrupt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What other parts read back of a written map."""
+"""Reader of a written map, for evaluation and pictures."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Floats
 from schemas import Pose
+from schemas.artifacts import MAP_FILE
 
-MAP_FILE = "map.json"
 REMEDY = "Give the folder that `mrasfm aggregate --out` wrote."
 
 
@@ -43,7 +43,7 @@ class MapPoses:
 
 
 def is_map(folder: Path) -> bool:
-    """Whether a folder holds a map, not a scene."""
+    """Return whether a folder holds a map, not a scene."""
     return (folder / MAP_FILE).is_file()
 
 

@@ -1,4 +1,4 @@
-"""What other parts read back of a written scene."""
+"""Reader of a written scene, for evaluation and pictures."""
 
 from __future__ import annotations
 

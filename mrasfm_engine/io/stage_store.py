@@ -7,19 +7,16 @@ import json
 import os
 import secrets
 from collections.abc import Mapping
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import mrasfm_engine
-import schemas
 from mrasfm_engine.errors import storage_error
 from mrasfm_engine.scene.drive import Drive
-
-NOT_IN_STAGES = ("ablation.py", "benchmark", "commands", "evaluation", "synthetic", "visualization")
+from schemas.artifacts import checkpoint_file
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -30,27 +27,26 @@ def fingerprint(*parts: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def drive_fingerprint(drive: Drive) -> str:
-    """Of the manifest and of size and modification time of every image and mask."""
-    files = []
-    for image in drive.images:
-        for name in (image.file, image.mask):
-            if name is not None:
-                status = (drive.root / name).stat()
-                files.append((name, status.st_size, status.st_mtime_ns))
-    return fingerprint(drive.manifest.model_dump(mode="json"), files)
+def drive_fingerprint(drive: Drive, content_sha256: Mapping[str, str] | None, *, threads: int) -> str:
+    """Hash the manifest and the contents of all images and masks.
+
+    Parameters
+    ----------
+    content_sha256
+        SHA-256 of the files by their names in the manifest, where the caller knows them; else the files are read.
+    """
+    names = [name for image in drive.images for name in (image.file, image.mask) if name is not None]
+    if content_sha256 is None:
+        with ThreadPoolExecutor(threads) as pool:
+            digests = list(pool.map(lambda name: _content_sha256(drive.root / name), names))
+    else:
+        digests = [content_sha256[name] for name in names]
+    return fingerprint(drive.manifest.model_dump(mode="json"), list(zip(names, digests, strict=True)))
 
 
-@cache
-def code_version() -> str:
-    """Of the code that stages run: a stage that was finished by other code is done again."""
-    digest = hashlib.sha256(mrasfm_engine.__version__.encode())
-    for package in (Path(mrasfm_engine.__file__).parent, Path(schemas.__file__).parent):
-        for path in sorted(package.rglob("*.py")):
-            name = path.relative_to(package)
-            if name.parts[0] not in NOT_IN_STAGES:
-                digest.update(str(name).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+def _content_sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class StageStore:
@@ -63,7 +59,7 @@ class StageStore:
         self._folder = folder
 
     def has(self, name: str, key: str) -> bool:
-        """Whether a stage has been finished with this fingerprint, without reading its arrays."""
+        """Return whether a stage has been finished with this fingerprint, without reading its arrays."""
         return self._read(name, key, arrays=False) is not None
 
     def load(self, name: str, key: str) -> tuple[Arrays, dict[str, Any]] | None:
@@ -71,7 +67,7 @@ class StageStore:
         return self._read(name, key, arrays=True)
 
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
-        path = self._folder / f"{name}.npz"
+        path = self._folder / checkpoint_file(name)
         try:
             # Opened here: np.load leaves a file open that turns out not to be an archive.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -95,7 +91,7 @@ class StageStore:
         StorageError
             Where the disk is full or cannot be written.
         """
-        path = self._folder / f"{name}.npz"
+        path = self._folder / checkpoint_file(name)
         partial = self._folder / f".{name}.{secrets.token_hex(4)}.partial"
         try:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ Component_co = TypeVar("Component_co", covariant=True)
 
 @dataclass(frozen=True, kw_only=True)
 class KnownModel:
-    """What is known of a model before its file is there."""
+    """Catalogue entry of a model: name, use, signature, licence and source."""
 
     name: str
     kind: ModelKind
@@ -39,7 +39,7 @@ class KnownModel:
 
     @property
     def is_published(self) -> bool:
-        """Whether exactly one file is this model."""
+        """Exactly one file is this model."""
         return self.sha256 is not None
 
 

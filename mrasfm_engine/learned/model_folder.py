@@ -42,7 +42,7 @@ class InstalledModel:
 
     @property
     def is_published(self) -> bool:
-        """Whether it is bit for bit the file that the catalogue names."""
+        """The file is bit for bit the one that the catalogue names."""
         return self.sha256 == self.known.sha256
 
     @property
@@ -52,7 +52,7 @@ class InstalledModel:
 
     @property
     def commercial_use(self) -> bool | None:
-        """Whether the licence allows it, None where that is not known."""
+        """The licence allows commercial use; None where that is not known."""
         return self.known.commercial_use if self.is_published or not self.known.is_published else None
 
 
@@ -183,7 +183,7 @@ class ModelFolder:
 
 
 def how_to_get(name: str) -> str:
-    """What to do where a model is missing."""
+    """Remedy for a missing model."""
     known = next((model for model in catalogue.known_models() if model.name == name), None)
     if known is None:
         return "`mrasfm models list` shows what is there; `mrasfm models add FILE --name NAME` adds one."
@@ -193,7 +193,7 @@ def how_to_get(name: str) -> str:
 
 
 def _recognise(data: bytes, sha256: str, name: str | None, what: str) -> KnownModel:
-    """Which model of the catalogue these bytes are or can stand for."""
+    """Find the model of the catalogue that these bytes are or can stand for."""
     published = by_sha256(sha256)
     named = next((model for model in catalogue.known_models() if model.name == name), None)
     if named is not None and named.is_published and published is not named:

@@ -1,4 +1,4 @@
-"""What an ONNX file says of itself, read without running it.
+"""Header of an ONNX file, read without running it.
 
 Only the few fields that matter are taken from the protobuf encoding (onnx.proto, whose field numbers never change): the
 package that reads all of it is needed for nothing else here.
@@ -136,7 +136,7 @@ def _too_large(path: Path) -> InputError:
 
 
 def _begins_a_message(piece: bytes) -> bool:
-    """Whether the first byte can be a field's key: a number over 0, of a type that ONNX has."""
+    """Return whether the first byte can be a field's key: a number over 0, of a type that ONNX has."""
     return piece[0] >> 3 > 0 and piece[0] & 7 in (_VARINT, _FIXED64, _BYTES, _FIXED32)
 
 

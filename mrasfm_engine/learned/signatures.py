@@ -1,4 +1,4 @@
-"""What goes into a model and comes out of it: the contract that a file must keep before it is used.
+"""Inputs and outputs of models: the contract that a file must keep before it is used.
 
 Shapes have a name where the size is free (the same name means nothing more) and a number where it is fixed.
 """
@@ -11,7 +11,7 @@ from enum import StrEnum
 
 
 class ModelKind(StrEnum):
-    """What a model is for."""
+    """Use of a model."""
 
     EXTRACTOR = "extractor"
     MATCHER = "matcher"
@@ -41,7 +41,7 @@ class Signature:
         return f"{', '.join(map(str, self.inputs))} -> {', '.join(map(str, self.outputs))}"
 
     def mismatches(self, found: Signature) -> list[str]:
-        """What of `found`, a file's signature, is not as it must be; empty where it is.
+        """List the differences of `found`, a file's signature; empty where it fits.
 
         A free size of the file fits any, and a fixed one fits a free size: networks are exported for one image size.
         """

@@ -1,4 +1,4 @@
-"""What is known of the calibration beforehand, and whether the drive may change it."""
+"""Prior knowledge of the calibration, and the decision whether the drive may change it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def heading_change_deg(mapper: Mapper) -> float:
 
 @dataclass(frozen=True)
 class CalibrationDecision:
-    """Whether `rig_from_cam` may vary, and why."""
+    """Decision whether `rig_from_cam` may vary, with its reason."""
 
     free: bool
     reason: str
@@ -55,7 +55,7 @@ class CalibrationDecision:
 def assess_calibration(
     mapper: Mapper, *, free_units: Bools, terms: Sequence[Term], georeferenced: bool, options: SolverOptions
 ) -> CalibrationDecision:
-    """Whether the drive observes the calibration: freeing what it does not observe makes everything worse.
+    """Decide whether the drive observes the calibration: freeing an unobserved one makes everything worse.
 
     A straight way without GNSS never does. Else it is asked what freeing would cost: the images, the priors and the
     positions must still know the scale.

@@ -39,7 +39,7 @@ COVERED_SHARE = 0.75  # of all matched ones
 
 @dataclass(frozen=True, kw_only=True)
 class MovingAlong:
-    """Which keypoints move along with the vehicle, and which images they cover."""
+    """Keypoints that move along with the vehicle, and the images that they cover."""
 
     keypoint: Bools  # (keypoints,) no part of the world; set only where images are covered
     share: Floats  # (images,) of an image's matched keypoints that do not move as the world does
@@ -47,7 +47,7 @@ class MovingAlong:
 
     @property
     def any(self) -> bool:
-        """Whether an image is covered."""
+        """An image is covered."""
         return bool(self.covered.any())
 
 
@@ -107,7 +107,7 @@ def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools)
 
 
 def _flows(mapper: Mapper, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
-    """Of every pair of one camera's images: keypoints of both, and by how much each must and does move, pixels."""
+    """Expected and measured motion, in pixels, of the keypoints of every pair of one camera's images."""
     posed = mapper.registered[mapper.image_unit] & ~mapper.missing
     world_from_cam = mapper.state.world_from_rig[mapper.image_unit] @ mapper.motion.unit_from_image(mapper.state)
     world_from_cam = world_from_cam @ mapper.state.rig_from_cam[mapper.image_camera]

@@ -89,7 +89,7 @@ def _state_of_images(mapper: Mapper, points_m: Floats) -> tuple[State, bool]:
 
 
 def terms_of_images(terms: Sequence[Term], image_unit: Ints, adjusted: Bools) -> list[Term]:
-    """What terms over units and cameras say of adjusted images (images,), each a unit of its own."""
+    """Convert terms over units and cameras to terms over adjusted images (images,), each a unit of its own."""
     result: list[Term] = []
     for term in terms:
         if isinstance(term, PositionPrior):

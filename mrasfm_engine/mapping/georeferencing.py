@@ -116,7 +116,7 @@ def _scale_is_off(scale: float) -> str:
 def _why_not(
     a: Floats, measured: Floats, sigma: Floats, inlier: Bools, outlier_sigmas: float, rng: np.random.Generator
 ) -> str:
-    """What is wrong with positions that do not fit: perhaps only the rig's units."""
+    """Reason for which positions do not fit: perhaps only the rig's units."""
     wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, (1e-4, 1e4))
     if fitting.mean() >= 2 * MIN_CONSENSUS:
         return _scale_is_off(float(np.cbrt(np.linalg.det(wide[:3, :3]))))

@@ -38,7 +38,7 @@ DECREMENT_TOLERANCE = 0.1  # while the scene grows: less than half a standard de
 
 @dataclass(kw_only=True)
 class MappingLog:
-    """What happened while the scene grew."""
+    """Log of incremental mapping."""
 
     initialisation: Initialisation | None = None
     registrations: list[Registration] = field(default_factory=list)

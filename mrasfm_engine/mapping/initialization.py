@@ -32,7 +32,7 @@ INSIDE = "points inside the first unit"
 
 @dataclass(frozen=True, kw_only=True)
 class Initialisation:
-    """Where the scene begins."""
+    """First units of a reconstruction."""
 
     units: tuple[int, int]
     points: int
@@ -41,7 +41,7 @@ class Initialisation:
 
 @dataclass(frozen=True, kw_only=True)
 class UnitScores:
-    """How much pairs of units have in common.
+    """Scores of pairs of units by their matches.
 
     Parallax takes its time to compute, and no pair of units has more matches that show motion than it has matches:
     those that come into question are asked first.
@@ -53,7 +53,7 @@ class UnitScores:
 
     @staticmethod
     def from_pairs(mapper: Mapper, pairs: Sequence[PairMatches]) -> UnitScores:
-        """Of a drive's keyframes."""
+        """Count the matches of a drive's keyframes."""
         inside = np.zeros(len(mapper.registered), dtype=np.int64)
         between: dict[tuple[int, int], list[PairMatches]] = {}
         for pair in pairs:
@@ -90,7 +90,7 @@ class UnitScores:
 
 
 def _share_that_moves(mapper: Mapper, pair: PairMatches) -> float:
-    """How far the matches show motion, 0 to 1: units at which the car stands match best, but give no points."""
+    """Share of the matches that show motion: units at which the car stands match best, but give no points."""
     matches = pair.matches[pair.inliers]
     matches = matches[:: 1 + len(matches) // MAX_PARALLAX_MATCHES]
     a = mapper.keypoints.rays[mapper.keypoints.first[pair.image_a] + matches[:, 0]]

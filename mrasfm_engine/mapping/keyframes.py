@@ -17,7 +17,7 @@ MIN_COMMON = 40  # keypoints of a camera in common with the last keyframe; with 
 
 
 def select_keyframes(mapper: Mapper) -> Bools:
-    """Which units (u,) moved against the last keyframe before them, in the camera that moved most.
+    """Select the units (u,) that moved against the last keyframe before them, in the camera that moved most.
 
     A camera's motion is its median, because others drive past a standing car. One camera is enough, because a lorry
     that drives along stands still in all that it covers: a unit too many costs time, one too few loses points. Where

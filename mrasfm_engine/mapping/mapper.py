@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
@@ -21,6 +24,12 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, inlier_members
 from mrasfm_engine.triangulation.triangulate import Triangulator
 from mrasfm_engine.types import Bools, Floats, Ints
+
+_RESULTS = ("registered", "keyframe", "triangulated", "is_inlier", "missing")
+_STATE = (
+    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
+    "band_rotation", "band_position_m",
+)  # fmt: skip
 
 
 class Mapper:
@@ -91,6 +100,47 @@ class Mapper:
         tracked = tracks.of_keypoint >= 0
         self.rows_of_unit = [rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in pairwise(bounds))]
 
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything that mapping has found, for `from_arrays`."""
+        has_own_pose, unit_from_image = self.motion.own_poses
+        return {
+            "of_keypoint": self.tracks.of_keypoint,
+            "has_own_pose": has_own_pose,
+            "unit_from_image": unit_from_image,
+            **{name: getattr(self, name) for name in _RESULTS},
+            **{name: getattr(self.state, name) for name in _STATE},
+        }
+
+    @staticmethod
+    def from_arrays(
+        drive: Drive,
+        keypoints: Keypoints,
+        config: EngineConfig,
+        prior_world_from_rig: Floats | None,
+        arrays: Mapping[str, NDArray[Any]],
+    ) -> Mapper:
+        """The mapper whose `to_arrays` these are; units without a pose move as the prior trajectory says."""
+        mapper = Mapper(drive, keypoints, Tracks.from_labels(arrays["of_keypoint"]), config)
+        for name in _RESULTS:
+            setattr(mapper, name, arrays[name])
+        mapper.state = replace(mapper.state, **{name: arrays[name] for name in _STATE})
+        if prior_world_from_rig is not None:
+            mapper.motion.follow_prior(prior_world_from_rig)
+        for image in np.flatnonzero(arrays["has_own_pose"]):
+            mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
+        return mapper
+
+    def with_points_of(self, units: Bools) -> Mapper:
+        """A mapper of the same poses whose units (units,) alone are registered, with points triangulated from these."""
+        result = copy.copy(self)
+        result.registered = self.registered & units
+        result.state = replace(self.state, points_m=np.zeros_like(self.state.points_m))
+        for name in ("triangulated", "is_inlier", "rejected"):
+            setattr(result, name, np.zeros_like(getattr(self, name)))
+        result.triangulate()
+        result.filter(self.config.mapping.filter_error_px)
+        return result
+
     def set_pose(self, unit: int, world_from_rig: Floats) -> None:
         """Give a unit a pose and count it as registered."""
         self.state.unit_rotation[unit] = world_from_rig[:3, :3]
@@ -156,7 +206,7 @@ class Mapper:
         return (a, b) if self.image_unit[pair.image_a] == unit else (b, a)
 
     def visible_counts(self) -> Ints:
-        """How many keypoints with a point every unit has (units,); not to be written to."""
+        """Number of keypoints with a point in every unit (units,); not to be written to."""
         changed = np.flatnonzero(self.triangulated != self._visible_of)
         count_members(self.tracks, changed, self.triangulated, self.keypoints.unit, self._visible)
         self._visible_of[changed] = self.triangulated[changed]
@@ -243,8 +293,9 @@ class Mapper:
         return members[self.is_inlier[members]]
 
     def observed(self, free_units: Bools, *, everything: bool = False) -> tuple[Ints, Ints, Ints]:
-        """What an adjustment of some units looks at: keypoints that observe their points (or all points), sorted by
-        point, the points' tracks, and the keypoints' points as rows of these."""
+        """Observations of an adjustment of some units: keypoints that observe their points (or all points), sorted by
+        point, the points' tracks, and the keypoints' points as rows of these.
+        """
         everything = everything or bool((free_units | ~self.registered).all())
         seen = None if everything else self.tracks_of_units(np.flatnonzero(free_units))
         rows = self.observation_rows(None if seen is None else seen[self.triangulated[seen]])

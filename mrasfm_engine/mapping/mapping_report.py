@@ -1,4 +1,4 @@
-"""What the report says of mapping and refinement, in plain values."""
+"""Report of mapping and refinement, in plain values."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
 
 
 def _directions(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
-    """What of the cameras' poses was observed, by name, and which of them were wrong."""
+    """Observed directions of the cameras' poses, by name, and the miscalibrated cameras."""
     cameras, directions = mapper.drive.cameras, refinement.directions
     if directions is None:
         return {}
@@ -200,7 +200,7 @@ def describe_between(mapper: Mapper, registrations: Sequence[Registration]) -> d
 
 
 def _motion(mapper: Mapper) -> dict[str, Any]:
-    """How far images are from their unit in time and, where that was taken into account, in space."""
+    """Distance of images from their unit in time and, where motion is compensated, in space."""
     bands = RowBands.from_drive(mapper.drive)
     if bands.simultaneous:
         return {"simultaneous": True}
@@ -225,7 +225,7 @@ def _not_compensated(mapper: Mapper) -> Ints:
 
 
 def motion_findings(mapper: Mapper) -> list[Finding]:
-    """What a user is told of the motion within units."""
+    """Findings on the motion within units."""
     units = _not_compensated(mapper)
     return [rig_motion.finding(len(units), int(mapper.registered.sum()))] if len(units) else []
 

@@ -43,7 +43,7 @@ class MiscalibratedPair:
 
 
 def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observability) -> MiscalibratedPair | None:
-    """Of a rig of two cameras, whether they are off against each other by more than their prior can be."""
+    """Check whether the two cameras of a rig are off against each other by more than their prior can be."""
     corrections = np.where(directions.observed, prior.corrections(state), 0.0)
     if len(corrections) != 2:
         return None
@@ -116,12 +116,12 @@ def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Flo
 
 
 def voted_out(registrations: Sequence[Registration], covered_units: set[int]) -> dict[str, int]:
-    """How often cameras were voted out, by name; in a unit with a covered image that is no fault of a camera."""
+    """Count how often cameras were voted out, by name; in a unit with a covered image no camera is at fault."""
     return dict(Counter(name for r in registrations for name in r.voted_out if r.unit not in covered_units))
 
 
 def finding(name: str, wrong: Miscalibration) -> Finding:
-    """What a user is told of a wrong camera."""
+    """Finding on a miscalibrated camera."""
     return warning(
         "camera-miscalibrated",
         f"camera {name} is turned by {wrong.rotation_deg:.2f} deg and moved by {wrong.translation_m:.3f} m from where "
@@ -132,7 +132,7 @@ def finding(name: str, wrong: Miscalibration) -> Finding:
 
 
 def pair_finding(names: Sequence[str], wrong: MiscalibratedPair) -> Finding:
-    """What a user is told of a wrong pair."""
+    """Finding on a miscalibrated pair of cameras."""
     return warning(
         "camera-miscalibrated",
         f"cameras {names[0]} and {names[1]} are turned by {wrong.rotation_deg:.2f} deg and moved by "

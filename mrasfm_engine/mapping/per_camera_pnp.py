@@ -20,7 +20,7 @@ VOTE_TRANSLATION_M = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Vote:
-    """What one camera says of the unit's pose."""
+    """Pose of the unit by one camera."""
 
     camera: int
     world_from_rig: Floats  # (4, 4)
@@ -29,7 +29,7 @@ class Vote:
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """What the cameras agree on."""
+    """Pose on which the largest group of cameras agrees."""
 
     world_from_rig: Floats  # (4, 4)
     agreeing: Bools  # (votes,)
@@ -59,7 +59,7 @@ def largest_agreement(votes: list[Vote]) -> Agreement | None:
 
 
 def agree(poses: Floats, pose: Floats) -> Bools:
-    """Which poses (n, 4, 4) of a unit are one with another (4, 4), as far as single cameras can tell."""
+    """Return which poses (n, 4, 4) of a unit equal another (4, 4), as far as single cameras can tell."""
     turned = se3.rotation_angle_deg(poses[:, :3, :3] @ pose[:3, :3].T)
     moved = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
     result: Bools = (turned < VOTE_ROTATION_DEG) & (moved < VOTE_TRANSLATION_M)

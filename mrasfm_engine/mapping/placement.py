@@ -27,7 +27,7 @@ SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
 @dataclass(kw_only=True)
 class Placement:
-    """How the model fits the receiver's positions; without a prior it does not, and the reason says why."""
+    """Fit of the model to the receiver's positions; without a prior it does not fit, and the reason says why."""
 
     prior: PositionPrior | None = None
     reason: str = ""
@@ -116,7 +116,7 @@ def _move(mapper: Mapper, world_from_model: Floats) -> None:
 
 
 def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> float:
-    """How many samples share one error, as errors of a receiver change slowly: their information counts once."""
+    """Number of samples that share one error, as errors of a receiver change slowly: their information counts once."""
     if len(times_us) < 2:
         return 1.0
     return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))

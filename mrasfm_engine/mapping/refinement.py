@@ -46,7 +46,7 @@ SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show
 
 @dataclass(kw_only=True)
 class Refinement:
-    """What the last stage did."""
+    """Result of the refinement."""
 
     sigma_px: float = 1.0
     placement: Placement | None = None  # by GNSS, where it was to be used
@@ -67,7 +67,7 @@ class Refinement:
 
     @property
     def georeferenced(self) -> bool:
-        """Whether the scene stands where the receiver says."""
+        """The scene stands where the receiver says."""
         return self.placement is not None and self.placement.prior is not None
 
 

@@ -1,4 +1,4 @@
-"""Where the rig stands when an image is taken, relative to its unit's timestamp.
+"""Motion of the rig within a unit: its pose at the time of each image, relative to the unit's timestamp.
 
 `State.unit_from_band` comes from the units' own trajectory: the motion around a unit is interpolated from the
 registered units before and after it, and follows them when they are adjusted: were it held meanwhile, baselines between
@@ -53,7 +53,7 @@ class RigMotion:
         self._prior_known = np.zeros(len(timestamps_us), dtype=np.bool_)
 
     def follow_prior(self, world_from_rig: Floats) -> None:
-        """Where no registered unit says how the vehicle moves, prior poses (u, 4, 4) do; NaN where unknown."""
+        """Take the motion from prior poses (u, 4, 4) where no registered unit shows it; NaN where unknown."""
         if not self.bands.simultaneous:
             velocity = smoothed_velocity(world_from_rig, self._time_s, window_s=PRIOR_WINDOW_S)
             self._prior_known[:] = np.isfinite(velocity).all(axis=1)
@@ -73,12 +73,12 @@ class RigMotion:
 
     @property
     def own_poses(self) -> tuple[Bools, Floats]:
-        """Which images (i,) have a pose of their own, and the poses (i, 4, 4) as `set_image_pose` takes them."""
+        """Images (i,) with a pose of their own, and the poses (i, 4, 4) as `set_image_pose` takes them."""
         return self._own, self._unit_from_image
 
     @property
     def needed(self) -> bool:
-        """Whether any image is apart from its unit at all."""
+        """An image is apart from its unit."""
         return bool(self._own.any()) or not self.bands.simultaneous
 
     def renew(self, state: State, registered: Bools, units: Ints | None = None) -> float:
@@ -104,7 +104,7 @@ class RigMotion:
         return motion
 
     def in_adjustment(self, state: State, registered: Bools, free_units: Bools) -> RowBandMotion | None:
-        """How row bands follow the free units while these are adjusted; images with poses of their own do not."""
+        """Motion of row bands with the free units while these are adjusted; images with poses of their own stay."""
         if state.simultaneous:
             return None
         rows = self._bands_of(_with_neighbours(np.flatnonzero(free_units & registered), registered))
@@ -140,7 +140,7 @@ class RigMotion:
         self._write(state, rows, at_band, moved(self._offset_of_image(rows)[:, None] * velocity))
 
     def expected_pose(self, state: State, registered: Bools, unit: int) -> Floats | None:
-        """Where a unit (4, 4) is if it moves as the two registered nearest in time do; None where these are far."""
+        """Predict the pose (4, 4) of a unit from the two registered units nearest in time; None where these are far."""
         known = np.flatnonzero(registered)
         known = known[known != unit]
         nearest = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
@@ -175,7 +175,7 @@ class RigMotion:
         self._unit_from_image[own] = self.unit_from_image(state)[own]
 
     def largest(self, state: State, registered: Bools) -> LargestMotion:
-        """How far apart images and units are."""
+        """Largest distance between an image and its unit."""
         rows = np.flatnonzero(registered[self.bands.unit])
         if state.simultaneous or not len(rows):
             return LargestMotion(translation_m=0.0, rotation_deg=0.0)
@@ -220,7 +220,7 @@ class RigMotion:
 
 
 def finding(not_compensated: int, units: int) -> Finding:
-    """What a user is told of units whose motion nothing tells, by their number and that of all registered ones."""
+    """Finding on units whose motion is unknown, by their number and that of all registered ones."""
     return warning(
         "motion-not-compensated",
         f"{not_compensated} of {units} registered units have no other one within {MAX_GAP_S:g} s: how the vehicle "

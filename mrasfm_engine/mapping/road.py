@@ -39,7 +39,7 @@ class RoadAssessment:
 
     @property
     def road(self) -> Road:
-        """What the scene says of the road."""
+        """Road of the scene."""
         return Road(
             source=self.source,
             surface=self.fitted.surface,
@@ -142,7 +142,7 @@ def height_sigmas_m(mapper: Mapper, tracks: Ints, world_from_rig: Floats) -> Flo
 
 
 def _all_images_are_masked(mapper: Mapper) -> bool:
-    """Whether every image with keypoints has some of a known class: an image without a mask has none."""
+    """Return whether every image with keypoints has some of a known class: an image without a mask has none."""
     image, classes = mapper.keypoints.image, mapper.keypoints.classes
     return len(np.unique(image[classes != UNKNOWN])) == len(np.unique(image))
 

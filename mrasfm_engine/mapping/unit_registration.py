@@ -31,7 +31,7 @@ VOTE_BEATS_JOINT = 0.9  # of the joint pose's inliers: what the vote loses on a 
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
-    """How a unit was registered, or why not."""
+    """Registration of a unit, or the reason for its failure."""
 
     unit: int
     world_from_rig: Floats | None
@@ -64,7 +64,7 @@ class Correspondences2D3D:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraViews:
-    """What looks out of a rig: its cameras, or, where these are not simultaneous, its cameras at their row bands."""
+    """Views of a generalised camera: the rig's cameras, or, where these are not simultaneous, cameras at row bands."""
 
     index: Ints  # (n,) which of them each image point is seen by
     rig_from_view: Floats  # (e, 4, 4)

@@ -116,7 +116,9 @@ def _motion_agreement(
 
 
 def _inverses(rig_from_cam: Floats) -> list[Floats]:
-    """What was meant, if the inverse was given in forward-left-up, right-down-forward or forward-right-down axes."""
+    """Poses that were meant, if the inverse was given in forward-left-up, right-down-forward or forward-right-down
+    axes.
+    """
     return [flu @ se3.inverse(se3.inverse(flu) @ rig_from_cam) for flu in map(flu_from_body, BodyAxes)]
 
 
@@ -128,7 +130,7 @@ def _explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: F
 
 
 def _direction(rays_a: Floats, rays_b: Floats) -> Floats | None:
-    """Where camera b is, seen from camera a: a unit vector."""
+    """Direction from camera a to camera b: a unit vector."""
     ok = (rays_a[:, 2] > MIN_FORWARD) & (rays_b[:, 2] > MIN_FORWARD)
     a, b = rays_a[ok, :2] / rays_a[ok, 2:], rays_b[ok, :2] / rays_b[ok, 2:]
     essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, 0.999, 2e-3)

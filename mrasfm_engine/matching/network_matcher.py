@@ -29,7 +29,7 @@ class Prepared:
 
 
 class NetworkMatcher:
-    """What all trained matchers share: the first keypoints of an image, in the network's own units."""
+    """Base of the trained matchers: the first keypoints of an image, in the network's own units."""
 
     usual_min_score: float
 

@@ -27,7 +27,7 @@ class Matcher(Protocol):
     """Matches two images' features."""
 
     def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Any:
-        """What the matcher needs of one image of width x height pixels, computed once."""
+        """Prepare one image of width x height pixels for the matcher, once."""
         ...
 
     def match(self, a: Any, b: Any) -> Ints32:

@@ -1,4 +1,4 @@
-"""Which image pairs are worth matching: never all of them."""
+"""Selection of the image pairs that are worth matching: never all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the units roughly are before any image is looked at: from rough poses, from GNSS, or unknown."""
+"""Prior trajectory of the units, before any image is read: from rough poses, from GNSS, or unknown."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MARGIN_US = 10_000_000  # of samples before and after the drive that are looked 
 
 @dataclass(frozen=True, kw_only=True)
 class PriorTrajectory:
-    """What is known of the way before reconstruction; NaN for units of which nothing is known.
+    """Trajectory that is known before reconstruction; NaN for units of which nothing is known.
 
     GNSS is in an east-north-up frame at the track's middle, rough poses are in their own world, moved to begin near
     zero. `world_from_rig` is in the frame of its source.

@@ -14,7 +14,7 @@ MIN_RANSAC_MATCHES = 8
 
 
 def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bools:
-    """Which matches (n,) agree with one essential matrix found by RANSAC.
+    """Return which matches (n,) agree with one essential matrix found by RANSAC.
 
     Parameters
     ----------
@@ -53,7 +53,9 @@ def parallax_rad(rays_a: Floats, rays_b: Floats) -> float:
 
 
 def in_front_of_both(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Bools:
-    """Which pairs of rays (n,) meet in front of both cameras under a known pose, or are parallel to within rounding."""
+    """Return which pairs of rays (n,) meet in front of both cameras under a known pose, or are parallel to within
+    rounding.
+    """
     ra = rays_a @ b_from_a[:3, :3].T
     t = b_from_a[:3, 3]
     # Least squares depths of da * ra + t = db * rb, from the 2x2 normal equations.

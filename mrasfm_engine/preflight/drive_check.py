@@ -39,7 +39,7 @@ class UnsoundDriveError(InputError):
 
 
 def check_manifest(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Finding]:
-    """What is wrong or odd about a drive as far as its manifest shows it; no file is looked at.
+    """List the errors and oddities of a drive that its manifest shows; no file is opened.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def check_drive(drive: Drive, *, use_gnss: bool = True, progress: CountProgress 
 
 
 def is_sound(findings: Sequence[Finding]) -> bool:
-    """Whether no finding is an error."""
+    """Return whether no finding is an error."""
     return all(finding.severity is not Severity.ERROR for finding in findings)
 
 

@@ -1,4 +1,4 @@
-"""What a sample of a drive's images tells before hours of work: blur, standing still, damage.
+"""Findings from a sample of a drive's images before hours of work: blur, standing still, damage.
 
 At most 64 images are decoded, to their last pixel, which takes under a second for images of two megapixels: little
 enough that a reconstruction does it too, and its report has these warnings. On a drive of any length that finds what
@@ -50,7 +50,7 @@ MOVED_M = 1.0  # positions that stay within this say that the vehicle stood
 
 @dataclass(frozen=True)
 class _Look:
-    """What one image shows."""
+    """Measures of one image."""
 
     image: DriveImage
     detail: float
@@ -296,7 +296,7 @@ def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss
 
 
 def _is_still(a: Floats32, b: Floats32) -> bool | None:
-    """Whether two images show the same; None where they show too little.
+    """Return whether two images show the same; None where they show too little.
 
     What changes between them is held against what a shift by one pixel would change: so texture and exposure have no
     say. The most changed tenth of the pixels counts, so that a sky or a bonnet that stays does not hide movement, and
@@ -314,7 +314,7 @@ def _is_still(a: Floats32, b: Floats32) -> bool | None:
 
 
 def _stays(pairs: Sequence[tuple[_Look, _Look]]) -> bool:
-    """Whether the cameras show at the end what they showed at the beginning."""
+    """Return whether the cameras show at the end what they showed at the beginning."""
     first: dict[int, _Look] = {}
     last: dict[int, _Look] = {}
     for a, b in pairs:
@@ -324,7 +324,7 @@ def _stays(pairs: Sequence[tuple[_Look, _Look]]) -> bool:
 
 
 def _positions_move(drive: Drive, use_gnss: bool) -> bool:
-    """Whether GNSS or the rough poses, where there are any, tell of movement."""
+    """Return whether GNSS or the rough poses, where there are any, show movement."""
     rough, gnss = drive.manifest.rough_poses, drive.manifest.gnss
     if rough is not None and _extent_m([pose.world_from_rig.translation_m for pose in rough.poses]) > MOVED_M:
         return True
@@ -336,6 +336,6 @@ def _positions_move(drive: Drive, use_gnss: bool) -> bool:
 
 
 def _extent_m(positions_m: Sequence[Sequence[float]] | Floats) -> float:
-    """How far the positions are apart, without the few outermost."""
+    """Extent of the positions, without the few outermost."""
     low, high = np.quantile(np.asarray(positions_m, dtype=np.float64), [0.05, 0.95], axis=0)
     return float(np.linalg.norm(high - low))

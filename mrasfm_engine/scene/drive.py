@@ -28,7 +28,7 @@ def pose_from_matrix(a_from_b: Floats) -> Pose:
 
 
 class Incomplete(StrEnum):
-    """Why an image of which some pixels can be decoded is not used."""
+    """Reason for not using an image of which some pixels can be decoded."""
 
     TRUNCATED = "truncated"
     CORRUPT = "corrupt"

@@ -62,7 +62,7 @@ class RowBands:
 
     @property
     def simultaneous(self) -> bool:
-        """Whether every row band is at its unit's timestamp."""
+        """Every row band is at its unit's timestamp."""
         return not self.time_offset_s.any()
 
     @property

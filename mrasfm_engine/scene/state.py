@@ -43,7 +43,7 @@ class State:
 
     @property
     def simultaneous(self) -> bool:
-        """Whether all images are taken at their unit's timestamp."""
+        """All images are taken at their unit's timestamp."""
         return len(self.band_rotation) == 0
 
     @property

@@ -1,4 +1,4 @@
-"""Which points are the road's where no mask says so: those on one level below the vehicle's way."""
+"""Points of the road where no mask names it: those on one level below the vehicle's trajectory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MIN_SHARE = 0.2  # of the points below the cameras on the way that must be on on
 
 
 def points_below_the_way(points_m: Floats, world_from_rig: Floats, lowest_camera_m: float) -> Bools | None:
-    """Which points (n, 3) are near the road's level in the lane that the vehicle drove.
+    """Return which points (n, 3) are near the road's level in the lane that the vehicle drove.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def points_below_the_way(points_m: Floats, world_from_rig: Floats, lowest_camera
 
 
 def standing_is_impossible(points_m: Floats, distance_m: Floats, world_from_rig: Floats) -> Bools:
-    """Where (n,) nothing that stands can be: below the road, or above it where the vehicle itself drove.
+    """Return where (n,) nothing that stands can be: below the road, or above it in the lane that the vehicle drove.
 
     `distance_m` (n,) is signed, to the road's surface. Kerbs, bollards and parked cars beside the way may be there.
     """

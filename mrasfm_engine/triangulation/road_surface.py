@@ -263,7 +263,7 @@ def _append(patches: _Patches, xy: Floats, plane: HeightPlane) -> None:
 
 
 def _cover(xyz: Floats, spacing_m: float) -> Sequence[int]:
-    """Which places (n, 3), in their order, are at least the spacing from all chosen before, or on another level."""
+    """Choose places (n, 3), in their order, at least the spacing from all chosen before, or on another level."""
     chosen: list[int] = []
     for n in range(len(xyz)):
         away = xyz[chosen] - xyz[n]

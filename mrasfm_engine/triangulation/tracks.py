@@ -63,7 +63,7 @@ class Keypoints:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """Which keypoints belong together. No track has two keypoints of one image."""
+    """Keypoints that belong together. No track has two keypoints of one image."""
 
     of_keypoint: Ints  # (n,) -1 where a keypoint is in no track
     first: Ints  # (tracks + 1,)

@@ -249,7 +249,7 @@ def _has_angle(
     cos_limit: float,
     out: Any,
 ) -> None:
-    """Whether two observations of a point are seen under at least the limit's angle."""
+    """Return whether two observations of a point are seen under at least the limit's angle."""
     direction = np.empty((MAX_OBSERVATIONS, 3))
     for n in range(len(which)):
         count = 0
@@ -345,7 +345,9 @@ class Triangulator:
         )  # fmt: skip
 
     def has_angle(self, state: State, tracks: Tracks, is_inlier: Bools, which: Ints) -> Bools:
-        """Which of the tracks `which` are still seen under an angle that gives depth by their kept observations."""
+        """Return which of the tracks `which` are still seen under an angle that gives depth by their inlier
+        observations.
+        """
         r, _ = self._cam_from_world(state, _members(tracks, which))
         out, k = np.empty(len(which), dtype=np.bool_), self._keypoints
         in_ranges(

@@ -1,4 +1,4 @@
-"""How certain a triangulated point is, from the rays that see it."""
+"""Uncertainty of a triangulated point, from the rays that see it."""
 
 from __future__ import annotations
 

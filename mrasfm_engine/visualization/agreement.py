@@ -1,4 +1,4 @@
-"""How well the views of different cameras agree where they show the same ground."""
+"""Agreement of the views of different cameras on the ground that they share."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MIN_BLOCKS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Of two cameras' views of the same ground.
+    """Agreement of two cameras' views of the same ground.
 
     Attributes
     ----------

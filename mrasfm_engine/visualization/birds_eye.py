@@ -247,7 +247,7 @@ def _world_from_pixel(mosaic: Mosaic, world_from_plan: Floats, top_px: int, leve
 
 
 def calibration_changed(scene: Scene) -> bool:
-    """Whether any camera's refined calibration differs from the given one."""
+    """Return whether any camera's refined calibration differs from the given one."""
     return any(
         not np.allclose(refined.rig_from_cam, given, atol=1e-9)
         or not np.allclose(refined.params, camera.params, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""What stands around a picture: title, scale bar, direction."""
+"""Frame of a picture: title, scale bar, direction."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ PATCH_SIGMA_M, PATCH_SIGMA_SLOPE = 0.1, 0.03
 
 
 class GroundHeights(Protocol):
-    """Where the ground is, in a frame whose z axis points up."""
+    """Height of the ground, in a frame whose z axis points up."""
 
     def height_m(self, xy_m: Floats) -> Floats:
         """Heights (n,) of the ground at positions (n, 2)."""

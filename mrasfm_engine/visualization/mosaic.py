@@ -87,7 +87,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Mosaic:
-    """What the two best cameras see of every cell.
+    """Views of every cell by the two best cameras.
 
     Attributes
     ----------
@@ -260,7 +260,7 @@ def _height_at(heights: Any, right_m: float, up_m: float) -> float:
 
 @njit(cache=True, inline="always")
 def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: float) -> int:
-    """Which layer a camera's view of this score belongs to, -1 if to none; the best is moved down where it must."""
+    """Layer that a camera's view of this score belongs to, -1 if to none; the best is moved down where it must."""
     if owner[0, row, column] == camera:
         return 0 if s > score[0, row, column] else -1
     if s > score[0, row, column]:

@@ -131,7 +131,7 @@ def _views(road: Road, world_from_rig: Floats) -> _Views:
 
 
 def _along(way: Floats, travelled: Floats, forward: Floats, points: Floats) -> Floats:
-    """How far along the way (n,) points are: that of the nearest pose, and what they are ahead of it."""
+    """Distance along the trajectory (n,) of points: that of the nearest pose, and their lead over it."""
     pose = nearest(way[:, :2], points[:, :2])[1][:, 0]
     ahead = ((points[:, :2] - way[pose, :2]) * forward[pose, :2]).sum(1)
     result: Floats = travelled[pose] + ahead

@@ -1,1 +1,1 @@
-"""What crosses the HTTP API, as pydantic models with examples."""
+"""Requests and answers of the HTTP API, as pydantic models with examples."""

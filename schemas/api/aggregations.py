@@ -16,7 +16,7 @@ MapName = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern
 
 
 class AggregationRequest(RequestBody):
-    """Which drives or scenes become one map, or are added to one and taken out of it."""
+    """Drives or scenes that become one map, or are added to one and taken out of it."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -32,7 +32,7 @@ class DriveState(StrEnum):
 
 
 class PreflightState(StrEnum):
-    """What is known of a drive's soundness."""
+    """State of the check of a drive."""
 
     NONE = "NONE"
     PENDING = "PENDING"
@@ -91,7 +91,7 @@ _FILE: JsonDict = {"path": "front/000000.png", "size_bytes": 1048576, "sha256": 
 
 
 class FileRole(StrEnum):
-    """What a file is in its drive."""
+    """Role of a file in its drive."""
 
     IMAGE = "image"
     MASK = "mask"
@@ -120,7 +120,7 @@ class FileDeclaration(RequestBody):
 
 
 class DeclareFiles(RequestBody):
-    """What a client has, to learn what it must send."""
+    """Files that a client has, to learn which of them it must send."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"files": [_FILE]}]})
 
@@ -130,7 +130,7 @@ class DeclareFiles(RequestBody):
 
 
 class DeclaredFiles(Resource):
-    """What is stored already, here or under another name, and what must be sent."""
+    """Files that are stored already, here or under another name, and files that must be sent."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"stored": ["front/000000.png"], "to_send": ["front/000001.png"]}]}
@@ -141,7 +141,7 @@ class DeclaredFiles(Resource):
 
 
 class StoredFiles(Resource):
-    """What an archive brought."""
+    """Files of an archive that were stored."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"stored": 228, "files_stored": 240, "files_expected": 240}]}
@@ -153,7 +153,7 @@ class StoredFiles(Resource):
 
 
 class PreflightResource(Resource):
-    """What the check of a drive found."""
+    """Findings of the check of the drive."""
 
     model_config = ConfigDict(
         json_schema_extra={

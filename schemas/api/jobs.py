@@ -17,7 +17,7 @@ DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
 
 
 class ReconstructionSettings(RequestBody):
-    """What of the engine a request may set; null leaves the engine's default."""
+    """Engine settings that a request may set; null leaves the engine's default."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"use_gnss": True}]})
 
@@ -52,7 +52,7 @@ class ReconstructionRequest(RequestBody):
 
 
 class JobKind(StrEnum):
-    """What a job does."""
+    """Kind of a job."""
 
     PREFLIGHT = "PREFLIGHT"
     RECONSTRUCTION = "RECONSTRUCTION"
@@ -60,7 +60,7 @@ class JobKind(StrEnum):
 
 
 class JobState(StrEnum):
-    """Where a job is. SUCCEEDED, FAILED and CANCELLED never change again."""
+    """State of a job. SUCCEEDED, FAILED and CANCELLED never change again."""
 
     QUEUED = "QUEUED"
     RUNNING = "RUNNING"
@@ -91,7 +91,7 @@ _ATTEMPT: JsonDict = {
 
 
 class JobProgress(Resource):
-    """How far the current attempt is."""
+    """Progress of the current attempt."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [_PROGRESS]})
 

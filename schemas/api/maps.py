@@ -165,7 +165,7 @@ class MapResource(Times):
 
 
 class CurrentVersion(RequestBody):
-    """Which version a map shall show."""
+    """Version that a map shows."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"version": 1}]})
 

@@ -29,7 +29,7 @@ class ProblemItem(BaseModel):
 
 
 class Problem(BaseModel):
-    """What went wrong and what to do."""
+    """Problem details: the error and its remedy."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -1,4 +1,4 @@
-"""What several resources share."""
+"""Common parts of resources."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Page(Resource, Generic[Item]):
 
 
 class Finding(Resource):
-    """What the check of a drive found."""
+    """Finding of the check of a drive."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -1,4 +1,4 @@
-"""How the service itself is."""
+"""Status of the service itself."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from schemas.api.resource import Resource
 
 
 class Health(StrEnum):
-    """Whether everything works."""
+    """Health of the service."""
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -63,7 +63,7 @@ class DiskStatus(Resource):
 
 
 class ServiceStatus(Resource):
-    """Whether the service works, and what is lost where it does not."""
+    """Status of the service, and what is lost where a part does not work."""
 
     model_config = ConfigDict(
         json_schema_extra={

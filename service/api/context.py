@@ -1,4 +1,4 @@
-"""What every request needs: settings, database, artifact store and broker, opened once a process."""
+"""Objects that every request needs: settings, database, artifact store and broker, opened once per process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What routes ask for by type: the context, who calls, and the idempotent execution of a POST."""
+"""Dependencies of the routes: the context, the caller, and the idempotent execution of a POST."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class _ApiKey(HTTPBearer):
     """FastAPI's, so that the OpenAPI page says which key a route needs; what it gives is the key's owner."""
 
     async def __call__(self, request: Request) -> Caller:  # type: ignore[override]
-        """Who calls.
+        """Identify the caller.
 
         Raises
         ------

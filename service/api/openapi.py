@@ -100,7 +100,7 @@ def _operations(page: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]
 
 
 def _add_problems(operation: dict[str, Any], *statuses: int) -> None:
-    """What any request of a kind may be answered with: a body that does not come, a disk that is full."""
+    """Add the problems that any request of a kind may meet: a body that does not come, a disk that is full."""
     for status, documented_problem in problems(*statuses).items():
         operation["responses"].setdefault(str(status), documented_problem)
 

@@ -1,4 +1,4 @@
-"""Whether database and artifact store can be written, asked seldom and never by more than one thread."""
+"""Readiness of database and artifact store for writing, asked seldom and never by more than one thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the API is served: uvicorn, with what must not be left to its defaults."""
+"""The API's server: uvicorn, with explicit settings where its defaults do not fit."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class Client:
 
     @property
     def url(self) -> str:
-        """Of the service, without a slash at its end."""
+        """URL of the service, without a slash at its end."""
         return self._transport.url
 
     def close(self) -> None:
@@ -109,7 +109,7 @@ class Client:
 
     @property
     def stopped(self) -> bool:
-        """Whether `stop` or `close` was called."""
+        """`stop` or `close` was called."""
         return self._transport.closing.is_set()
 
     def pause(self, seconds: float) -> None:
@@ -121,7 +121,7 @@ class Client:
         return self._transport.retry_budget()
 
     def status(self) -> ServiceStatus:
-        """How the service is."""
+        """Status of the service."""
         return self._get("/v1/status", ServiceStatus)
 
     def create_drive(self, manifest: bytes, *, idempotency_key: str | None = None) -> DriveResource:
@@ -165,7 +165,7 @@ class Client:
         return self._post(path, DriveResource, key=idempotency_key, timeout_s=CHECK_TIMEOUT_S)
 
     def preflight(self, drive_id: str) -> PreflightResource:
-        """What the check of a drive found."""
+        """Findings of the check of a drive."""
         return self._get(f"/v1/drives/{_part(drive_id)}/preflight", PreflightResource)
 
     def reconstruct(
@@ -261,7 +261,7 @@ class Client:
         return _parsed(response, UploadResource).id
 
     def upload_offset(self, drive_id: str, upload_id: str) -> int:
-        """How many bytes of a resumable upload the service has."""
+        """Number of bytes of a resumable upload that the service has."""
         response = self._transport.request("HEAD", _upload_path(drive_id, upload_id), headers=_TUS)
         offset = response.headers.get("upload-offset", "")
         if not offset.isdecimal():

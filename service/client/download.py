@@ -32,7 +32,7 @@ _relative_path = TypeAdapter(RelativePath)
 
 @dataclass(frozen=True)
 class Downloaded:
-    """What a download brought."""
+    """Result of a download."""
 
     bytes_received: int
     files_received: int

@@ -87,7 +87,7 @@ class DriveFolder:
         return hashlib.sha256(self.raw_manifest).hexdigest()
 
     def size_bytes(self) -> int:
-        """Of all files but the manifest."""
+        """Size of all files but the manifest."""
         return sum((self.root / path).stat().st_size for path in self.paths)
 
 

@@ -16,7 +16,7 @@ _SILENT_CONNECTIONS = 2
 
 @dataclass(frozen=True)
 class JobNews:
-    """How a job is now."""
+    """State of a job."""
 
     state: str
     attempt: int = 0

@@ -17,7 +17,7 @@ MAX_REPORT_BYTES = 1 << 27  # that of the longest drives has some megabytes
 
 
 def scene_findings(client: Client, scene_id: str) -> list[Finding]:
-    """What the report of a scene says a user should look at; nothing where there is no readable report.
+    """Findings in a scene's report that a user should read; empty where there is no readable report.
 
     Raises
     ------

@@ -266,7 +266,7 @@ def checked_url(url: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether requests to the host stay on this machine."""
+    """Return whether requests to the host stay on this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

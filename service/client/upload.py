@@ -25,7 +25,7 @@ DECLARED_AT_ONCE = 1000
 
 @dataclass(frozen=True)
 class Sent:
-    """What it took until the service had the drive."""
+    """Requests and bytes until the service had the drive."""
 
     drive_id: str
     bytes_sent: int

@@ -1,4 +1,4 @@
-"""What an upload has reached, so that the same command goes on after an interruption.
+"""State of an upload, so that the same command goes on after an interruption.
 
 Under a name that is kept before the first request is made, a request whose answer was lost is repeated without a
 second effect.
@@ -87,7 +87,7 @@ class UploadState:
         return record
 
     def job(self, asked: BaseModel) -> JobRecord | None:
-        """What was asked for so."""
+        """Job that was requested under this key."""
         return self.record.jobs.get(_digest(asked))
 
     @property

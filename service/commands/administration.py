@@ -1,4 +1,4 @@
-"""What commands that change a service's records share: whose, and a transaction on them."""
+"""Common part of the commands that change a service's records: the project, and a transaction on the records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What commands that talk to a service share: the key, what may go wrong, and how that is said."""
+"""Common part of the commands that talk to a service: the key, the errors, and their messages."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def failed(summary: CommandSummary, display: Display, text: str, code: int) -> i
 
 
 def _is_trouble(status: int) -> bool:
-    """Whether the service could not answer, rather than did not want to. A full disk (507) is its answer.
+    """Return whether the service could not answer, rather than refused. A full disk (507) is its answer.
 
     After many tries, requests that arrive too slowly (408) are a network that does not carry them.
     """

@@ -242,7 +242,7 @@ class _Demo:
 
 
 def _output_of(argv: Sequence[str]) -> str:
-    """What a program prints.
+    """Run a program and return its output.
 
     Raises
     ------

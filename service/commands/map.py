@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Summary:
-    """What `--json` prints, filled as it becomes known."""
+    """Document of `--json`, filled as it becomes known."""
 
     drive_ids: list[str] = field(default_factory=list)
     job_id: str | None = None

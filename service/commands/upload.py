@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Summary:
-    """What `--json` prints, filled as it becomes known."""
+    """Document of `--json`, filled as it becomes known."""
 
     drive_id: str | None = None
     job_id: str | None = None

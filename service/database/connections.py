@@ -200,7 +200,7 @@ def newest_schema() -> str:
 
 
 def is_current(database: Database) -> bool:
-    """Whether the schema is the one that this code expects.
+    """Return whether the schema is the one that this code expects.
 
     Asked without Alembic, which takes 10 MB that a process that does not migrate can do without.
     """

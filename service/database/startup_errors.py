@@ -1,4 +1,4 @@
-"""What to say to who starts a part of the service where the database cannot be used."""
+"""Messages for the start of a part of the service where the database cannot be used."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _NAMES = {Drive: "drive", Job: "job", Map: "map", Scene: "scene", Upload: "uploa
 
 
 def is_id(text: str) -> bool:
-    """Whether a text can be an id of ours; what cannot may hold what a database refuses in a parameter."""
+    """Return whether a text can be an id of ours; other texts may hold what a database refuses in a parameter."""
     return _ID.fullmatch(text) is not None
 
 

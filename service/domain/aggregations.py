@@ -16,6 +16,7 @@ from schemas.api.drives import DriveState, PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
 from schemas.api.resource import Finding
+from schemas.artifacts import Stage
 from service.database.tables import TERMINAL, Drive, Job, JobMember, JobState, Map, MapScene, Project, Scene, new_id
 from service.domain import drives, jobs, maps
 from service.domain.access import require
@@ -283,7 +284,7 @@ def _child(session: Session, drive: Drive, job: Job) -> Job:
 
 
 def _rejection(drive: Drive) -> Problem:
-    """Why a drive whose check found errors cannot be reconstructed."""
+    """Problem of a drive whose check found errors, and which cannot be reconstructed."""
     errors = [finding for finding in drive.findings if finding.get("severity") == "error"]
     first = errors[0] if errors else {}
     return Problem(
@@ -292,7 +293,7 @@ def _rejection(drive: Drive) -> Problem:
         detail=str(first.get("what", "the check of the drive found errors")),
         remedy=str(first.get("remedy", "Correct the drive, and upload it as a new one.")),
         findings=[Finding.model_validate(finding) for finding in drive.findings],
-        stage="preflight",
+        stage=Stage.PREFLIGHT,
         retryable=False,
     )
 

@@ -13,6 +13,7 @@ from typing import Any
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
+from schemas.artifacts import checkpoint_file, seam_checkpoint
 from service.database.connections import Database
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
@@ -57,7 +58,7 @@ class MapShelf:
         """The shelf for scenes of a map, ids by name, under some settings."""
         under = settings_sha256(settings)
         digests = {
-            f"seam-{a}~{b}.npz": hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
+            checkpoint_file(seam_checkpoint(a, b)): hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
             for a, first in scenes.items()
             for b, second in scenes.items()
             if a != b
@@ -68,7 +69,7 @@ class MapShelf:
 Shelf = DriveShelf | MapShelf
 _SEAM = "seam"
 _SHELVES_A_DRIVE = 3
-_KEPT = (Blob.id, Blob.key, Blob.sha256)
+_KEPT = (Blob.id, Blob.key)
 
 
 def restore(database: Database, shelf: Shelf, folder: Path, *, fetch: Fetch) -> list[str]:
@@ -82,7 +83,7 @@ def restore(database: Database, shelf: Shelf, folder: Path, *, fetch: Fetch) -> 
     brought = []
     for name, kept in found.items():
         try:
-            fetch(kept.key, folder / name, kept.sha256)
+            fetch(kept.key, folder / name)
         except FileNotFoundError:
             log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
             with database.write() as session:
@@ -101,11 +102,10 @@ def _forget(session: Session, blob_id: str) -> None:
 
 @dataclass(frozen=True)
 class _Kept:
-    """Where a finished stage's bytes are."""
+    """Location of a finished stage's bytes."""
 
     id: str
     key: str
-    sha256: str
 
 
 def _shelved(session: Session, shelf: Shelf) -> dict[str, _Kept]:

@@ -24,7 +24,7 @@ def materialise(
     *,
     fetch: Fetch,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> None:
+) -> dict[str, str]:
     """Lay a drive out as a folder that the engine reads: `drive.json` and the files under the names it gives them.
 
     Parameters
@@ -33,6 +33,11 @@ def materialise(
         Brings one file.
     progress
         Called as progress(done, total) with each file.
+
+    Returns
+    -------
+    dict
+        SHA-256 of the files by their names in the manifest.
 
     Raises
     ------
@@ -48,9 +53,10 @@ def materialise(
         stored = select(DriveFile.path, Blob.key, Blob.sha256).join(Blob, DriveFile.blob_id == Blob.id)
         files = session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
     folder.mkdir(parents=True, mode=0o700)
-    fetch(manifest.key, folder / MANIFEST_NAME, manifest.sha256)
-    for i, (path, key, sha256) in enumerate(files):
+    fetch(manifest.key, folder / MANIFEST_NAME)
+    for i, (path, key, _) in enumerate(files):
         target = folder / path  # checked when the manifest came: relative, without '..'
         target.parent.mkdir(parents=True, exist_ok=True)
-        fetch(key, target, sha256)
+        fetch(key, target)
         progress(i + 1, len(files))
+    return {path: sha256 for path, _, sha256 in files}

@@ -191,7 +191,7 @@ def empty(session: Session, slot: Slot) -> None:
 
 
 def _put(session: Session, slot: Slot, blob_id: str | None) -> bool:
-    """Whether the slot was still as it was found, and has these bytes now."""
+    """Write the bytes of a file if it is still as it was found, and return whether it was."""
     values = {"drive": slot.drive_id, "name": slot.path, "before": slot.blob_id, "after": blob_id}
     values["now"] = None if blob_id is None else now_us()  # type: ignore[assignment]
     return bool(session.connection().execute(_FILL, values).rowcount)

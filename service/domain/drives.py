@@ -28,14 +28,14 @@ _BATCH = 500
 
 @dataclass(frozen=True)
 class Stored:
-    """How much of a drive is here."""
+    """Number and size of a drive's stored files."""
 
     files: int
     size_bytes: int
 
 
 def rows_of(manifest: ManifestFacts) -> list[str]:
-    """What `create` writes for the files: made before, for in its transaction all others wait who want to write."""
+    """Make the rows that `create` writes for the files: before its transaction, for which all other writers wait."""
     return list(bulk.batches(manifest.files))
 
 
@@ -110,7 +110,7 @@ def get(session: Session, project_id: str, drive_id: str, *, lock: bool = False)
 
 
 def stored_of(session: Session, drive_ids: Sequence[str]) -> dict[str, Stored]:
-    """How much of each drive is here."""
+    """Count the stored files of each drive."""
     statement = select(DriveFile.drive_id, func.count(), func.coalesce(func.sum(Blob.size_bytes), 0)).join(
         Blob, DriveFile.blob_id == Blob.id
     )

@@ -26,7 +26,7 @@ from service.errors import ServiceError
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What a POST answers, and which jobs it made."""
+    """Response to a POST, and the jobs that it made."""
 
     status: int
     body: Any  # JSON

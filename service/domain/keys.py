@@ -19,7 +19,7 @@ _PREFIX = "mrasfm_"  # lets secret scanners recognise a key that was pushed some
 
 
 def secret_sha256(secret: str) -> str:
-    """What is kept of a key. A plain hash suffices: the secret has 256 random bits and cannot be guessed."""
+    """Hash of a key, which is all that is stored. A plain hash suffices: the secret has 256 random bits."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 

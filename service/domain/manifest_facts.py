@@ -1,4 +1,4 @@
-"""What the service takes of a manifest: what a drive is shown as, and which files it consists of."""
+"""Facts of a manifest that the service uses: the drive's summary, and its files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.errors import ServiceError
 
 @dataclass(frozen=True, kw_only=True)
 class ManifestFacts:
-    """What creating a drive needs.
+    """Facts for the creation of a drive.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ def facts_of(manifest: DriveManifest) -> ManifestFacts:
 
 
 def _roles(manifest: DriveManifest) -> dict[str, FileRole]:
-    """Of all files. A mask may serve several images, and is one file."""
+    """Roles of all files. A mask may serve several images, and is one file."""
     roles: dict[str, FileRole] = {}
     for frame in manifest.frames:
         for image in frame.images.values():

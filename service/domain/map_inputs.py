@@ -1,4 +1,4 @@
-"""What an aggregation works on: files of scenes, and of the version that it goes on from."""
+"""Inputs of an aggregation: files of scenes, and of the version that it goes on from."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from schemas.artifacts import is_read_by_aggregation, is_read_by_next_version
 from service.database.tables import Blob, Job, MapFile, SceneFile
 from service.domain import jobs, maps
-
-# For people and other programs; no stage reads them.
-_FOR_OTHERS = ("pictures/", "model/text/")
-# All that a version is made anew from.
-_OF_VERSION = ("map.json", "report.json", "scenes/", "seams/")
 
 
 @dataclass(frozen=True)
@@ -24,12 +20,11 @@ class StoredArtifact:
 
     path: str
     key: str
-    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapInputs:
-    """Of one aggregation.
+    """Inputs of one aggregation.
 
     Attributes
     ----------
@@ -77,13 +72,13 @@ def inputs_of(session: Session, job_id: str) -> MapInputs:
 
 
 def _files_of_scene(session: Session, scene_id: str) -> list[StoredArtifact]:
-    statement = select(SceneFile.path, Blob.key, Blob.sha256).join(Blob, SceneFile.blob_id == Blob.id)
+    statement = select(SceneFile.path, Blob.key).join(Blob, SceneFile.blob_id == Blob.id)
     rows = session.execute(statement.where(SceneFile.scene_id == scene_id).order_by(SceneFile.path))
-    return [StoredArtifact(*row) for row in rows if not row.path.startswith(_FOR_OTHERS)]
+    return [StoredArtifact(*row) for row in rows if is_read_by_aggregation(row.path)]
 
 
 def _files_of_version(session: Session, map_id: str | None, number: int | None) -> list[StoredArtifact]:
-    statement = select(MapFile.path, Blob.key, Blob.sha256).join(Blob, MapFile.blob_id == Blob.id)
+    statement = select(MapFile.path, Blob.key).join(Blob, MapFile.blob_id == Blob.id)
     mine = (MapFile.map_id == map_id) & (MapFile.number == (number or 0))
     rows = session.execute(statement.where(mine).order_by(MapFile.path))
-    return [StoredArtifact(*row) for row in rows if row.path.startswith(_OF_VERSION)]
+    return [StoredArtifact(*row) for row in rows if is_read_by_next_version(row.path)]

@@ -30,7 +30,7 @@ class Hold:
     holder: str
 
     def is_mine(self) -> ColumnElement[bool]:
-        """Whether a row of the table is held by this request."""
+        """Return whether a row of the table is held by this request."""
         return (
             (IdempotencyKey.project_id == self.project_id)
             & (IdempotencyKey.key == self.key)

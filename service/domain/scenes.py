@@ -24,7 +24,7 @@ _MEDIA_TYPES = {
 
 
 def media_type(path: str) -> str:
-    """Of an artifact, by its name."""
+    """Media type of an artifact, by its name."""
     return _MEDIA_TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
 
 

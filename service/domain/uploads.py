@@ -21,7 +21,7 @@ MAX_OPEN = 1000  # of a project: each is a file in the spool
 
 @dataclass(frozen=True, kw_only=True)
 class Announced:
-    """What a client wants to send.
+    """Announcement of an upload.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ def create(session: Session, *, project_id: str, drive_id: str, announced: Annou
 
 
 def _require_room(session: Session, project_id: str, size_bytes: int) -> None:
-    """What is announced and not here yet counts as if it were: many uploads cannot share the last free bytes.
+    """Count announced bytes as if they were here: many uploads cannot share the last free bytes.
 
     Uploads into a drive that was committed meanwhile come to nothing, and count nothing.
     """

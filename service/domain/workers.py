@@ -1,4 +1,4 @@
-"""Which workers there are."""
+"""Workers that are known."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class BrokerServerError(Exception):
 
 @dataclass(frozen=True)
 class EmbeddedBroker:
-    """How to start the broker, and how to reach it."""
+    """Command and address of the embedded broker."""
 
     argv: tuple[str, ...]
     port: int
@@ -150,7 +150,7 @@ def find_server() -> Path:
 
 
 def is_up(url: str) -> bool:
-    """Whether the server answers; False while it starts or loads its data."""
+    """Return whether the server answers; False while it starts or loads its data."""
     retry = Retry(NoBackoff(), 0)
     try:
         with redis.Redis.from_url(

@@ -1,4 +1,4 @@
-"""Whether a process still answers HTTP requests, found out without waiting for it."""
+"""Probe whether a process still answers HTTP requests, without waiting for it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Pulse:
             self._connection.send(request.encode())
 
     def end(self) -> bool:
-        """Whether it has answered by now, or could not be asked for want of something here."""
+        """Return whether it has answered by now, or could not be asked for want of something here."""
         if self._connection is None:
             return True
         with self._connection:

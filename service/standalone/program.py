@@ -32,7 +32,7 @@ Say = Callable[[str], None]
 
 
 class StandaloneError(Exception):
-    """What the processes need is not there; the message says what to do."""
+    """Something that the processes need is not there; the message says what to do."""
 
 
 def run_standalone(settings: Settings, *, workers: int, log_level: str, say: Say) -> None:
@@ -73,7 +73,7 @@ def run_standalone(settings: Settings, *, workers: int, log_level: str, say: Say
 def child_specs(
     settings: Settings, embedded: broker.EmbeddedBroker | None, *, workers: int, log_level: str
 ) -> list[ChildSpec]:
-    """What standalone runs, dependencies first."""
+    """Processes of standalone, dependencies first."""
     address = (settings.host, settings.port)
     # The broker's password is in the environment of our own processes only: command lines can be read by everybody.
     environment = _environment(settings, embedded, workers=workers)

@@ -39,7 +39,7 @@ _RETRIES = {"max_retries": 3, "retry_timeout": timedelta(seconds=15)}
 _PROBE_TIMEOUTS = {"connect_timeout": timedelta(seconds=3), "timeout": timedelta(seconds=3)}
 _PROBE_RETRIES = {"max_retries": 0}
 
-Fetch = Callable[[str, Path, str], None]  # as `ArtifactStore.fetch`: key, target, sha256
+Fetch = Callable[[str, Path], None]  # as `ArtifactStore.fetch`: key, target
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,6 @@ class StoredObject:
 
     key: str
     changed_us: int
-
-
-def content_mtime_ns(sha256: str) -> int:
-    """A modification time that depends on a file's content alone.
-
-    The engine tells inputs apart by size and modification time; with this one, the same content is the same input on
-    every machine and in every attempt, and finished stages are found again.
-    """
-    return int(sha256[:8], 16) * 1_000_000_000
 
 
 class ArtifactStore:
@@ -80,10 +71,10 @@ class ArtifactStore:
 
     @property
     def folder(self) -> Path | None:
-        """Where the objects lie on this machine, or None where they lie elsewhere."""
+        """Folder of the objects on this machine, or None where they lie elsewhere."""
         return self._root
 
-    def put_file(self, path: Path, key: str, sha256: str, *, durable: bool = True) -> None:
+    def put_file(self, path: Path, key: str, *, durable: bool = True) -> None:
         """Make the file `path` the object `key`; the file is gone afterwards.
 
         Parameters
@@ -97,7 +88,6 @@ class ArtifactStore:
             path.unlink()
             return
         os.chmod(path, 0o440)
-        os.utime(path, ns=(content_mtime_ns(sha256),) * 2)
         target = self._root / key
         try:
             _move(path, target)
@@ -147,7 +137,7 @@ class ArtifactStore:
             return None
         return digest.hexdigest()
 
-    def fetch(self, key: str, target: Path, sha256: str, *, check_stop: Callable[[], None] = lambda: None) -> None:
+    def fetch(self, key: str, target: Path, *, check_stop: Callable[[], None] = lambda: None) -> None:
         """Put the object's bytes at `target`, read-only; without copying where the file system allows.
 
         It may be tried again: where it fails, nothing is left at `target`.
@@ -179,7 +169,6 @@ class ArtifactStore:
                     check_stop()
                     file.write(chunk)
             os.chmod(target, 0o440)
-            os.utime(target, ns=(content_mtime_ns(sha256),) * 2)
 
     def read(self, key: str) -> bytes:
         """The whole object, for small ones.
@@ -231,12 +220,12 @@ class ArtifactStore:
                 obstore.delete(self._store, wanted[i : i + _DELETE_BATCH])
 
     def objects(self) -> Iterator[StoredObject]:
-        """What lies where blobs do, in no order; in a bucket that is shared not all of it is ours."""
+        """List the objects under the blobs' prefix, in no order; in a shared bucket not all of them are ours."""
         if self._root is not None:
             for path in (self._root / _PREFIX).rglob("*"):
                 with contextlib.suppress(FileNotFoundError):
                     status = path.stat()
-                    if path.is_file():  # its mtime is made of its content, its ctime is not
+                    if path.is_file():  # its mtime is that of the file that was put here, its ctime is when it came
                         yield StoredObject(path.relative_to(self._root).as_posix(), status.st_ctime_ns // 1000)
             return
         for batch in obstore.list(self._store, prefix=_PREFIX):

@@ -70,7 +70,7 @@ def store_file(
 
 def _put(artifacts: ArtifactStore, path: Path, key: str, *, sha256: str, size_bytes: int, durable: bool) -> StoredFile:
     boot = None if durable or artifacts.folder is None else boot_id()
-    artifacts.put_file(path, key, sha256, durable=boot is None)
+    artifacts.put_file(path, key, durable=boot is None)
     return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, is_new=True, written_in_boot=boot)
 
 

@@ -1,4 +1,4 @@
-"""Which bytes are in the artifact store, whose they are, and what still needs them."""
+"""Blobs: bytes in the artifact store, their owners, and the records that still need them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _TAKE_SPACE_WITHIN_QUOTA = _TAKE_SPACE.where(Project.used_bytes + bindparam("siz
 
 
 def new_key(project_id: str, sha256: str) -> str:
-    """Where a content that is not stored yet goes in the artifact store."""
+    """Make the key in the artifact store of a content that is not stored yet."""
     return f"blobs/{project_id}/{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
 
 
@@ -66,7 +66,7 @@ def project_of(key: str) -> str | None:
 
 
 def exists(session: Session, project_id: str, sha256: str) -> bool:
-    """Whether the project has this content."""
+    """Return whether the project has this content."""
     found = select(Blob.id).where(Blob.project_id == project_id, Blob.sha256 == sha256)
     return session.scalar(found) is not None
 

@@ -38,7 +38,7 @@ def collect_unused(database: Database, artifacts: ArtifactStore, *, project_id: 
 
 
 def _collect_unused_of(database: Database, artifacts: ArtifactStore, project_id: str) -> int:
-    """What to drop is looked for while others write; a batch is then dropped within one short transaction."""
+    """Find unused blobs while others write, and drop each batch within one short transaction."""
     deleted = 0
     last = ""
     while True:

@@ -259,7 +259,7 @@ def require_space(folder: Path, size_bytes: int, *, min_free_bytes: int) -> None
 
 
 class Writer(Protocol[Written]):
-    """What takes batches, one after the other."""
+    """Writer of batches, one after the other."""
 
     def write(self, *parts: Part) -> None:
         """Append."""

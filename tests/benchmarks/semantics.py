@@ -13,14 +13,13 @@ odd number only: none of them is left out for its own distance to the surface. P
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -249,16 +248,8 @@ def held_out_thickness(mapper: Mapper, parity: int) -> tuple[Thickness, Thicknes
 
 
 def _seen_by(mapper: Mapper, parity: int) -> Mapper:
-    """The model with points from units of one parity only."""
-    half = copy.copy(mapper)
-    half.registered = mapper.registered & (np.arange(len(mapper.registered)) % 2 == parity)
-    half.state = replace(mapper.state, points_m=np.zeros_like(mapper.state.points_m))
-    half.triangulated, half.is_inlier, half.rejected = (
-        np.zeros_like(a) for a in (mapper.triangulated, mapper.is_inlier, mapper.rejected)
-    )
-    half.triangulate()
-    half.filter(mapper.config.mapping.filter_error_px)
-    return half
+    """The mapper with points from units of one parity only."""
+    return mapper.with_points_of(np.arange(len(mapper.registered)) % 2 == parity)
 
 
 def _reconstruct_without(drive: Path, out: Path, *options: str, like: Path) -> None:

@@ -68,7 +68,7 @@ def artifacts(database_settings: Settings) -> ArtifactStore:
 def _put(artifacts: ArtifactStore, tmp_path: Path, key: str) -> str:
     path = tmp_path / "scratch"
     path.write_bytes(b"bytes")
-    artifacts.put_file(path, key, "0" * 64)
+    artifacts.put_file(path, key)
     return key
 
 

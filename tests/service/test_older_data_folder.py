@@ -98,7 +98,7 @@ def finished(service: Standalone, job_id: str) -> dict[str, Any]:
 
     wait_until(has_ended, lambda: f"{service.job(job_id)}\n{service.said()}")
     job = service.job(job_id)
-    assert job["state"] == "SUCCEEDED", job
+    assert job["state"] == "SUCCEEDED", f"{job['problem']}"
     return job
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from mrasfm_engine.aggregation.stages import seam_name
 from schemas.api.jobs import JobKind
 from service.database.connections import Database
 from service.domain import jobs
@@ -31,9 +30,8 @@ def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> 
     database.close()
 
 
-def test_stages_of_pairs_of_scenes_are_called_as_the_engine_calls_them() -> None:
-    """And each pair's by another name, whatever its scenes are called."""
+def test_every_pair_of_scenes_has_a_checkpoint_of_its_own_name() -> None:
     scenes = {name: f"scn_{number}" for number, name in enumerate(("a", "a--b", "b--c", "c"))}
     shelf = MapShelf.from_scenes("map_1", "prj_1", scenes=scenes, settings={})
-    assert set(shelf.digests) == {f"seam-{seam_name(a, b)}.npz" for a, b in permutations(scenes, 2)}
+    assert set(shelf.digests) == {f"seam-{a}~{b}.npz" for a, b in permutations(scenes, 2)}
     assert len(shelf.digests) == len(set(shelf.digests.values())) == 12

@@ -114,11 +114,11 @@ def test_stop_while_the_store_hangs(
         keep(world, shelf, "features.npz", b"a finished stage")
     real = ArtifactStore.fetch
 
-    def fetch(store: ArtifactStore, key: str, target: Path, sha256: str, **options: Any) -> None:
+    def fetch(store: ArtifactStore, key: str, target: Path, **options: Any) -> None:
         if during == "fetch" or target.suffix == ".npz":
             hangs.set()
             go_on.wait(60)
-        real(store, key, target, sha256, **options)
+        real(store, key, target, **options)
 
     monkeypatch.setattr(ArtifactStore, "fetch", fetch)
     thread = threading.Thread(target=Runner(world.settings, shutting_down=stop.is_set).run, args=(job_id,))

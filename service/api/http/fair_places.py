@@ -47,12 +47,12 @@ class FairPlaces:
 
     @property
     def held(self) -> int:
-        """How many places are held."""
+        """Number of held places."""
         return self._held.total()
 
     @property
     def waiting(self) -> int:
-        """How many requests wait."""
+        """Number of waiting requests."""
         return len(self._waiters)
 
     @asynccontextmanager

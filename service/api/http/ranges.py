@@ -59,7 +59,7 @@ def requested_part(headers: Mapping[str, str], *, size_bytes: int, etag: str) ->
 
 
 def none_match(if_none_match: Sequence[str] | None, etag: str) -> bool:
-    """Whether the client has this version already, by all lines of the header."""
+    """Return whether the client has this version already, by all lines of the header."""
     tags = [tag.strip().removeprefix("W/") for line in if_none_match or () for tag in line.split(",")]
     return etag in tags or "*" in tags
 

@@ -1,4 +1,4 @@
-"""What routes answer, for the OpenAPI page: statuses, and the headers that come with them."""
+"""Responses of the routes for the OpenAPI page: statuses, and the headers that come with them."""
 
 from __future__ import annotations
 

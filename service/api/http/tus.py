@@ -25,7 +25,7 @@ _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
 
 @dataclass(frozen=True)
 class Checksum:
-    """Of one request's body."""
+    """Checksum of one request's body."""
 
     algorithm: str
     digest: bytes
@@ -83,7 +83,7 @@ def parse_checksum(given: str | None) -> Checksum | None:
 
 
 def parse_announced(length: str | None, metadata: str | None) -> Announced:
-    """What an upload's creation says: Upload-Length, and in Upload-Metadata `path` or `archive`, `sha256`, `replace`.
+    """Parse an upload's creation: Upload-Length, and in Upload-Metadata `path` or `archive`, `sha256`, `replace`.
 
     Clients that know no better name for it send `filename`; it counts as `path`.
 

@@ -1,4 +1,4 @@
-"""What holds for the body of every request: it is sent as it is, and it keeps coming."""
+"""Rules for the body of every request: it is sent as it is, and it keeps coming."""
 
 from __future__ import annotations
 

@@ -183,7 +183,7 @@ async def commit_drive(drive_id: str, once: IdempotentDep, caller: CallerDep, co
     responses={**gives(200, "What is known so far"), **problems(401, 404)},
 )
 def get_preflight(drive_id: str, caller: CallerDep, context: ContextDep) -> PreflightResource:
-    """What the check of the drive found: of the manifest at once, of the images when its job is done."""
+    """Findings of the check of the drive: of the manifest at once, of the images when its job is done."""
     with context.database.read() as session:
         drive = drives.get(session, caller.project_id, drive_id)
     return PreflightResource(

@@ -49,7 +49,7 @@ def require_open(context: Context, project_id: str, drive_id: str) -> None:
 
 
 def require_room(context: Context, project_id: str, drive_id: str, size_bytes: int | None) -> int:
-    """How many bytes an archive may have; refuses one that comes too late, or is too large for the project's quota.
+    """Return the largest size of an archive; refuse one that comes too late, or is too large for the project's quota.
 
     What the drive has already may come once more: a client that got no answer repeats its request.
 
@@ -159,7 +159,7 @@ def _keep_all(
 
 
 def _same_manifest(context: Context, project_id: str, raw: bytes, stored: bytes) -> bool:
-    """Whether a file is the drive's manifest, perhaps written in another way.
+    """Return whether a file is the drive's manifest, perhaps written in another way.
 
     A large one takes ten times its size while it is parsed, and here there are two: beyond a bound they have to be the
     same bytes.

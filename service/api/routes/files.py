@@ -200,7 +200,7 @@ class _Announced(TypedDict):
 
 
 def _announced(request: Request, context: Context) -> _Announced:
-    """What is known of a body before it comes, and how it may be written."""
+    """Properties of a body that are known before it comes, and how it may be written."""
     if "content-range" in request.headers:
         raise ServiceError(
             400,

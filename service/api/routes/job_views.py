@@ -1,4 +1,4 @@
-"""How a job looks from outside."""
+"""Jobs as the API shows them."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ async def get_readiness(request: Request) -> Ready:
 
 @router.get("/v1/status", summary="How is it?", responses={**gives(200, "Also where it is degraded"), **problems(401)})
 def get_status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
-    """What works and what does not, and what that means for you."""
+    """Status of every part of the service, and its consequence for clients."""
     broker, reasons = True, []
     try:
         context.job_queue.require_broker()

@@ -1,4 +1,4 @@
-"""What requests do to a resumable upload: look how far it is, append to it, end it."""
+"""Requests on a resumable upload: query its offset, append to it, end it."""
 
 from __future__ import annotations
 

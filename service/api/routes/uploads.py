@@ -59,7 +59,7 @@ _PATCH_BODY = {"requestBody": {"required": True, "content": {tus.CONTENT_TYPE: _
 )
 @router.options("/{upload_id}", status_code=204, include_in_schema=False)
 def get_upload_protocol(drive_id: str, caller: CallerDep, context: ContextDep, response: Response) -> None:
-    """Which version and extensions of tus this service speaks, and how large an upload may be."""
+    """Version and extensions of tus that this service speaks, and the largest size of an upload."""
     with context.database.read() as session:
         drives.get(session, caller.project_id, drive_id)
     response.headers["Tus-Version"] = tus.VERSION
@@ -158,7 +158,9 @@ def create_upload(
 async def get_upload_offset(
     drive_id: str, upload_id: str, caller: CallerDep, context: ContextDep, tus_resumable: Resumable = None
 ) -> Response:
-    """Where to go on. All bytes up to `Upload-Offset` are here, also after a crash of the service or its machine."""
+    """Offset from which to go on. All bytes up to `Upload-Offset` are here, also after a crash of the service or its
+    machine.
+    """
     tus.require_version(tus_resumable)
     upload, offset = await current_offset(context, caller.project_id, drive_id, upload_id)
     headers = {**_headers(upload, offset), "Upload-Length": str(upload.size_bytes), "Cache-Control": "no-store"}

@@ -1,4 +1,4 @@
-"""How Alembic reaches the database: over the connection, and within the transaction, of `database.migrate`."""
+"""Alembic's access to the database: over the connection, and within the transaction, of `database.migrate`."""
 
 from __future__ import annotations
 

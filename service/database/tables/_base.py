@@ -1,4 +1,4 @@
-"""What all tables share."""
+"""Common part of all tables."""
 
 from __future__ import annotations
 

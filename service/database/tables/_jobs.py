@@ -12,7 +12,7 @@ from service.database.tables._base import Base, Id, Name, new_id, now_us
 
 
 class JobState(StrEnum):
-    """Where a job is in the database. The last three never change again; STALLED is only shown."""
+    """State of a job in the database. The last three never change again; STALLED is only shown."""
 
     QUEUED = "QUEUED"
     RUNNING = "RUNNING"
@@ -92,7 +92,7 @@ class JobAttempt(Base):
 
 
 class JobEvent(Base):
-    """What a job's event stream says. Ids rise; a reader goes on after the last one it saw."""
+    """Event of a job's stream. Ids rise; a reader goes on after the last one it saw."""
 
     __tablename__ = "job_events"
     __table_args__ = (Index(None, "job_id", "id"), {"sqlite_autoincrement": True})

@@ -9,7 +9,7 @@ from service.database.tables._base import Base, Id, Name, Path, Sha256, new_id, 
 
 
 class Project(Base):
-    """Who shares drives, scenes and quotas."""
+    """Owner of drives, scenes and quotas."""
 
     __tablename__ = "projects"
 

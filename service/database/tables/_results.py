@@ -40,7 +40,7 @@ class SceneFile(Base):
 
 
 class Map(Base):
-    """What aggregations make, version by version.
+    """Result of aggregations, version by version.
 
     One that has no version yet is being made, or failed to be: it goes with the record of the job that tried last.
     """

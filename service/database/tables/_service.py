@@ -1,4 +1,4 @@
-"""What the service notes of itself."""
+"""Records of the service about itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which attempts count against their job.
+"""Attempts that count against their job.
 
 A job that makes the engine fail must end; one whose workers are killed, for reasons of their own, must not. Both are
 retried, by different counts.
@@ -21,7 +21,7 @@ NO_BLAME = 0.0
 
 @dataclass(frozen=True, kw_only=True)
 class RetryLimits:
-    """How often a job is tried.
+    """Limits on the attempts of a job.
 
     Attributes
     ----------
@@ -40,12 +40,12 @@ class RetryLimits:
         return cls(max_attempts=settings.max_attempts, max_losses=settings.max_losses)
 
     def allow(self, *, blame: float, losses: int) -> bool:
-        """Whether a job with these counts is tried once more."""
+        """Return whether a job with these counts is tried once more."""
         return blame < self.max_attempts and losses < self.max_losses
 
 
 def blame_of_loss(*, engine_ran: bool, memory_kills: int | None) -> float:
-    """How much an attempt counts whose process was killed.
+    """Count of an attempt whose process was killed.
 
     Parameters
     ----------

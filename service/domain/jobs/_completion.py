@@ -1,4 +1,4 @@
-"""How an attempt ends, and with it perhaps its job."""
+"""End of an attempt, and with it perhaps of its job."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def fail(
 
 
 def _counts(job: Job, blame: float) -> dict[str, Any]:
-    """What a job has against it after one more attempt."""
+    """Counts against a job after one more attempt."""
     return {"blame": job.blame + blame, "losses": job.losses + (blame == NO_BLAME)}
 
 

@@ -62,7 +62,7 @@ def look_at(session: Session, parent_id: str) -> None:
 
 
 def _hopeless(session: Session, parent: Job, left: int) -> dict[str, Any] | None:
-    """Why no map can come of an aggregation any more; None where it can."""
+    """Reason for which an aggregation can make no map any more; None where it can."""
     asked = parent.request or {}
     members = session.scalars(select(JobMember).where(JobMember.job_id == parent.id).order_by(JobMember.name)).all()
     failed = [member for member in members if member.problem is not None]
@@ -110,7 +110,7 @@ def tell_parents(session: Session, child: Job) -> None:
 
 
 def _tell(session: Session, parent_id: str) -> None:
-    """How far an aggregation's children are, all together; it never falls, also where one begins anew."""
+    """Note the progress of an aggregation's children, all together; it never falls, also where one begins anew."""
     parent = session.get_one(Job, parent_id, populate_existing=True)
     statement = select(JobMember, Job.percent).outerjoin(Job, Job.id == JobMember.child_id)
     rows = session.execute(statement.where(JobMember.job_id == parent_id)).all()

@@ -134,7 +134,7 @@ def heartbeat(session: Session, held: Claim, *, lease_us: int, note: ProgressNot
 
 
 def cancel_requested(session: Session, held: Claim) -> bool:
-    """Whether somebody asked to cancel the job; asked between heartbeats, and writes nothing.
+    """Return whether somebody asked to cancel the job; asked between heartbeats, and writes nothing.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def cancel_requested(session: Session, held: Claim) -> bool:
 
 
 def has_succeeded(session: Session, held: Claim) -> bool:
-    """Whether this holder, and no other, has ended the job as succeeded."""
+    """Return whether this holder, and no other, has ended the job as succeeded."""
     by_holder = (Job.state == JobState.SUCCEEDED) & (Job.fence == held.fence)
     return session.scalar(select(Job.id).where(Job.id == held.job_id, by_holder)) is not None
 

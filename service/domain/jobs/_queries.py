@@ -1,4 +1,4 @@
-"""What all statements on jobs share."""
+"""Common part of all statements on jobs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def close_attempts(session: Session, job_id: str, outcome: str, problem: Mapping
 
 
 def drop_progress(session: Session, job_id: str) -> None:
-    """Of progress only the newest is kept: a long job would else leave a row a second, and every reader get them."""
+    """Drop all progress but the newest: a long job would else leave a row per second, and every reader get them."""
     session.execute(delete(JobEvent).where(JobEvent.job_id == job_id, JobEvent.kind == "progress"))
 
 
@@ -105,7 +105,7 @@ def tell_progress(session: Session, job: Job) -> None:
 
 
 def events_after(session: Session, job_id: str, last_id: int, *, limit: int = 500) -> list[JobEvent]:
-    """What happened to a job after an event, in order."""
+    """Events of a job after one of them, in order."""
     statement = select(JobEvent).where(JobEvent.job_id == job_id, JobEvent.id > last_id)
     return list(session.scalars(statement.order_by(JobEvent.id).limit(limit)))
 

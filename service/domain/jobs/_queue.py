@@ -1,4 +1,4 @@
-"""Which jobs wait for a worker."""
+"""Jobs that wait for a worker."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from service.errors import ServiceError
 
 
 class OfTree(TypedDict, total=False):
-    """What only jobs of an aggregation's tree have."""
+    """Fields of a job in an aggregation's tree."""
 
     map_id: str
     request: dict[str, Any]

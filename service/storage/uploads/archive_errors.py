@@ -1,4 +1,4 @@
-"""How archives are refused: what each code means, and how names of entries are shown."""
+"""Refusals of archives: the meaning of each code, and the form in which names of entries are shown."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _SHOWN_CHARACTERS = 120
 
 
 class Refusal(Enum):
-    """Why an archive is refused: status, code and title of the answer."""
+    """Refusal of an archive: status, code and title of the answer."""
 
     NOT_AN_ARCHIVE = (415, "not-an-archive", "Not an archive")
     DAMAGED = (422, "damaged-archive", "The archive is damaged")

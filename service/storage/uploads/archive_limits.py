@@ -1,4 +1,4 @@
-"""What an archive may hold, and the counting against it."""
+"""Limits on an archive, and the counting against them."""
 
 from __future__ import annotations
 

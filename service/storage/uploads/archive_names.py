@@ -46,7 +46,7 @@ def safe_name(raw: bytes, *, is_folder: bool = False) -> str:
 
 
 def is_ignored(name: str) -> bool:
-    """Whether an operating system put the file there, and nobody misses it."""
+    """Return whether an operating system put the file there, and nobody misses it."""
     parts = name.split("/")
     return _IGNORED_FOLDER in parts[:-1] or parts[-1] in _IGNORED_FILES or parts[-1].startswith("._")
 
@@ -115,7 +115,7 @@ class EntryNames:
 
 
 def may_be_manifest(name: str) -> bool:
-    """Whether the entry can be the drive's manifest, at the root or in one top folder."""
+    """Return whether the entry can be the drive's manifest, at the root or in one top folder."""
     return MANIFEST_NAME in (name, _without_top(name))
 
 

@@ -28,13 +28,13 @@ _OURS = re.compile(r"(upl_[0-9a-f]{30})\.bytes")
 
 
 class Hash(Protocol):
-    """Of hashlib."""
+    """Interface of a hash of hashlib."""
 
     def update(self, data: Part, /) -> None:
         """Take in bytes."""
 
     def digest(self) -> bytes:
-        """Of all so far."""
+        """Digest of all bytes so far."""
 
 
 class PartialFile:
@@ -77,7 +77,7 @@ class PartialFile:
         return os.fstat(self._descriptor).st_size
 
     def offset(self, kept_bytes: int, tail_boot: str | None, boot: str | None) -> int:
-        """How many of the bytes count; the file may be gone with a disk, then none do."""
+        """Number of bytes that count; none where the file is gone with its disk."""
         counts_all = tail_boot is not None and tail_boot == boot
         return self.size() if counts_all else min(kept_bytes, self.size())
 
@@ -199,7 +199,7 @@ def _as_it_is(offset: int) -> int:
 
 
 def new_hash(algorithm: str) -> Hash:
-    """Of an algorithm that tus names."""
+    """Make a hash of an algorithm that tus names."""
     return hashlib.new(algorithm)
 
 

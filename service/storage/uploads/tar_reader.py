@@ -70,7 +70,7 @@ def read_tar(
 
 
 class _Stream(io.BufferedIOBase):
-    """What tarfile reads from: forwards, whole or not at all, and of an entry's headers only so much.
+    """Input of tarfile: forwards, whole or not at all, and of an entry's headers only so much.
 
     The total size and the compression ratio, of the archive and of each entry, are watched.
     """

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -152,14 +153,34 @@ def test_fingerprints_tell_inputs_apart() -> None:
     assert len({fingerprint(*parts) for parts in different}) == len(different)
 
 
-def test_the_drives_fingerprint_follows_its_files_and_manifest(write_drive: Any, drive_document: Any) -> None:
+def of(folder: Path, contents: dict[str, str] | None = None) -> str:
+    return drive_fingerprint(read_drive(folder), contents, threads=2)
+
+
+def test_the_drives_fingerprint_follows_contents_and_manifest(write_drive: Any, drive_document: Any) -> None:
     folder = write_drive(drive_document)
-    first = drive_fingerprint(read_drive(folder))
-    assert first == drive_fingerprint(read_drive(folder))
+    first = of(folder)
     image = next((folder / "images").rglob("*.png"))
+    times = image.stat()
     os.utime(image, ns=(1, 1))
-    touched = drive_fingerprint(read_drive(folder))
-    assert touched != first
+    assert of(folder) == first, "a file that was copied or restored is the same input"
+    data = bytearray(image.read_bytes())
+    data[-1] ^= 1
+    image.write_bytes(data)
+    os.utime(image, ns=(times.st_atime_ns, times.st_mtime_ns))
+    changed = of(folder)
+    assert changed != first, "other bytes of the same size and time are another input"
     drive_document["rig"]["cameras"][0]["params"][0] += 0.001
     (folder / "drive.json").write_text(json.dumps(drive_document), encoding="utf-8")
-    assert drive_fingerprint(read_drive(folder)) not in {first, touched}
+    assert of(folder) not in {first, changed}
+
+
+def test_digests_that_the_caller_knows_stand_for_the_files(write_drive: Any, drive_document: Any) -> None:
+    folder = write_drive(drive_document)
+    read = of(folder)
+    names = [path.relative_to(folder).as_posix() for path in (folder / "images").rglob("*.png")]
+    contents = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    for name in names:
+        (folder / name).unlink()
+    assert of(folder, contents) == read
+    assert of(folder, {**contents, names[0]: "0" * 64}) != read

@@ -1,0 +1,66 @@
+"""Stages of a job and the files that scenes and maps consist of: the names that engine, worker and service share."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Stage(StrEnum):
+    """Stages by the names in progress, reports and problems.
+
+    FETCH and PUBLISH are the worker's, which brings the inputs and stores the results; the others are the engine's.
+    """
+
+    FETCH = "fetch"
+    PREFLIGHT = "preflight"
+    CALIBRATION = "calibration"  # the check of its direction, in a job that checks a drive
+    FEATURES = "features"
+    MATCHES = "matches"
+    MAPPING = "mapping"
+    REFINEMENT = "refinement"
+    SCENES = "scenes"
+    ASSOCIATION = "association"
+    SEAMS = "seams"
+    JOINT = "joint"
+    ADJUSTMENT = "adjustment"
+    PICTURES = "pictures"
+    EXPORT = "export"
+    PUBLISH = "publish"
+
+
+# A finished stage is a file of this folder, inside the scene's or map's. A file of that name is complete.
+CHECKPOINT_FOLDER = ".stages"
+CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING})  # seams are too, each by itself
+
+REPORT_FILE = "report.json"
+MAP_FILE = "map.json"
+PICTURES_FOLDER = "pictures"
+TEXT_MODEL_FOLDER = "model/text"
+SCENES_FOLDER = "scenes"  # of a map: its scenes as an aggregation reads them
+SEAMS_FOLDER = "seams"  # of a map: its seams, for the next version
+BETWEEN_SCENES = "~"  # no name of a scene has it, and URLs and shells take it as it is
+
+
+def checkpoint_file(name: str) -> str:
+    """Name the file of a finished stage, or of anything else that `StageStore` keeps."""
+    return f"{name}.npz"
+
+
+def seam_name(a: str, b: str) -> str:
+    """Name the seam of two scenes, as no other two scenes' is named."""
+    return f"{a}{BETWEEN_SCENES}{b}"
+
+
+def seam_checkpoint(a: str, b: str) -> str:
+    """Name the checkpoint of a seam."""
+    return f"seam-{seam_name(a, b)}"
+
+
+def is_read_by_aggregation(path: str) -> bool:
+    """Return whether an aggregation reads this file of a scene."""
+    return not path.startswith((f"{PICTURES_FOLDER}/", f"{TEXT_MODEL_FOLDER}/"))
+
+
+def is_read_by_next_version(path: str) -> bool:
+    """Return whether an aggregation that goes on from a map's version reads this file of it."""
+    return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))
