@@ -18,7 +18,6 @@ from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.features.extraction import extract_features
-from mrasfm_engine.findings import as_json
 from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
 from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
@@ -42,6 +41,7 @@ from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import CountProgress, StageProgress
 from mrasfm_engine.visualization.pictures import draw_pictures
 from schemas.artifacts import CHECKPOINT_FOLDER, Stage
+from schemas.findings import as_json
 
 PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")

@@ -12,7 +12,6 @@ from mrasfm_engine import stages
 from mrasfm_engine.aggregation import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
-from mrasfm_engine.findings import as_json, error
 from mrasfm_engine.learned.model_folder import default_folder
 from mrasfm_engine.pipeline import reconstruct
 from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
@@ -20,6 +19,7 @@ from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage
+from schemas.findings import as_json, error
 from worker.child_protocol import ChildError, ChildRequest, ChildResult, Work
 from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter

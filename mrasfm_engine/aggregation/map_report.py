@@ -23,10 +23,10 @@ from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.export.calibration import document_in_map
 from mrasfm_engine.export.map import MapContent
 from mrasfm_engine.export.picture_files import png_of
-from mrasfm_engine.findings import warning
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
+from schemas.findings import warning
 
 CONNECTED, BY_POSITIONS = "connected", "placed by positions"
 BEFORE, AFTER = "before", "after"

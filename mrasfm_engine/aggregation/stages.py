@@ -19,11 +19,11 @@ from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.findings import Finding, as_json, warning
 from mrasfm_engine.io.stage_store import StageStore, fingerprint
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.types import CountProgress, StageProgress
 from schemas.artifacts import MAP_FILE, SCENES_FOLDER, SEAMS_FOLDER, Stage, seam_checkpoint, seam_name
+from schemas.findings import Finding, as_json, warning
 
 FAR_APART_M = 50_000.0
 MIN_SCENES = 2

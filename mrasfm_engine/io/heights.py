@@ -13,10 +13,10 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.findings import listed
 from mrasfm_engine.geometry.geodesy import ellipsoidal_from_datum
 from mrasfm_engine.types import Floats
 from schemas import Gnss
+from schemas.findings import listed
 
 
 def ellipsoidal_heights(gnss: Gnss) -> Floats:

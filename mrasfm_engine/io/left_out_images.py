@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.findings import Finding, error, listed, warning
 from mrasfm_engine.scene.drive import Incomplete
+from schemas.findings import Finding, error, listed, warning
 
 NAMED = 20  # files that a finding names; the report names all
 REMEDY = "Copy them again from their source and reconstruct again."

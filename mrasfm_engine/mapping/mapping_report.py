@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.solver import Report
-from mrasfm_engine.findings import Finding
 from mrasfm_engine.mapping import rig_motion
 from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
@@ -21,6 +20,7 @@ from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registra
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.types import Ints
+from schemas.findings import Finding
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 

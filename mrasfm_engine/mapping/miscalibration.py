@@ -10,10 +10,10 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
-from mrasfm_engine.findings import Finding, warning
 from mrasfm_engine.mapping.unit_registration import Registration
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats
+from schemas.findings import Finding, warning
 
 SIGNIFICANT_SIGMAS = 5.0  # of the posterior: less is no correction at all
 BEYOND_PRIOR_SIGMAS = 5.0  # of the prior: what was declared cannot be true

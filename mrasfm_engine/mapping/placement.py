@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.priors import PositionPrior
-from mrasfm_engine.findings import Finding, warning
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
@@ -15,6 +14,7 @@ from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_bas
 from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Floats, Ints
+from schemas.findings import Finding, warning
 
 MIN_CLOCK_OFFSET_S = 0.05
 CLOCK_OFFSET_SIGMAS = 5.0

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.problem import RowBandMotion
-from mrasfm_engine.findings import Finding, warning
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.local_motion import MAX_GAP_S, LocalMotion, local_motion, moved, smoothed_velocity
 from mrasfm_engine.scene.row_bands import MAX_BAND_S, RowBands
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
+from schemas.findings import Finding, warning
 
 PRIOR_WINDOW_S = 1.0  # over which the velocity of noisy prior poses is averaged
 

@@ -7,7 +7,6 @@ import uuid
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError, storage_error
-from mrasfm_engine.findings import Finding, Severity
 from mrasfm_engine.io.axes import manifest_in_flu
 from mrasfm_engine.io.documents import read_parsed
 from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
@@ -15,6 +14,7 @@ from mrasfm_engine.preflight.drive_check import check_drive, require_sound
 from mrasfm_engine.scene.drive import Drive
 from schemas import DriveManifest, parse_manifest, parse_new_manifest
 from schemas.file_names import MANIFEST_NAME
+from schemas.findings import Finding, Severity
 
 __all__ = [
     "MANIFEST_NAME",

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.findings import Finding, Severity, error, listed, warning
 from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_gray
@@ -25,6 +24,7 @@ from mrasfm_engine.io.left_out_images import sample_findings
 from mrasfm_engine.preflight.drive_check import check_drive, is_sound
 from mrasfm_engine.scene.drive import Drive, DriveImage, Incomplete
 from mrasfm_engine.types import Bytes, CountProgress, Floats, Floats32
+from schemas.findings import Finding, Severity, error, listed, warning
 
 Item = TypeVar("Item")
 

@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.findings import Finding, Severity, error, listed, warning
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
 from mrasfm_engine.io.images import check_image_header, check_mask_header, read_mask
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import CountProgress
+from schemas.findings import Finding, Severity, error, listed, warning
 
 MASK_THREADS = 4
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -276,6 +276,17 @@ def test_the_check_runs_nothing_of_the_working_directory_and_knows_no_secret(
     assert "secret" not in environment.values()
 
 
+def test_a_commit_needs_nothing_of_the_engine(client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = tmp_path / "site"
+    (folder / "mrasfm_engine").mkdir(parents=True)
+    (folder / "mrasfm_engine" / "__init__.py").write_text("raise ImportError('there is no engine on this machine')")
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    drive_id = client.filled(tiny_drive(frames=1))
+    problem = problem_of(client.post(f"/v1/drives/{drive_id}:commit"), 422, "drive-rejected")
+    assert {finding["code"] for finding in problem["findings"]} >= {"too-few-frames"}
+    client.committed()
+
+
 def test_slow_checks_leave_the_api_to_others(client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """More commits at once than the API has threads."""
     go_on = tmp_path / "go on"

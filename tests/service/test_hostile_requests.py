@@ -219,7 +219,7 @@ def test_what_the_engine_finds_in_the_manifest_is_said_in_its_words(
 
 
 def engine_findings(path: Path) -> list[dict[str, Any]]:
-    command = [sys.executable, "-m", "mrasfm_engine.commands.preflight", "--manifest-only", "--json", str(path)]
+    command = [str(Path(sys.executable).with_name("mrasfm")), "preflight", "--manifest-only", "--json", str(path)]
     done = subprocess.run(command, capture_output=True, check=False)
     findings: list[dict[str, Any]] = json.loads(done.stdout)["findings"]
     return findings

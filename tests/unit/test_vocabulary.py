@@ -1,4 +1,4 @@
-"""The product speaks the vocabulary of docs/development/naming.md, has no import cycle and no copied function."""
+"""The product speaks as docs/development/naming.md says, has no import cycle and no copied function."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ _OLD_NAMES = """
     parent_death unusable_database follow Told plugins search matching settle adjustment correspondence persistence
 """
 OLD_NAMES = frozenset(_OLD_NAMES.split())
+NO_BEGINNINGS = {"What", "Who", "Where", "Of", "Whether", "How", "Which", "Why"}
 OLD_BEGINNINGS = ("judge_", "settle_", "settled_")
 # Names of the list that the vocabulary gives to a room, by the room's section of the settings.
 ROOMS = {("mrasfm_engine/config.py", "matching")}
@@ -61,6 +62,19 @@ def test_no_old_name_is_left(package: str) -> None:
         if (name in OLD_NAMES or name.startswith(OLD_BEGINNINGS))
         and (path, name) not in ROOMS
         and not (line == 0 and name == "matching")
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_docstrings_begin_with_what_they_describe(package: str) -> None:
+    found = [
+        f"{path}: {docstring.splitlines()[0]}"
+        for path, tree in _trees().items()
+        if path.startswith(f"{package}/")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if (docstring := ast.get_docstring(node)) and docstring.split()[0] in NO_BEGINNINGS
     ]
     assert found == []
 

@@ -14,9 +14,9 @@ from mrasfm_engine.cli import main
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE, ModelFolder
-from mrasfm_engine.preflight.drive_check import check_manifest
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import BodyAxes, Pose
+from schemas.manifest_check import check_manifest
 from schemas.parsing import parse_manifest
 from service.domain.jobs import ProgressNote
 from service.settings import Settings

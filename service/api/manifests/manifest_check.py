@@ -1,14 +1,9 @@
-"""The check of a manifest before its drive is frozen.
-
-It is the engine's own check, in the engine's own words, and runs in a process of its own: the API never imports the
-engine.
-"""
+"""The check of a manifest before its drive is frozen: `schemas.manifest_check`, in a process of its own."""
 
 from __future__ import annotations
 
 import json
 import logging
-import secrets
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,7 +20,7 @@ log = logging.getLogger("mrasfm.api")
 Result = TypeVar("Result")
 
 # -P: the working directory holds files from outside and is no place to import from.
-_COMMAND = (sys.executable, "-P", "-m", "mrasfm_engine.commands.preflight", "--manifest-only", "--accepted", "--json")
+_COMMAND = (sys.executable, "-P", "-m", "schemas.manifest_check")
 _MEMORY_MB = 800  # 100,000 frames of 6 cameras take 700; hostile JSON unpacks to a hundred times its bytes
 _TIMEOUT_S = 120
 
@@ -54,31 +49,18 @@ def checked_manifest(context: Context, key: str) -> list[Finding]:
     """
     folder = context.settings.spool_dir
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    path = folder / f"{secrets.token_hex(16)}.part"
-    try:
-        raw = stored_manifest(context, key)
-        path.write_bytes(raw)
-        return _findings(path, len(raw))
-    finally:
-        path.unlink(missing_ok=True)
-
-
-def _findings(path: Path, size_bytes: int) -> list[Finding]:
-    command = [*_COMMAND, "--max-memory-mb", str(_MEMORY_MB), str(path)]
+    raw = stored_manifest(context, key)
     bounds = Bounds(memory_mb=_MEMORY_MB, timeout_s=_TIMEOUT_S)
-    findings = result_of(command, _told, bounds, size_bytes=size_bytes, folder=path.parent)
-    if any(finding.code == "bad-size" for finding in findings):
-        raise _too_large(bounds)
-    return findings
+    return result_of([*_COMMAND, str(_MEMORY_MB)], _findings_in, bounds, size_bytes=len(raw), folder=folder, given=raw)
 
 
-def _told(output: bytes) -> list[Finding]:
+def _findings_in(output: bytes) -> list[Finding]:
     return [Finding.model_validate(finding) for finding in json.loads(output)["findings"]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """What a program may take for a manifest. Its time is bounded here, its memory by itself."""
+    """Bounds of a program that reads a manifest. Its time is bounded here, its memory by itself."""
 
     memory_mb: float
     timeout_s: float
@@ -93,7 +75,7 @@ def result_of(
     folder: Path,
     given: bytes = b"",
 ) -> Result:
-    """What a program finds in a manifest, read from its output; other parameters are those of `run_on_document`.
+    """Run a program on a manifest and read its output; other parameters are those of `run_on_document`.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def write(header: dict[str, Any]) -> None:
 
 
 def result_in(output: bytes) -> ManifestFacts:
-    """What the program found, from its output.
+    """Read the facts from the program's output.
 
     The files stay as they are there, and take no more memory: as texts they would take ten times as much.
 

@@ -9,8 +9,8 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.preflight.drive_reader import Severity, check_drive, read_drive
-from mrasfm_engine.preflight.gnss import check_gnss
 from mrasfm_engine.scene.drive import Drive, matrix_from_pose
+from schemas.manifest_check import check_manifest
 
 pytestmark = pytest.mark.real
 
@@ -53,7 +53,7 @@ def test_stereo_pair_is_left_and_right(shared_data: Path, tmp_path: Path) -> Non
 
 def test_gnss_outliers_are_named(shared_data: Path, tmp_path: Path) -> None:
     drive, _ = imported(shared_data / "kitti06", tmp_path / "drive")
-    findings = check_gnss(drive)
+    findings = check_manifest(drive.manifest)
     assert [f.code for f in findings] == ["gnss-jump"]
     assert "gnss.samples.13, gnss.samples.14, gnss.samples.37" in findings[0].what
 

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.cli import main
-from mrasfm_engine.commands import preflight
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.findings import Finding
 from mrasfm_engine.io.images import read_image_gray
 from mrasfm_engine.preflight import image_content
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import MAX_IMAGES, check_content, inspect_drive
+from schemas.findings import Finding
 from tests.helpers.damaged_images import cut
 
 WIDTH, HEIGHT = 320, 200
@@ -192,7 +191,7 @@ def test_one_camera_that_repeats_itself_is_no_standing(make_drive: Callable[...,
 def test_standing_all_the_time(make_drive: Callable[..., Path], gnss: Callable[[int], float] | None) -> None:
     root = make_drive(speed_px=lambda frame: 0.0, gnss=gnss)
     assert codes_of(root) == [("error", "standing-still")]
-    assert preflight.main([str(root)]) == 2
+    assert main(["preflight", str(root)]) == 2
     assert main(["reconstruct", str(root), "--out", str(root.parent / "scene")]) == 2
 
 

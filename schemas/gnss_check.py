@@ -1,16 +1,12 @@
-"""Checks a drive's GNSS samples before hours of work rest on them."""
+"""Check of a drive's GNSS samples, before hours of work rest on them."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mrasfm_engine.errors import InputError
-from mrasfm_engine.findings import Finding, error, listed, warning
-from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
-from mrasfm_engine.io.heights import ellipsoidal_heights
-from mrasfm_engine.scene.drive import Drive
-from mrasfm_engine.types import Bools, Floats, Ints
-from schemas import Gnss
+from schemas.drive import DriveManifest, Gnss
+from schemas.findings import Finding, error, listed, warning
 
 # Between GPS time and UTC: 18 s since 2017; a neighbouring value betrays an old table of leap seconds.
 LEAP_SECONDS = (18, 17, 19)
@@ -19,11 +15,22 @@ JUMP_SIGMAS = 4.0
 # Positions this far beyond the first or last sample can be extrapolated: in samples, and at most in time.
 EXTRAPOLATED_SAMPLES = 1.5
 MAX_EXTRAPOLATION_US = 2_000_000
+WGS84_A_M, WGS84_E2 = 6_378_137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 
-def check_gnss(drive: Drive) -> list[Finding]:
-    """Findings about the manifest's GNSS samples; none if it has no `gnss`."""
-    gnss = drive.manifest.gnss
+def check_gnss(manifest: DriveManifest, image_times_us: NDArray[np.int64]) -> list[Finding]:
+    """List the findings about the manifest's GNSS samples; none if it has no `gnss`.
+
+    Parameters
+    ----------
+    image_times_us
+        Timestamps (images,).
+    """
+    gnss = manifest.gnss
     if gnss is None:
         return []
     if not gnss.samples:
@@ -34,12 +41,7 @@ def check_gnss(drive: Drive) -> list[Finding]:
     findings = _check_order(times)
     if findings:
         return findings  # the rest assumes an order
-    try:
-        heights = ellipsoidal_heights(gnss)
-    except InputError as problem:
-        return [error(problem.code, problem.what, problem.remedy), *_check_cover(drive, times)]
-    positions = _positions(gnss, heights, swapped=False)
-    return [*_check_cover(drive, times), *_check_jumps(gnss, times, positions), *_check_swapped(drive, times, heights)]
+    return [*_check_cover(image_times_us, times), *_check_jumps(gnss, times), *_check_swapped(manifest, times)]
 
 
 def _check_order(times: Ints) -> list[Finding]:
@@ -67,11 +69,6 @@ def _check_order(times: Ints) -> list[Finding]:
     return findings
 
 
-def _image_times(drive: Drive) -> Ints:
-    times = [image.timestamp_us for image in drive.images]
-    return np.array(times, dtype=np.int64) if times else drive.timestamps_us
-
-
 def _covered(images: Ints, samples: Ints) -> Bools:
     spacing = float(np.median(np.diff(samples))) if len(samples) > 1 else 0.0
     slack = min(EXTRAPOLATED_SAMPLES * spacing, MAX_EXTRAPOLATION_US)
@@ -79,8 +76,7 @@ def _covered(images: Ints, samples: Ints) -> Bools:
     return covered
 
 
-def _check_cover(drive: Drive, times: Ints) -> list[Finding]:
-    images = _image_times(drive)
+def _check_cover(images: Ints, times: Ints) -> list[Finding]:
     covered = _covered(images, times)
     if covered.all():
         return []
@@ -118,18 +114,34 @@ def _seconds(time_us: np.int64) -> str:
     return f"{int(time_us) / 1e6:.3f}"
 
 
-def _positions(gnss: Gnss, heights: Floats, *, swapped: bool) -> Floats:
-    """Local east, north, up (samples, 3) at the first sample, metres; `swapped` exchanges latitude and longitude."""
-    latitude = np.array([sample.latitude_deg for sample in gnss.samples])
-    longitude = np.array([sample.longitude_deg for sample in gnss.samples])
-    geodetic = np.stack([longitude, latitude, heights] if swapped else [latitude, longitude, heights], -1)
-    return local_from_geodetic(geodetic, ecef_from_local(geodetic[0]))
+def _positions(gnss: Gnss, *, swapped: bool) -> Floats:
+    """Local east and north (samples, 2) at the first sample, metres; `swapped` exchanges latitude and longitude.
+
+    Heights may count from any datum: a difference of 100 m changes these distances by 2e-5 of them.
+    """
+    degrees = np.array([(sample.latitude_deg, sample.longitude_deg) for sample in gnss.samples])
+    latitude, longitude = np.radians(degrees[:, ::-1] if swapped else degrees).T
+    height = np.array([sample.height_m for sample in gnss.samples])
+    # Earth-centred coordinates on WGS84's ellipsoid.
+    normal = WGS84_A_M / np.sqrt(1 - WGS84_E2 * np.sin(latitude) ** 2)
+    ecef = np.stack(
+        [
+            (normal + height) * np.cos(latitude) * np.cos(longitude),
+            (normal + height) * np.cos(latitude) * np.sin(longitude),
+            (normal * (1 - WGS84_E2) + height) * np.sin(latitude),
+        ],
+        -1,
+    )
+    sin_lat, cos_lat, sin_lon, cos_lon = (f(v) for v in (latitude[0], longitude[0]) for f in (np.sin, np.cos))
+    east, north = (-sin_lon, cos_lon, 0.0), (-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat)
+    result: Floats = (ecef - ecef[0]) @ np.array([east, north]).T
+    return result
 
 
-def _check_jumps(gnss: Gnss, times: Ints, positions: Floats) -> list[Finding]:
+def _check_jumps(gnss: Gnss, times: Ints) -> list[Finding]:
     sigma = np.array([sample.sigma_horizontal_m for sample in gnss.samples])
     seconds = np.diff(times) / 1e6
-    distance = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    distance = np.linalg.norm(np.diff(_positions(gnss, swapped=False), axis=0), axis=1)
     excess = distance - JUMP_SIGMAS * np.hypot(sigma[1:], sigma[:-1])
     jumps = np.flatnonzero(excess > MAX_SPEED_MPS * seconds) + 1
     if not len(jumps):
@@ -146,9 +158,9 @@ def _check_jumps(gnss: Gnss, times: Ints, positions: Floats) -> list[Finding]:
     ]
 
 
-def _check_swapped(drive: Drive, times: Ints, heights: Floats) -> list[Finding]:
+def _check_swapped(manifest: DriveManifest, times: Ints) -> list[Finding]:
     """Compares the track with the rough poses: swapped latitude and longitude mirror and stretch it."""
-    gnss, rough = drive.manifest.gnss, drive.manifest.rough_poses
+    gnss, rough = manifest.gnss, manifest.rough_poses
     assert gnss is not None
     if rough is None or max(abs(sample.longitude_deg) for sample in gnss.samples) > 90:
         return []
@@ -158,7 +170,7 @@ def _check_swapped(drive: Drive, times: Ints, heights: Floats) -> list[Finding]:
         return []
     track = np.array([pose.world_from_rig.translation_m[:2] for pose in rough.poses])[inside]
     residual = {
-        swapped: _misfit(track, _at(rough_times[inside], times, _positions(gnss, heights, swapped=swapped)[:, :2]))
+        swapped: _misfit(track, _at(rough_times[inside], times, _positions(gnss, swapped=swapped)))
         for swapped in (False, True)
     }
     noise = float(np.median([sample.sigma_horizontal_m for sample in gnss.samples])) + rough.sigma_translation_m

@@ -1,0 +1,260 @@
+"""Check of a drive's manifest: errors and oddities that show without opening a file.
+
+`python -m schemas.manifest_check MEGABYTES` checks the manifest in its standard input, within so much more memory than
+it begins with, and prints the findings as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.drive import BodyAxes, DriveManifest, Pose
+from schemas.findings import Finding, Severity, as_json, error, listed, warning
+from schemas.gnss_check import check_gnss
+from schemas.parsing import DocumentError, parse_manifest
+
+MAX_UNSYNCHRONISED_US = 60_000  # nuScenes' cameras are up to 50 ms apart
+MIN_FRAME_INTERVAL_US = 1_000
+MAX_FRAME_INTERVAL_US = 20_000_000
+MAX_CAMERA_ROLL_DEG = 60.0
+
+_UP_IN_BODY = {BodyAxes.FLU: (0, 0, 1), BodyAxes.RDF: (0, -1, 0), BodyAxes.FRD: (0, 0, -1)}
+
+
+def check_manifest(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Finding]:
+    """List the errors and oddities of a drive that its manifest shows; no file is opened.
+
+    Parameters
+    ----------
+    manifest
+        In any body axes.
+    use_gnss
+        The reconstruction will use the drive's GNSS.
+
+    Returns
+    -------
+    list of Finding
+        Errors first. With any error the drive cannot be reconstructed.
+    """
+    recorded = _Recorded(manifest)
+    return errors_first(
+        [
+            *_check_frames(recorded),
+            *_check_times(recorded),
+            *_check_rig(manifest),
+            *_check_scale(recorded, use_gnss=use_gnss),
+            *_check_rough_poses(recorded),
+            *(check_gnss(manifest, recorded.image_times_us) if use_gnss else []),
+        ]
+    )
+
+
+def errors_first(findings: list[Finding]) -> list[Finding]:
+    """Sort errors before warnings, otherwise in their order."""
+    return sorted(findings, key=lambda finding: finding.severity is not Severity.ERROR)
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """Times and cameras of a manifest's images."""
+
+    manifest: DriveManifest
+
+    @cached_property
+    def timestamps_us(self) -> NDArray[np.int64]:
+        """Timestamps (frames,)."""
+        return np.array([frame.timestamp_us for frame in self.manifest.frames], dtype=np.int64)
+
+    @property
+    def images(self) -> Iterator[tuple[str, str, int, int]]:
+        """Camera, file, timestamp and the frame's timestamp of every image."""
+        for frame in self.manifest.frames:
+            for camera, image in frame.images.items():
+                own = frame.timestamp_us if image.timestamp_us is None else image.timestamp_us
+                yield camera, image.file, own, frame.timestamp_us
+
+    @cached_property
+    def used_cameras(self) -> set[str]:
+        """Cameras with images."""
+        return {camera for camera, *_ in self.images}
+
+    @cached_property
+    def image_times_us(self) -> NDArray[np.int64]:
+        """Timestamps of all images, or of the frames where there is no image."""
+        times = [own for _, _, own, _ in self.images]
+        return np.array(times, dtype=np.int64) if times else self.timestamps_us
+
+
+def _check_frames(recorded: _Recorded) -> list[Finding]:
+    frames = recorded.manifest.frames
+    empty = [f"frames.{i}" for i, frame in enumerate(frames) if not frame.images]
+    findings = []
+    if len(frames) - len(empty) < 2:
+        findings.append(
+            error(
+                "too-few-frames",
+                f"drive {recorded.manifest.name!r} has {len(frames) - len(empty)} frames with images",
+                "Give at least two frames: structure comes from motion.",
+            )
+        )
+    if empty:
+        findings.append(
+            warning("frame-without-images", f"no images in {listed(empty)}", "Take these frames out of drive.json.")
+        )
+    unused = [camera.name for camera in recorded.manifest.rig.cameras if camera.name not in recorded.used_cameras]
+    if unused and recorded.used_cameras:
+        findings.append(
+            warning("camera-without-images", f"no images of camera {listed(unused)}", "Take it out of the rig.")
+        )
+    return findings
+
+
+def _check_times(recorded: _Recorded) -> list[Finding]:
+    findings = []
+    if len(recorded.timestamps_us) > 1:
+        median = float(np.median(np.diff(recorded.timestamps_us)))
+        unit = ""
+        if median < MIN_FRAME_INTERVAL_US:
+            unit = "milliseconds"
+        elif median > MAX_FRAME_INTERVAL_US:
+            unit = "nanoseconds"
+        if unit:
+            findings.append(
+                error(
+                    "frame-rate",
+                    f"frames are {median / 1e6:g} s apart: their timestamps look like {unit}",
+                    "Give frames.timestamp_us in microseconds, and the samples of gnss and rough_poses too.",
+                )
+            )
+    off = [
+        (abs(own - of_frame), file)
+        for _, file, own, of_frame in recorded.images
+        if abs(own - of_frame) > MAX_UNSYNCHRONISED_US
+    ]
+    if off:
+        worst = max(off)
+        findings.append(
+            warning(
+                "unsynchronised",
+                f"{len(off)} images are over {MAX_UNSYNCHRONISED_US // 1000} ms from their frame's time, most "
+                f"{worst[1]} with {worst[0] / 1000:.0f} ms",
+                "Put images into the frame that is nearest in time.",
+            )
+        )
+    return findings
+
+
+def _check_rig(manifest: DriveManifest) -> list[Finding]:
+    """Cameras stand about upright on a vehicle; if none does, the rig's axes are not what was said."""
+    up = np.array(_UP_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
+    turned = [
+        camera.name
+        for camera in manifest.rig.cameras
+        if _image_up(camera.rig_from_cam) @ up < np.cos(np.radians(MAX_CAMERA_ROLL_DEG))
+    ]
+    if not turned:
+        return []
+    what = f"camera {listed(turned)} is turned by over {MAX_CAMERA_ROLL_DEG:g} degrees against the vehicle's upright"
+    remedy = (
+        "Check rig.body_axes and that rig_from_cam is the camera's pose in the rig, not its inverse; camera axes are "
+        "x right, y down, z forward."
+    )
+    if len(turned) == len(manifest.rig.cameras):
+        return [error("rig-axes", what, remedy)]
+    return [warning("camera-turned", what, remedy)]
+
+
+def _check_scale(recorded: _Recorded, *, use_gnss: bool) -> list[Finding]:
+    if len(recorded.used_cameras) > 1:
+        return []
+    gnss = use_gnss and recorded.manifest.gnss is not None
+    if gnss or recorded.manifest.rough_poses is not None:
+        source = "GNSS" if gnss else "the rough poses"
+        return [
+            warning(
+                "scale-not-from-rig",
+                f"the drive has images of one camera only: its scale comes from {source} alone",
+                "Give the images of all cameras for a scale that the rig's baselines confirm.",
+            )
+        ]
+    return [
+        error(
+            "no-metric-scale",
+            "the drive has images of one camera only and neither GNSS nor rough poses: nothing gives it a scale",
+            "Give a second camera, GNSS or rough poses.",
+        )
+    ]
+
+
+def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
+    rough = recorded.manifest.rough_poses
+    if rough is None:
+        return []
+    times = np.array([pose.timestamp_us for pose in rough.poses], dtype=np.int64)
+    wrong = np.flatnonzero(np.diff(times) <= 0) + 1
+    if len(wrong):
+        i = int(wrong[0])
+        return [
+            error(
+                "rough-poses-order",
+                f"rough_poses.poses.{i}.timestamp_us {times[i]} does not come after the pose before it",
+                "Sort the rough poses by time and give every one its own timestamp.",
+            )
+        ]
+    units = recorded.timestamps_us
+    covered = (units >= times[0] - MAX_UNSYNCHRONISED_US) & (units <= times[-1] + MAX_UNSYNCHRONISED_US)
+    if not covered.any():
+        return [
+            error(
+                "rough-poses-not-covering",
+                f"the rough poses span {times[0] / 1e6:.3f} to {times[-1] / 1e6:.3f} s, the frames "
+                f"{units[0] / 1e6:.3f} to {units[-1] / 1e6:.3f} s",
+                "Give rough poses of the drive's time, or leave them out.",
+            )
+        ]
+    if not covered.all():
+        what = f"{int((~covered).sum())} of {len(units)} frames are outside the rough poses' time"
+        return [warning("rough-poses-partial", what, "Give rough poses of the drive's whole time.")]
+    return []
+
+
+def _image_up(rig_from_cam: Pose) -> NDArray[np.float64]:
+    """The image's upward direction (3,) in the rig: -y of the camera."""
+    x, y, z, w = np.array(rig_from_cam.rotation_xyzw) / np.linalg.norm(rig_from_cam.rotation_xyzw)
+    return np.array([-2 * (x * y - z * w), 2 * (x * x + z * z) - 1, -2 * (y * z + x * w)])
+
+
+def main() -> None:
+    """Print the findings of the manifest in the standard input."""
+    _bound_memory(int(sys.argv[1]))
+    try:
+        findings = check_manifest(parse_manifest(sys.stdin.buffer.read()))
+    except DocumentError as problem:
+        fields = ", ".join(p.path for p in problem.problems[:3] if p.path) or "the file"
+        findings = [error("bad-document", f"drive manifest: {problem}", f"Correct {fields}.")]
+    print(json.dumps({"findings": [as_json(finding) for finding in findings]}, allow_nan=False))
+
+
+def _bound_memory(megabytes: int) -> None:
+    """Let this process take so much more memory than it has now.
+
+    Small JSON can unpack to a hundred times its bytes. Where memory is refused to Python it raises MemoryError; where
+    to pydantic, that aborts the process.
+    """
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    bound = pages * resource.getpagesize() + megabytes * 1_000_000
+    resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+if __name__ == "__main__":
+    main()
