@@ -1,17 +1,17 @@
 """The service as a Python library: what `mrasfm upload` is made of.
 
 >>> from pathlib import Path
->>> from service.client import Client, DriveFolder, download_scene, watch_job, start_reconstruction, upload_drive
+>>> from service.client import Client, DriveFolder, download, watch_job, start_reconstruction, upload_drive
 >>> with Client("https://maps.example.org", key) as client:  # doctest: +SKIP
 ...     sent = upload_drive(client, DriveFolder.read(Path("my-drive")))
 ...     job = watch_job(client, start_reconstruction(client, sent.drive_id).id)
-...     download_scene(client, job.scene_id, Path("my-scene"))
+...     download(client, client.scene(job.scene_id), Path("my-scene"))
 
 What can go wrong is a `ClientError`: an `ApiError` carries the problem that the service answered with.
 """
 
-from service.client.api import Client, JobEvent
-from service.client.download import Downloaded, download_map, download_scene
+from service.client.api import Client, JobEvent, Result
+from service.client.download import Downloaded, download
 from service.client.drive_folder import DriveFolder, LocalFile
 from service.client.errors import ApiError, ClientError, DriveFolderError, SceneFolderError, UnreachableError
 from service.client.job_watcher import ENDED, JobNews, watch_job
@@ -30,12 +30,12 @@ __all__ = [
     "JobEvent",
     "JobNews",
     "LocalFile",
+    "Result",
     "SceneFolderError",
     "Sent",
     "UnreachableError",
     "UploadState",
-    "download_map",
-    "download_scene",
+    "download",
     "scene_findings",
     "start_aggregation",
     "start_reconstruction",

@@ -8,7 +8,6 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, TypeVar
 from urllib.parse import quote
 
@@ -18,11 +17,12 @@ from pydantic import BaseModel, ValidationError
 from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource
 from schemas.api.jobs import JobResource, ReconstructionSettings
-from schemas.api.maps import MapVersionResource
-from schemas.api.scenes import SceneResource
+from schemas.api.maps import MapFileResource, MapVersionResource
+from schemas.api.scenes import SceneFileResource, SceneResource
 from schemas.api.status import ServiceStatus
 from schemas.api.uploads import UploadResource
 from service.client.drive_folder import LocalFile
+from service.client.errors import ClientError
 from service.client.transport import (
     CHECK_TIMEOUT_S,
     IO_TIMEOUT_S,
@@ -35,6 +35,8 @@ from service.client.transport import (
 from service.digests import format_digest
 
 Model = TypeVar("Model", bound=BaseModel)
+Result = SceneResource | MapVersionResource
+ResultFile = SceneFileResource | MapFileResource
 RETRY_S = 300.0  # a service that is being restarted, or moved
 FIRST_RETRY_S = 6.0
 _TUS = {"Tus-Resumable": "1.0.0"}
@@ -89,9 +91,7 @@ class Client:
     def __enter__(self) -> Client:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -111,6 +111,11 @@ class Client:
     def stopped(self) -> bool:
         """`stop` or `close` was called."""
         return self._transport.closing.is_set()
+
+    def require_open(self, what: str) -> None:
+        """Raise ClientError where `stop` or `close` was called."""
+        if self.stopped:
+            raise ClientError(f"the {what} was interrupted")
 
     def pause(self, seconds: float) -> None:
         """Sleep, unless the client is closed."""
@@ -226,27 +231,24 @@ class Client:
         return self._get(f"/v1/maps/{_part(map_id)}/versions/{number}", MapVersionResource)
 
     @contextmanager
-    def open_file(
-        self, resource: str, path: str, *, sha256: str, start: int = 0
-    ) -> Iterator[tuple[int, Iterator[bytes]]]:
+    def open_file(self, result: Result, file: ResultFile, *, start: int = 0) -> Iterator[tuple[int, Iterator[bytes]]]:
         """A file of a scene or of a map's version, from byte `start` on where it still is this one. One try.
-
-        Parameters
-        ----------
-        resource
-            Its path, such as `/v1/scenes/ID`.
 
         Yields
         ------
         start, pieces
             Where the pieces begin: 0 where the service sends the file from its beginning.
         """
-        headers = {} if start == 0 else {"Range": f"bytes={start}-", "If-Range": f'"{sha256}"'}
-        with self._transport.open("GET", f"{resource}/files/{quote(path)}", headers=headers) as response:
+        headers = {} if start == 0 else {"Range": f"bytes={start}-", "If-Range": f'"{file.sha256}"'}
+        with self._transport.open("GET", _file_path(result, file), headers=headers) as response:
             partial = response.status_code == httpx.codes.PARTIAL_CONTENT
             if partial and not response.headers.get("content-range", "").startswith(f"bytes {start}-"):
                 raise unexpected(response, "the part of the file that was asked for")
             yield (start if partial else 0), response.iter_bytes()
+
+    def read_file(self, result: Result, file: ResultFile) -> bytes:
+        """Bytes of a small file of a scene or of a map's version."""
+        return self._transport.request("GET", _file_path(result, file)).content
 
     def create_upload(self, drive_id: str, size_bytes: int, metadata: Mapping[str, str]) -> str:
         """Begin a resumable upload; its id."""
@@ -302,6 +304,12 @@ def _part(identifier: str) -> str:
 
 def _upload_path(drive_id: str, upload_id: str) -> str:
     return f"/v1/drives/{_part(drive_id)}/uploads/{_part(upload_id)}"
+
+
+def _file_path(result: Result, file: ResultFile) -> str:
+    if isinstance(result, SceneResource):
+        return f"/v1/scenes/{_part(result.id)}/files/{quote(file.path)}"
+    return f"/v1/maps/{_part(result.map_id)}/versions/{result.number}/files/{quote(file.path)}"
 
 
 def _parsed(response: httpx.Response, model: type[Model]) -> Model:

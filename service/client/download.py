@@ -1,32 +1,28 @@
-"""Bringing a scene into a folder: resumed where it was interrupted, every byte checked, complete or visibly not."""
+"""Download of a scene or map: resumed where it was interrupted, every byte checked, complete or visibly not."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
-from urllib.parse import quote
 
 from pydantic import TypeAdapter, ValidationError
 
-from schemas.api.maps import MapFileResource, MapVersionResource
-from schemas.api.scenes import SceneFileResource
+from schemas.api.scenes import SceneResource
+from schemas.artifacts import REPORT_FILE
 from schemas.drive import RelativePath
-from service.client.api import Client
-from service.client.errors import ClientError, SceneFolderError
-from service.client.parallel import Meter, Report, in_parallel, no_report
+from service.client.api import Client, Result, ResultFile
+from service.client.errors import SceneFolderError
+from service.client.parallel import FileMeter, Meter, Report, in_parallel, no_report
 from service.client.transport import TroubleError
 from service.storage.data_folder import write_private_file
 
 OWN_PREFIX = ".mrasfm-"
 MARKER_NAME = f"{OWN_PREFIX}scene.json"  # says which scene the folder is of
-REPORT_NAME = "report.json"  # written last: a folder with it is complete, as the engine's own are
 PARALLEL = 4
-ResultFile = SceneFileResource | MapFileResource
 _relative_path = TypeAdapter(RelativePath)
 
 
@@ -39,64 +35,33 @@ class Downloaded:
     files_skipped: int
 
 
-def download_scene(
-    client: Client, scene_id: str, out: Path, *, parallel: int = PARALLEL, report: Report = no_report
+def download(
+    client: Client, result: Result, out: Path, *, parallel: int = PARALLEL, report: Report = no_report
 ) -> Downloaded:
-    """Bring all files of a scene into `out`.
+    """Bring all files of a scene or of a map's version into `out`.
 
     Files that are there, whole and unchanged, are not brought again, and one that was interrupted goes on where it was.
 
     Raises
     ------
     SceneFolderError
-        Where `out` holds something else, the scene's file names lead out of it, or what arrives is damaged.
+        Where `out` holds something else, the file names lead out of it, or what arrives is damaged.
     ApiError
-        There is no such scene.
+        The result is not there any more.
     UnreachableError
         The service does not answer.
     """
-    scene = client.scene(scene_id)
-    resource = f"/v1/scenes/{quote(scene_id, safe='')}"
-    return _bring(_Result(client, scene_id, f"scene {scene_id}", resource, scene.files), out, parallel, report)
-
-
-def download_map(
-    client: Client,
-    version: MapVersionResource,
-    out: Path,
-    *,
-    parallel: int = PARALLEL,
-    report: Report = no_report,
-) -> Downloaded:
-    """Bring all files of a map's version into `out`; as `download_scene`."""
-    resource = f"/v1/maps/{quote(version.map_id, safe='')}/versions/{version.number}"
-    held, what = f"{version.map_id}/{version.number}", f"version {version.number} of map {version.map_id}"
-    return _bring(_Result(client, held, what, resource, version.files), out, parallel, report)
-
-
-@dataclass(frozen=True)
-class _Result:
-    """A scene, or a map's version: `held` is what a folder with it is marked with."""
-
-    client: Client
-    held: str
-    what: str
-    resource: str
-    files: Sequence[ResultFile]
-
-
-def _bring(result: _Result, out: Path, parallel: int, report: Report) -> Downloaded:
-    client = result.client
-    require_free(out, result.held)
+    held = result.id if isinstance(result, SceneResource) else f"{result.map_id}/{result.number}"
+    require_free(out, held)
     for file in result.files:
         _require_inside(out, file)
-    _claim(out, result.held)
+    _claim(out, held)
     meter = Meter(report, "download", sum(file.size_bytes for file in result.files))
     brought: list[int | None] = []
-    for is_last in (False, True):
-        files = [file for file in result.files if (file.path == REPORT_NAME) is is_last]
+    for is_last in (False, True):  # the report: a folder with it is complete, as the engine's own are
+        files = [file for file in result.files if (file.path == REPORT_FILE) is is_last]
         brought += in_parallel(
-            lambda file: _Download(result, out, file, meter).run(), files, threads=parallel, stop=client.stop
+            lambda file: _Download(client, result, file, out, meter).run(), files, threads=parallel, stop=client.stop
         )
     received = [count for count in brought if count is not None]
     return Downloaded(sum(received), len(received), len(brought) - len(received))
@@ -163,15 +128,14 @@ def _require_inside(out: Path, file: ResultFile) -> None:
 class _Download:
     """One file of a scene. Its bytes gather under a temporary name until all are there and are the right ones."""
 
-    def __init__(self, result: _Result, out: Path, file: ResultFile, meter: Meter) -> None:
+    def __init__(self, client: Client, result: Result, file: ResultFile, out: Path, meter: Meter) -> None:
+        self._client = client
         self._result = result
-        self._client = result.client
         self._file = file
-        self._meter = meter
+        self._meter = FileMeter(meter)
         self._target = out / file.path
         name = hashlib.sha256(f"{file.path}\n{file.sha256}".encode()).hexdigest()[:32]
         self._partial = out / f"{OWN_PREFIX}{name}.partial"
-        self._have_bytes = 0
         self._received_bytes = 0
 
     def run(self) -> int | None:
@@ -185,7 +149,7 @@ class _Download:
 
     def _run(self) -> int | None:
         if self._is_right(self._target):
-            self._now_have(self._file.size_bytes)
+            self._meter.set(self._file.size_bytes)
             return None
         self._gather()
         if not self._is_right(self._partial):
@@ -195,8 +159,8 @@ class _Download:
         if not self._is_right(self._partial):
             self._partial.unlink()
             raise SceneFolderError(
-                f"{self._file.path} of {self._result.what} arrives damaged: its SHA-256 is not the one that the "
-                "service states. Try again; if it stays so, tell the service's operator."
+                f"{self._target} arrives damaged: its SHA-256 is not the one that the service states. "
+                "Try again; if it stays so, tell the service's operator."
             )
         self._target.parent.mkdir(parents=True, exist_ok=True)
         self._partial.replace(self._target)
@@ -208,18 +172,14 @@ class _Download:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest() == self._file.sha256
 
-    def _now_have(self, size_bytes: int) -> None:
-        self._meter.add(size_bytes - self._have_bytes)
-        self._have_bytes = size_bytes
-
     def _gather(self) -> None:
         """Bring the file under its temporary name up to its size, or to where the service has no more."""
         self._partial.touch()
         with self._partial.open("r+b") as partial:
             there_bytes = partial.seek(0, os.SEEK_END)
-            self._now_have(there_bytes if there_bytes <= self._file.size_bytes else 0)
+            self._meter.set(there_bytes if there_bytes <= self._file.size_bytes else 0)
             budget = self._client.retry_budget()
-            while self._have_bytes < self._file.size_bytes:
+            while self._meter.done_bytes < self._file.size_bytes:
                 before_bytes = self._received_bytes
                 try:
                     self._receive(partial)
@@ -228,19 +188,17 @@ class _Download:
                     if self._received_bytes > before_bytes:
                         budget.renew()
                     budget.pause(trouble)
-            partial.truncate(self._have_bytes)
+            partial.truncate(self._meter.done_bytes)
 
     def _receive(self, partial: BinaryIO) -> None:
-        start = self._have_bytes
-        path, sha256 = self._file.path, self._file.sha256
-        with self._client.open_file(self._result.resource, path, sha256=sha256, start=start) as (begins_at, pieces):
-            self._now_have(begins_at)
+        start = self._meter.done_bytes
+        with self._client.open_file(self._result, self._file, start=start) as (begins_at, pieces):
+            self._meter.set(begins_at)
             partial.seek(begins_at)
             for piece in pieces:
-                if self._client.stopped:
-                    raise ClientError("the download was interrupted")
+                self._client.require_open("download")
                 partial.write(piece)
                 self._received_bytes += len(piece)
-                self._now_have(self._have_bytes + len(piece))
-                if self._have_bytes > self._file.size_bytes:
+                self._meter.set(self._meter.done_bytes + len(piece))
+                if self._meter.done_bytes > self._file.size_bytes:
                     return  # more than the service stated

@@ -35,6 +35,19 @@ class Meter:
             self._report(self._stage, self.done_bytes, self._total_bytes)
 
 
+class FileMeter:
+    """Counts the bytes of one file in a meter of many."""
+
+    def __init__(self, meter: Meter) -> None:
+        self._meter = meter
+        self.done_bytes = 0
+
+    def set(self, done_bytes: int) -> None:
+        """Report so many bytes of the file; fewer than before, where it begins again."""
+        self._meter.add(done_bytes - self.done_bytes)
+        self.done_bytes = done_bytes
+
+
 def in_parallel(
     work: Callable[[Item], Result], items: Iterable[Item], *, threads: int, stop: Callable[[], None]
 ) -> list[Result]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from http import HTTPStatus
 
 from service.client.api import Client
 from service.client.drive_folder import LocalFile
-from service.client.errors import ApiError, ClientError
-from service.client.parallel import Meter
+from service.client.errors import ApiError
+from service.client.parallel import FileMeter, Meter
 from service.client.transport import RetryBudget, TroubleError
 
 # Smaller ones are sent again from their beginning: the questions where to go on would take as long.
@@ -32,8 +33,7 @@ class ResumableUpload:
         self._client = client
         self._drive_id = drive_id
         self._file = file
-        self._meter = meter
-        self._counted_bytes = 0
+        self._meter = FileMeter(meter)
         self._id = upload_id or ""
 
     def begin(self) -> str:
@@ -69,7 +69,7 @@ class ResumableUpload:
             if offset > reached_bytes:  # however little of what was sent: it goes on
                 budget.renew()
             reached_bytes = offset
-            self._count(offset)
+            self._meter.set(offset)
             try:
                 self._append(offset)
             except TroubleError as trouble:
@@ -79,10 +79,11 @@ class ResumableUpload:
                 if error.code not in ("wrong-offset", "upload-locked"):
                     raise
                 budget.pause(TroubleError(error, 1.0))
-        self._count(self._file.size_bytes)
+        self._meter.set(self._file.size_bytes)
 
     def _append(self, offset: int) -> None:
-        self._client.append_to_upload(self._drive_id, self._id, offset, lambda: self._pieces(offset))
+        body = partial(counted_pieces, self._client, self._file, self._meter, offset)
+        self._client.append_to_upload(self._drive_id, self._id, offset, body)
 
     def _offset(self, budget: RetryBudget) -> int:
         while True:
@@ -97,13 +98,17 @@ class ResumableUpload:
                     case _:
                         raise
 
-    def _pieces(self, offset: int) -> Iterator[bytes]:
-        for piece in self._file.pieces(offset):
-            if self._client.stopped:
-                raise ClientError("the upload was interrupted")
-            yield piece
-            self._count(self._counted_bytes + len(piece))
 
-    def _count(self, size_bytes: int) -> None:
-        self._meter.add(size_bytes - self._counted_bytes)
-        self._counted_bytes = size_bytes
+def counted_pieces(client: Client, file: LocalFile, meter: FileMeter, offset: int = 0) -> Iterator[bytes]:
+    """Bytes of a file from `offset` on, counted as they are sent.
+
+    Raises
+    ------
+    ClientError
+        The client was stopped.
+    """
+    meter.set(offset)
+    for piece in file.pieces(offset):
+        client.require_open("upload")
+        yield piece
+        meter.set(meter.done_bytes + len(piece))

@@ -137,7 +137,6 @@ class Transport:
         path: str,
         *,
         headers: Mapping[str, str] | None = None,
-        json: Any = None,
         body: Body | None = None,
         timeout_s: float = IO_TIMEOUT_S,
     ) -> httpx.Response:
@@ -153,9 +152,7 @@ class Transport:
         budget = self.retry_budget()
         while True:
             try:
-                with self.open(
-                    method, path, headers=headers, json=json, body=body, read_timeout_s=timeout_s
-                ) as response:
+                with self.open(method, path, headers=headers, body=body, read_timeout_s=timeout_s) as response:
                     response.read()
                     return response
             except TroubleError as trouble:
@@ -168,7 +165,6 @@ class Transport:
         path: str,
         *,
         headers: Mapping[str, str] | None = None,
-        json: Any = None,
         body: Body | None = None,
         read_timeout_s: float = IO_TIMEOUT_S,
     ) -> Iterator[httpx.Response]:
@@ -193,7 +189,6 @@ class Transport:
                 method,
                 path,
                 headers=headers,
-                json=json,
                 content=content,
                 timeout=timeout,
                 extensions={"trace": self._connections.note},

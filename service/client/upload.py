@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from pydantic import BaseModel
 
@@ -14,9 +15,9 @@ from schemas.api.jobs import JobResource, JobState, ReconstructionSettings
 from service.client import resumable
 from service.client.api import Client
 from service.client.drive_folder import DriveFolder, LocalFile, identify
-from service.client.errors import ApiError, ClientError
-from service.client.parallel import Item, Meter, Report, Result, in_parallel, no_report
-from service.client.resumable import ResumableUpload
+from service.client.errors import ApiError
+from service.client.parallel import FileMeter, Item, Meter, Report, Result, in_parallel, no_report
+from service.client.resumable import ResumableUpload, counted_pieces
 from service.client.upload_state import UploadState
 
 PARALLEL = 4
@@ -195,7 +196,9 @@ class _Upload:
             if file.size_bytes >= resumable.FROM_BYTES:
                 self._send_resumably(drive_id, file, meter)
             else:
-                self._send_whole(drive_id, file, meter)
+                # The drive is this folder's: where a file was changed here since it was sent, the new bytes count.
+                body = partial(counted_pieces, self._client, file, FileMeter(meter))
+                self._client.put_file(drive_id, file, body=body, replace=True)
         except ApiError as error:
             if error.code == "wrong-digest":
                 raise file.changed() from error
@@ -207,23 +210,6 @@ class _Upload:
         self._state.note_upload(name, upload.begin())
         upload.send()
         self._state.note_upload(name, None)
-
-    def _send_whole(self, drive_id: str, file: LocalFile, meter: Meter) -> None:
-        sent_bytes = 0
-
-        def counted() -> Iterator[bytes]:
-            nonlocal sent_bytes
-            meter.add(-sent_bytes)
-            sent_bytes = 0
-            for piece in file.pieces():
-                if self._client.stopped:
-                    raise ClientError("the upload was interrupted")
-                yield piece
-                sent_bytes += len(piece)
-                meter.add(len(piece))
-
-        # The drive is this folder's: where a file was changed here since it was sent, the new bytes count.
-        self._client.put_file(drive_id, file, body=counted, replace=True)
 
     def _commit(self, drive: DriveResource) -> None:
         if drive.state == DriveState.COMMITTED:

@@ -182,7 +182,7 @@ class _Demo:
 
     def _use(self, client: Client) -> None:
         from schemas.api.aggregations import AggregationRequest
-        from service.client import DriveFolder, download_map, start_aggregation, upload_drive, watch_job
+        from service.client import DriveFolder, download, start_aggregation, upload_drive, watch_job
 
         with self._timed("upload"):
             drive_ids = []
@@ -204,15 +204,10 @@ class _Demo:
         self._drive_ids = drive_ids
         with self._timed("download"):
             for number, drive_id in zip(self._numbers, drive_ids, strict=True):
-                self._download(client, number, scene_of[drive_id])
+                self._display.say(f"downloading {self._scene(number)}")
+                download(client, client.scene(scene_of[drive_id]), self._scene(number), report=self._display.report)
             self._display.say(f"downloading {self._map}")
-            download_map(client, version, self._map, report=self._display.report)
-
-    def _download(self, client: Client, number: int, scene_id: str) -> None:
-        from service.client import download_scene
-
-        self._display.say(f"downloading {self._scene(number)}")
-        download_scene(client, scene_id, self._scene(number), report=self._display.report)
+            download(client, version, self._map, report=self._display.report)
 
     def _evaluate(self, result: Path, *truths: Path | str) -> dict[str, Any]:
         words = [str(truth) for truth in truths]

@@ -48,6 +48,7 @@ def _commands(parser: argparse.ArgumentParser, *, level: int) -> Iterator[str]:
 def _command(parser: argparse.ArgumentParser, *, summary: str, level: int) -> str:
     description = parser.description or f"{summary[:1].upper()}{summary[1:]}."
     actions = [action for action in parser._actions if not isinstance(action, argparse._SubParsersAction)]
+    actions.sort(key=lambda action: bool(action.option_strings))  # first what has no option, as in the usage
     arguments = [action for action in actions if not isinstance(action, argparse._HelpAction)]
     parts = [
         f"\n{'#' * level} {parser.prog}\n",

@@ -16,7 +16,7 @@ from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.api.aggregations import AggregationRequest
 from schemas.api.jobs import JobResource
 from schemas.api.maps import MapFileResource, MapVersionResource
-from service.client import Client, DriveFolder, UploadState, download_map, start_aggregation, upload_drive
+from service.client import Client, DriveFolder, UploadState, download, start_aggregation, upload_drive
 from service.database.tables import Project
 from service.domain.keys import create_key
 from tests.helpers.live_api import ApiProcess, api_process
@@ -96,7 +96,7 @@ def test_seven_drives_become_one_version(
     for file in wanted(version):
         assert_downloads(plain, file)
     out = tmp_path / "map"
-    download_map(client, version, out)
+    download(client, version, out)
     assert {file.path for file in version.files} <= {p.relative_to(out).as_posix() for p in out.rglob("*")}
 
 

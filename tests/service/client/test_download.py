@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from service.client import ApiError, SceneFolderError, download_scene
+from service.client import ApiError, Downloaded, SceneFolderError, download
+from service.client import Client as LibraryClient
 from service.client.download import MARKER_NAME
 from tests.helpers.bad_network import Cut, bad_network
 from tests.helpers.live_api import Api, Client, sha256_of
@@ -39,6 +41,10 @@ class Shop:
 @pytest.fixture(scope="module")
 def shop(api: Api) -> Shop:
     return Shop(api.client())
+
+
+def download_scene(library: LibraryClient, scene_id: str, out: Path, **options: Any) -> Downloaded:
+    return download(library, library.scene(scene_id), out, **options)
 
 
 def held(out: Path) -> dict[str, bytes]:

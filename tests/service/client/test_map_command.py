@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from service.client import SceneFolderError, download_map
+from service.client import SceneFolderError, download
 from service.commands import map as map_command
 from service.database.tables import Job
 from service.domain import jobs
@@ -117,8 +117,8 @@ def test_a_folder_of_another_version(client: Client, connect: Connect, tmp_path:
     client.publish_map(client.claim(job["id"]), FILES)
     library = connect(client)
     version = library.map_version(job["map_id"], 1)
-    done = download_map(library, version, tmp_path / "out")
+    done = download(library, version, tmp_path / "out")
     assert (done.files_received, done.files_skipped) == (len(FILES), 0)
     other = version.model_copy(update={"number": 2})
     with pytest.raises(SceneFolderError, match="holds the map"):
-        download_map(library, other, tmp_path / "out")
+        download(library, other, tmp_path / "out")
