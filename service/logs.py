@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextvars
 import json
 import logging
@@ -40,6 +41,11 @@ def log_fields(**fields: Any) -> Iterator[None]:
         yield
     finally:
         _fields.reset(token)
+
+
+def add_log_level(parser: argparse.ArgumentParser, meaning: str = "least severe messages") -> None:
+    """Add the argument whose value `configure` takes."""
+    parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"), help=meaning)
 
 
 def configure(level: str = "INFO") -> None:

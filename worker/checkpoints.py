@@ -10,7 +10,6 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from service.database.connections import Database
 from service.domain import checkpoints, jobs
@@ -20,7 +19,7 @@ from service.storage.blob_writer import file_sha256, store_file
 
 log = logging.getLogger("mrasfm.worker")
 
-_LOOK_EVERY_S = 1.0
+_POLL_EVERY_S = 1.0
 _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 300.0
 _ENDS_WITHIN_S = 10.0  # a store that hangs holds up neither a stop nor what is to be published
@@ -70,14 +69,12 @@ class CheckpointKeeper:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join(_ENDS_WITHIN_S)
 
     def _run(self) -> None:
-        while not self._ended.wait(_LOOK_EVERY_S):
+        while not self._ended.wait(_POLL_EVERY_S):
             self._poll()
         self._poll(is_last=True)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -14,45 +15,25 @@ from typing import Any
 
 
 class Work(StrEnum):
-    """Work of a child."""
+    """The kinds of work of a child."""
 
     RECONSTRUCTION = "reconstruction"
     PREFLIGHT = "preflight"
     AGGREGATION = "aggregation"
 
 
-class ErrorKind(StrEnum):
-    """Kind of the engine's error that ended the child's work."""
-
-    INPUT = "input"
-    RECONSTRUCTION = "reconstruction"
-    STORAGE = "storage"
-    CANCELLED = "cancelled"
-    OTHER = "other"  # a scene that contradicts itself, or does not read back as it was written
-
-
 @dataclass(frozen=True, kw_only=True)
-class ChildRequest:
-    """Request to one child process.
+class Attempt:
+    """The work of one attempt.
 
     Attributes
     ----------
     drive
-        Folder with `drive.json`; None for an aggregation.
-    out
-        Folder of the scene or map; finished stages lie in its `CHECKPOINT_FOLDER`.
+        Folder with `drive.json` and the files it names; None for an aggregation.
     content_sha256
-        SHA-256 of the drive's files by name; None for an aggregation.
+        SHA-256 of these files by name: what finished stages are found again by.
     settings
         As in the API's `ReconstructionSettings`.
-    cancel_file
-        The child ends its work where this file exists.
-    result_file
-        Where the child writes its ChildResult.
-    progress_fd
-        Inherited descriptor of a pipe that takes lines of progress.
-    parent_pid
-        The supervisor: without it the child ends.
     scenes, into, remove
         Of an aggregation: folders of scenes by name, folder of the map that they are added to, names of scenes that it
         shall lose.
@@ -63,25 +44,45 @@ class ChildRequest:
     """
 
     work: Work
-    drive: Path | None
+    settings: Mapping[str, Any]
+    drive: Path | None = None
+    content_sha256: Mapping[str, str] | None = None
+    scenes: Mapping[str, Path] = field(default_factory=dict)
+    into: Path | None = None
+    remove: Sequence[str] = field(default_factory=list)
+    failed: Sequence[Mapping[str, Any]] = field(default_factory=list)
+    members: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    leave_out: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChildRequest(Attempt):
+    """An attempt with all that one child process needs for it.
+
+    Attributes
+    ----------
+    out
+        Folder of the scene or map; finished stages lie in its `CHECKPOINT_FOLDER`.
+    cancel_file
+        The child ends its work where this file exists.
+    result_file
+        The file for the child's ChildResult.
+    progress_fd
+        Inherited descriptor of a pipe that takes lines of progress.
+    parent_pid
+        The supervisor: without it the child ends.
+    """
+
     out: Path
-    settings: dict[str, Any]
     threads: int
     cancel_file: Path
     result_file: Path
     progress_fd: int
     parent_pid: int
-    content_sha256: dict[str, str] | None = None
-    scenes: dict[str, Path] = field(default_factory=dict)
-    into: Path | None = None
-    remove: list[str] = field(default_factory=list)
-    failed: list[dict[str, Any]] = field(default_factory=list)
-    members: dict[str, dict[str, Any]] = field(default_factory=dict)
-    leave_out: bool = False
 
     def write(self, path: Path) -> None:
         """Put the request where the child reads it."""
-        path.write_text(json.dumps(asdict(self), default=str), encoding="utf-8")
+        path.write_text(json.dumps(asdict(self), default=lambda given: str(given.resolve())), encoding="utf-8")
 
     @classmethod
     def read(cls, path: Path) -> ChildRequest:
@@ -100,20 +101,25 @@ class ChildError:
 
     Attributes
     ----------
+    retryable
+        Whether another attempt may succeed.
+    is_storage
+        Whether a disk failed.
     findings
         All that the check of the drive found, where that is what refused it.
     """
 
-    kind: ErrorKind
     code: str
     what: str
     remedy: str
+    retryable: bool
+    is_storage: bool = False
     findings: list[dict[str, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChildResult:
-    """Result of a child's work: a report, or an error."""
+    """The end of a child's work: a report or an error."""
 
     report: dict[str, Any] | None = None
     error: ChildError | None = None
@@ -135,7 +141,4 @@ class ChildResult:
         except FileNotFoundError:
             return None
         error = values["error"]
-        return cls(
-            report=values["report"],
-            error=None if error is None else ChildError(**{**error, "kind": ErrorKind(error["kind"])}),
-        )
+        return cls(report=values["report"], error=None if error is None else ChildError(**error))

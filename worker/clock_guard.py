@@ -1,4 +1,4 @@
-"""When the silence of a worker means its death."""
+"""Guards leases against clocks that jump: the silence of a worker does not always mean its death."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _SHARE = 0.25  # of a lease: a live worker has more than that left at any time
 
 
 class ClockGuard:
-    """Told apart from a clock that was set, a machine that slept, and a database that nobody could reach.
+    """Tells the death of a worker from a clock that was set, a machine that slept, and a database out of reach.
 
     After any of these every lease may have run out with its worker alive, so for the length of a lease none counts.
     """

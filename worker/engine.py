@@ -20,18 +20,14 @@ from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage
 from schemas.findings import as_json, error
-from worker.child_protocol import ChildError, ChildRequest, ChildResult, ErrorKind, Work
+from worker.child_protocol import ChildError, ChildRequest, ChildResult, Work
 from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter
 
 CANCEL_INTERVAL_S = 0.2
 
-_KINDS = (
-    (InputError, ErrorKind.INPUT),
-    (ReconstructionError, ErrorKind.RECONSTRUCTION),
-    (StorageError, ErrorKind.STORAGE),
-    (CancelledError, ErrorKind.CANCELLED),
-)
+# Other errors than these are a disk's, or a scene that contradicts itself or does not read back as it was written.
+_FINAL = (InputError, ReconstructionError, CancelledError)
 
 
 def work(request: ChildRequest) -> ChildResult:
@@ -42,11 +38,11 @@ def work(request: ChildRequest) -> ChildResult:
         config = engine_config(request.settings, threads=request.threads)
         return ChildResult(report=_WORK[request.work](request, config, progress, cancelled))
     except MrasfmError as problem:
-        return ChildResult(error=_described(problem, request))
+        return ChildResult(error=described(problem, request))
 
 
 class CancelFile:
-    """File that asks the child to stop; once there, it counts for good.
+    """Sees the file that asks to stop; once seen, always so.
 
     The engine asks thousands of times a second, the disk is asked a few times.
     """
@@ -57,7 +53,7 @@ class CancelFile:
         self._look_at_s = 0.0
 
     def __call__(self) -> bool:
-        """Return whether to stop."""
+        """True where the child is to stop."""
         now_s = time.monotonic()
         if not self._found and now_s >= self._look_at_s:
             self._look_at_s = now_s + CANCEL_INTERVAL_S
@@ -115,7 +111,7 @@ def _problem(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _figures(document: dict[str, Any]) -> dict[str, Any]:
-    """Figures of `map.json` that are recorded with the map's version."""
+    """The figures of `map.json` that are recorded with the map's version."""
     return {
         "scenes": len(document["scenes"]),
         "seams": sum(bool(seam["accepted"]) for seam in document["seams"]),
@@ -124,7 +120,7 @@ def _figures(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _written_report(out: Path) -> dict[str, Any]:
-    """Read the report that was written: the file has been through the writer's conversions."""
+    """The report as written, and not as returned: the file has been through the writer's conversions."""
     written: dict[str, Any] = json.loads((out / REPORT_FILE).read_text(encoding="utf-8"))
     return written
 
@@ -162,13 +158,15 @@ def _preflight(
 _WORK = {Work.RECONSTRUCTION: _reconstruct, Work.PREFLIGHT: _preflight, Work.AGGREGATION: _aggregate}
 
 
-def _described(problem: MrasfmError, request: ChildRequest) -> ChildError:
+def described(problem: MrasfmError, request: ChildRequest) -> ChildError:
+    """An error of the engine, without the paths of this machine."""
     findings = problem.findings if isinstance(problem, UnsoundDriveError) else ()
     return ChildError(
-        kind=next((kind for of, kind in _KINDS if isinstance(problem, of)), ErrorKind.OTHER),
         code=problem.code,
         what=_without_paths(problem.what, request),
         remedy=problem.remedy,
+        retryable=not isinstance(problem, _FINAL),
+        is_storage=isinstance(problem, StorageError),
         findings=[as_json(finding) for finding in findings],
     )
 

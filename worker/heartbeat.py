@@ -6,22 +6,20 @@ import contextvars
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
-from types import TracebackType
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from schemas.artifacts import Stage
 from service.database.connections import Database
 from service.domain import jobs
 from service.settings import Settings
-from worker.attempt import StopRequest
-from worker.progress import Progress
 from worker.retry import may_pass
+from worker.termination import StopReason, StopRequest
 
 log = logging.getLogger("mrasfm.worker")
 
-_LOOK_EVERY_S = 1.0  # progress that changes is told this often, and so is a request to cancel looked for
+_POLL_EVERY_S = 1.0  # progress that changes is reported this often, and a request to cancel is asked for
 _SURE_SHARE = 0.8  # of the lease: after that without an answer, another worker may soon hold the job
 
 
@@ -29,14 +27,30 @@ class Heartbeat:
     """A thread that renews a job's lease for as long as it is in its `with` block.
 
     It beats apart from the attempt itself: fetching a large drive or publishing a large scene must not look like death.
+
+    Parameters
+    ----------
+    progress
+        Says how far the attempt is; called in the thread.
+    shutting_down
+        Whether the worker was told to stop.
     """
 
-    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
+    def __init__(
+        self,
+        database: Database,
+        held: jobs.Claim,
+        settings: Settings,
+        *,
+        progress: Callable[[], jobs.ProgressNote],
+        shutting_down: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._database = database
         self._held = held
         self._settings = settings
-        self._progress = Progress()
-        self._told = Progress()
+        self._progress = progress
+        self._shutting_down = shutting_down
+        self._reported = jobs.ProgressNote()
         self._cancel = False
         self._fenced = False
         self._ended = threading.Event()
@@ -48,24 +62,24 @@ class Heartbeat:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
 
-    def tell(self, progress: Progress) -> StopRequest:
-        """Say how far the attempt is; never waits.
+    def check_stop(self) -> None:
+        """Go on only where the job is still ours, nobody asked for its end, and the worker goes on; never waits.
 
-        Returns
-        -------
+        Raises
+        ------
         StopRequest
-            FENCED where the job is not ours any more, CANCEL where somebody asked for its end, else GO_ON.
+            FENCED, CANCEL or SHUT_DOWN, in this order.
         """
-        self._progress = progress
         if self._fenced:
-            return StopRequest.FENCED
-        return StopRequest.CANCEL if self._cancel else StopRequest.GO_ON
+            raise StopRequest(StopReason.FENCED)
+        if self._cancel:
+            raise StopRequest(StopReason.CANCEL)
+        if self._shutting_down():
+            raise StopRequest(StopReason.SHUT_DOWN)
 
     def _run(self) -> None:
         try:
@@ -76,7 +90,7 @@ class Heartbeat:
     def _beat_until_ended(self) -> None:
         sure_until_s = time.monotonic() + _SURE_SHARE * self._settings.lease_seconds
         beat_s = time.monotonic()
-        while not self._ended.wait(min(_LOOK_EVERY_S, self._settings.heartbeat_seconds)):
+        while not self._ended.wait(min(_POLL_EVERY_S, self._settings.heartbeat_seconds)):
             now_s = time.monotonic()
             news = self._news()
             try:
@@ -95,36 +109,19 @@ class Heartbeat:
             else:
                 beat_s, sure_until_s = now_s, now_s + _SURE_SHARE * self._settings.lease_seconds
 
-    def _news(self) -> Progress | None:
-        """Progress to tell; None where there is no more than a new guess at the time to the end."""
-        progress = self._progress
-        return None if replace(progress, eta_s=None) == replace(self._told, eta_s=None) else progress
+    def _news(self) -> jobs.ProgressNote | None:
+        """Progress to report; None where there is no more than a new guess at the time to the end."""
+        note = self._progress()
+        return None if replace(note, eta_low_s=None, eta_high_s=None) == self._reported else note
 
     def _poll(self) -> None:
         """See whether somebody asked for the job's end: that does not wait for the next heartbeat."""
         with self._database.read() as session:
             self._cancel = jobs.cancel_requested(session, self._held)
 
-    def _beat(self, news: Progress | None) -> None:
+    def _beat(self, news: jobs.ProgressNote | None) -> None:
         lease_us = int(self._settings.lease_seconds * 1e6)
         with self._database.write() as session:
-            self._cancel = jobs.heartbeat(session, self._held, lease_us=lease_us, note=_note(news))
+            self._cancel = jobs.heartbeat(session, self._held, lease_us=lease_us, note=news)
         if news is not None:
-            self._told = news
-
-
-def _note(progress: Progress | None) -> jobs.ProgressNote | None:
-    if progress is None:
-        return None
-    low_s, high_s = progress.eta_s or (None, None)
-    return jobs.ProgressNote(
-        stage=progress.stage,
-        done=progress.done,
-        total=progress.total,
-        unit=progress.unit,
-        percent=round(progress.percent, 2),
-        eta_low_s=None if low_s is None else round(low_s, 1),
-        eta_high_s=None if high_s is None else round(high_s, 1),
-        reused=progress.reused,
-        engine_ran=progress.stage not in ("", Stage.FETCH),
-    )
+            self._reported = replace(news, eta_low_s=None, eta_high_s=None)

@@ -1,10 +1,13 @@
-"""Differences between the kinds of jobs: inputs, checkpoints and results."""
+"""Handlers of the kinds of jobs: inputs, shelf of finished stages, and publication of the result.
+
+The shelf is known once the inputs are laid out.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 from sqlalchemy.orm import Session
 
@@ -20,48 +23,12 @@ from service.domain.map_inputs import MapInputs, inputs_of
 from service.settings import Settings
 from service.storage.artifacts import Fetch
 from service.storage.blob_writer import StoredFile
-from worker.attempt import Attempt, AttemptFolder
-from worker.child_protocol import Work
+from worker.attempt import AttemptFolder
+from worker.child_protocol import Attempt, Work
 from worker.outcomes import Succeeded
 
-WORK = {
-    JobKind.PREFLIGHT: Work.PREFLIGHT,
-    JobKind.RECONSTRUCTION: Work.RECONSTRUCTION,
-    JobKind.AGGREGATION: Work.AGGREGATION,
-}
 
-Counting = Callable[[int, int], None]  # done, total
-
-
-class JobHandler(Protocol):
-    """One claimed job."""
-
-    @property
-    def shelf(self) -> Shelf | None:
-        """Shelf of the job's finished stages."""
-
-    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
-        """Bring what it works on into the attempt's folder.
-
-        Raises
-        ------
-        DriveGoneError
-            Where the drive was deleted.
-        """
-
-    def publish(
-        self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
-    ) -> dict[str, Any]:
-        """Record what it made, of stored files by path, and end the job; for the log, what that is."""
-
-
-def handler_of(database: Database, held: jobs.Claim) -> JobHandler:
-    """Make the handler of a job's kind."""
-    of_kind = MapAssignment if held.kind is JobKind.AGGREGATION else DriveAssignment
-    return of_kind(database, held)
-
-
-class DriveAssignment:
+class DriveHandler:
     """The check of a drive, or its reconstruction."""
 
     def __init__(self, database: Database, held: jobs.Claim) -> None:
@@ -70,33 +37,40 @@ class DriveAssignment:
 
     @property
     def shelf(self) -> Shelf | None:
-        """Shelf of the drive under these settings; a check shares no stages."""
+        """The shelf of the drive under these settings; a check shares no stages."""
         if self._held.kind is not JobKind.RECONSTRUCTION:
             return None
         return DriveShelf(self._drive_id, settings_sha256(self._held.settings))
 
-    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
-        """The drive as a folder."""
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
+        """The drive as a folder.
+
+        Raises
+        ------
+        DriveGoneError
+            Where the drive was deleted.
+        """
         drive = folder.root / "drive"
         contents = materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
-        return Attempt(work=WORK[self._held.kind], drive=drive, content_sha256=contents, settings=self._held.settings)
+        work, settings = Work(self._held.kind.lower()), self._held.settings
+        return Attempt(work=work, drive=drive, content_sha256=contents, settings=settings)
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
     ) -> dict[str, Any]:
-        """The scene."""
+        """Record the scene of stored files, by path, and end the job; the ids of what was made, for the log."""
         scene_id = scenes.publish(
             session,
             self._held,
             files=files,
-            summary=_scene_summary(done.report),
+            summary=SceneSummary(**_figures(done.report)),
             expires_us=_expires_us(settings.scene_retention_days),
             reused=_reused(done.report),
         )
         return {"scene_id": scene_id}
 
 
-class MapAssignment:
+class AggregationHandler:
     """An aggregation."""
 
     def __init__(self, database: Database, held: jobs.Claim) -> None:
@@ -110,12 +84,12 @@ class MapAssignment:
 
     @property
     def shelf(self) -> Shelf | None:
-        """Shelf of every pair of its scenes, under these settings."""
+        """The shelf of every pair of its scenes, under these settings."""
         held = self._held
         ids = self._inputs.scene_ids
         return MapShelf.from_scenes(held.map_id or "", held.project_id, scenes=ids, settings=held.settings)
 
-    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Counting) -> Attempt:
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
         """The scenes as folders, and the version that they are added to."""
         inputs, root = self._inputs, folder.root
         into = root / "base" if inputs.base else None
@@ -139,7 +113,7 @@ class MapAssignment:
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
     ) -> dict[str, Any]:
-        """The map's next version."""
+        """Record the map's next version, likewise."""
         number = maps.publish(
             session,
             self._held,
@@ -153,16 +127,20 @@ class MapAssignment:
         return {"map_id": self._held.map_id, "version": number}
 
 
+JobHandler = DriveHandler | AggregationHandler
+
+
+def handler_of(database: Database, held: jobs.Claim) -> JobHandler:
+    """The handler for a job's kind."""
+    return (AggregationHandler if held.kind is JobKind.AGGREGATION else DriveHandler)(database, held)
+
+
 def _expires_us(days: float | None) -> int | None:
     return None if days is None else now_us() + int(days * 86400e6)
 
 
 def _reused(report: Mapping[str, Any]) -> Sequence[str]:
     return [stage["stage"] for stage in report["stages"] if stage["reused"]]
-
-
-def _scene_summary(report: Mapping[str, Any]) -> SceneSummary:
-    return SceneSummary(**_figures(report))
 
 
 def _map_summary(report: Mapping[str, Any]) -> MapSummary:

@@ -19,23 +19,27 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.database.connections import Database
 from service.domain import workers
-from service.settings import Settings
 
 log = logging.getLogger("mrasfm.worker")
 
 _DATABASE_TIMEOUT_S = 2.0  # the main process must not wait long for the database: it renews leases
 
 
-class RenewLeases(bootsteps.StartStopStep):
-    """Renews the delivery time of every message that this worker holds."""
+class _Repeated(bootsteps.StartStopStep):
+    """A step of the main process that is done with every connection to the broker, and again and again with it."""
 
     requires = ("celery.worker.consumer.tasks:Tasks",)
     _timer: Any = None
 
+    def do(self, consumer: Any) -> None:
+        """The step."""
+        raise NotImplementedError
+
     def start(self, consumer: Any) -> None:
         """With every connection to the broker."""
+        self.do(consumer)
         every_s = consumer.app.mrasfm_settings.visibility_renew_seconds
-        self._timer = consumer.timer.call_repeatedly(every_s, self._renew, (consumer,))
+        self._timer = consumer.timer.call_repeatedly(every_s, self.do, (consumer,))
 
     def stop(self, consumer: Any) -> None:
         """When the connection is lost or the worker stops."""
@@ -43,8 +47,12 @@ class RenewLeases(bootsteps.StartStopStep):
             self._timer.cancel()
             self._timer = None
 
-    @staticmethod
-    def _renew(consumer: Any) -> None:
+
+class RenewLeases(_Repeated):
+    """Renews the delivery time of every message that this worker holds."""
+
+    def do(self, consumer: Any) -> None:
+        """Set it to now."""
         channel = consumer.task_consumer.channel
         tags = list(channel.qos._delivered)
         if not tags:
@@ -53,26 +61,11 @@ class RenewLeases(bootsteps.StartStopStep):
             client.zadd(channel.unacked_index_key, dict.fromkeys(tags, time.time()), xx=True)
 
 
-class ReportPresence(bootsteps.StartStopStep):
-    """Tells the system of record that this worker is there."""
+class ReportPresence(_Repeated):
+    """Reports to the system of record that this worker is there."""
 
-    requires = ("celery.worker.consumer.tasks:Tasks",)
-    _timer: Any = None
-
-    def start(self, consumer: Any) -> None:
-        """With every connection to the broker."""
-        settings: Settings = consumer.app.mrasfm_settings
-        self._report(consumer)
-        self._timer = consumer.timer.call_repeatedly(settings.visibility_renew_seconds, self._report, (consumer,))
-
-    def stop(self, consumer: Any) -> None:
-        """When the connection is lost or the worker stops."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-    @staticmethod
-    def _report(consumer: Any) -> None:
+    def do(self, consumer: Any) -> None:
+        """Report it once."""
         # Opened for each report: pool processes are forked from this one and must not share a connection with it.
         database = Database(consumer.app.mrasfm_settings.resolved_database_url, timeout_s=_DATABASE_TIMEOUT_S)
         try:

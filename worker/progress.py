@@ -1,12 +1,13 @@
-"""Progress of an attempt as a whole: percent and time to the end, from the engine's reports on its stages."""
+"""The progress of an attempt as a whole: percent and time to the end, from the engine's reports on its stages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from types import MappingProxyType
 
 from schemas.artifacts import CHECKPOINTED, Stage
+from service.domain.jobs import ProgressNote
 from worker.child_protocol import Work
 
 # Shares of the time, measured on drives of 100 images; what counts is that nothing seems to stand still. `fetch` and
@@ -51,36 +52,10 @@ UNITS: Mapping[str, str] = MappingProxyType(
         Stage.PUBLISH: "files",
     }
 )
+
 _MIN_EARNED = 5.0  # percent that must have been worked for before a time to the end means something
 _MIN_ELAPSED_S = 3.0
 _DOUBT = 1.0  # at the beginning the end may be twice as far, or half; at the end there is no doubt left
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of an attempt.
-
-    Attributes
-    ----------
-    stage
-        Empty before the first one begins.
-    done, total, unit
-        Of the stage. Unit is None where the stage counts nothing: it was finished before, or has no parts.
-    percent
-        Of the attempt, 0 to 100; never falls.
-    eta_s
-        Seconds to the end, at least and at most; None until it means something.
-    reused
-        Stages whose results were there already, as far as the reports tell; the scene's report has the last word.
-    """
-
-    stage: str = ""
-    done: int = 0
-    total: int = 0
-    unit: str | None = None
-    percent: float = 0.0
-    eta_s: tuple[float, float] | None = None
-    reused: tuple[str, ...] = ()
 
 
 class ProgressMeter:
@@ -97,37 +72,39 @@ class ProgressMeter:
     def __init__(self, work: Work, *, started_s: float) -> None:
         self._weights = WEIGHTS[work]
         self._started_s = started_s
-        self._progress = Progress()
+        self._note = ProgressNote()
         self._skipped = 0.0  # percent that cost no time
 
     def update(self, stage: str, done: int, total: int) -> None:
         """Take in a report. Stages that are not known count nothing."""
-        now = self._progress
-        begins = stage != now.stage
+        now = self._note
         # The engine ends each of these with "1 of 1"; one that begins so was finished before.
-        reused = begins and done == total == 1 and stage in CHECKPOINTED
+        ends = done == total == 1 and stage in CHECKPOINTED
+        reused = ends and stage != now.stage
         if reused:
             self._skipped += self._weights.get(stage, 0.0)
-        elif done == total == 1 and stage in CHECKPOINTED:
+        elif ends:
             done = total = max(now.total, 1)
-        self._progress = Progress(
+        self._note = ProgressNote(
             stage=stage,
             done=done,
             total=total,
             unit=None if reused else UNITS.get(stage),
             percent=max(now.percent, self._percent(stage, done, total)),
             reused=(*now.reused, stage) if reused else now.reused,
+            engine_ran=stage != Stage.FETCH,
         )
 
     @property
     def stage(self) -> str:
         """The stage that was reported last; empty before the first."""
-        return self._progress.stage
+        return self._note.stage
 
-    def at(self, now_s: float) -> Progress:
-        """The progress at a moment."""
-        p = self._progress
-        return Progress(p.stage, p.done, p.total, p.unit, p.percent, self._eta_s(now_s), p.reused)
+    def at(self, now_s: float) -> ProgressNote:
+        """The progress at a moment, rounded; its time to the end is None until it means something."""
+        note = self._note
+        low_s, high_s = self._eta_s(note.percent, now_s)
+        return replace(note, percent=round(note.percent, 2), eta_low_s=low_s, eta_high_s=high_s)
 
     def _percent(self, stage: str, done: int, total: int) -> float:
         before = 0.0
@@ -135,14 +112,13 @@ class ProgressMeter:
             if name == stage:
                 return before + weight * min(1.0, max(0.0, done / total if total > 0 else 0.0))
             before += weight
-        return self._progress.percent
+        return self._note.percent
 
-    def _eta_s(self, now_s: float) -> tuple[float, float] | None:
+    def _eta_s(self, percent: float, now_s: float) -> tuple[float, float] | tuple[None, None]:
         elapsed_s = now_s - self._started_s
-        percent = self._progress.percent
         earned = percent - self._skipped
         if earned < _MIN_EARNED or elapsed_s < _MIN_ELAPSED_S:
-            return None
+            return None, None
         left_s = elapsed_s * (100.0 - percent) / earned
         doubt = 1.0 + _DOUBT * (100.0 - percent) / 100.0
-        return left_s / doubt, left_s * doubt
+        return round(left_s / doubt, 1), round(left_s * doubt, 1)

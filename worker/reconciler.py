@@ -24,7 +24,7 @@ log = logging.getLogger("mrasfm.reconciler")
 _HOUR_US = 3600 * 1_000_000
 _SWEEP_EVERY_S = 600.0
 _ORPHANS_FIRST_S = 300.0
-_ORPHANS_LOOK_EVERY_S = 600.0
+_ORPHANS_CHECK_EVERY_S = 600.0
 _ORPHANS_EVERY_US = 24 * _HOUR_US  # not with every restart: listing a store costs time and, in the cloud, money
 _ORPHANS = "orphans"
 _END_WITHIN_S = 5.0
@@ -56,7 +56,7 @@ class Reconciler:
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
                 ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
-                ("orphans", self.collect_orphans, _ORPHANS_LOOK_EVERY_S, _ORPHANS_FIRST_S),
+                ("orphans", self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
             )
         ]
         for thread in threads:

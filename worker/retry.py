@@ -9,13 +9,12 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from pathlib import Path
 from typing import TypeVar
 
 from obstore import exceptions as store
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
-from service.storage.artifacts import ArtifactStore
+from worker.termination import CheckStop
 
 log = logging.getLogger("mrasfm.worker")
 
@@ -23,7 +22,7 @@ RETRY_BUDGET_S = 120.0
 
 _FIRST_PAUSE_S = 0.2
 _LONGEST_PAUSE_S = 5.0
-_LOOK_EVERY_S = 0.25
+_CHECK_EVERY_S = 0.25
 _ENDS_WITHIN_S = 2.0  # a step that is not wanted any more and does not hang
 
 # Of disks that are full or shared, and of networks.
@@ -47,24 +46,20 @@ _FINAL = (
 )
 
 T = TypeVar("T")
-CheckStop = Callable[[], None]
 
 
-def _never_stop() -> None:
-    """Nothing asks for a stop."""
-
-
-def retry(step: Callable[[], T], *, budget_s: float = RETRY_BUDGET_S, check_stop: CheckStop = _never_stop) -> T:
+def retry(step: Callable[[], T], *, budget_s: float = RETRY_BUDGET_S, check_stop: CheckStop = lambda: None) -> T:
     """Do something that may be done again, until it is taken or `budget_s` have passed.
 
     Parameters
     ----------
     check_stop
-        Called several times a second between two tries; what it raises ends the waiting.
+        Called before each try, and several times a second between two; what it raises ends the waiting.
     """
     end_s = time.monotonic() + budget_s
     pause_s = _FIRST_PAUSE_S
     while True:
+        check_stop()
         try:
             return step()
         except Exception as error:
@@ -74,12 +69,12 @@ def retry(step: Callable[[], T], *, budget_s: float = RETRY_BUDGET_S, check_stop
         again_s = time.monotonic() + pause_s
         while (left_s := again_s - time.monotonic()) > 0:
             check_stop()
-            time.sleep(min(left_s, _LOOK_EVERY_S))
+            time.sleep(min(left_s, _CHECK_EVERY_S))
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
 
 def may_pass(error: Exception) -> bool:
-    """Return whether a connection, a lock, a server or a full disk is at fault, and not the request itself."""
+    """True where a connection, a lock, a server or a full disk is at fault, and not what was asked of it."""
     if isinstance(error, DBAPIError):
         return error.connection_invalidated or isinstance(error, (OperationalError, InterfaceError))
     if isinstance(error, OSError):
@@ -104,26 +99,9 @@ def watched(step: Callable[[], T], check_stop: CheckStop) -> T:
     thread = threading.Thread(target=contextvars.copy_context().run, args=(run,), name="watched", daemon=True)
     thread.start()
     try:
-        while not wait([future], _LOOK_EVERY_S).done:
+        while not wait([future], _CHECK_EVERY_S).done:
             check_stop()
     except BaseException:
         thread.join(_ENDS_WITHIN_S)
         raise
     return future.result()
-
-
-class RetryingFetch:
-    """Brings objects from the artifact store as `ArtifactStore.fetch` does, also where it is away for a while."""
-
-    def __init__(self, artifacts: ArtifactStore, *, budget_s: float, check_stop: CheckStop) -> None:
-        self._artifacts = artifacts
-        self._budget_s = budget_s
-        self._check_stop = check_stop
-
-    def __call__(self, key: str, target: Path) -> None:
-        """Put the object's bytes at `target`."""
-        retry(
-            lambda: self._artifacts.fetch(key, target, check_stop=self._check_stop),
-            budget_s=self._budget_s,
-            check_stop=self._check_stop,
-        )

@@ -1,4 +1,4 @@
-"""Stopping a child: first by asking, then by signals."""
+"""Requests to stop an attempt, and the steps by which its child is stopped: first by asking, then by signals."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from contextlib import suppress
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 
 from service.settings import Settings
@@ -22,6 +23,17 @@ class StopReason(IntEnum):
     FENCED = 4  # another worker has the job already
     ORPHANED = 5  # who started this supervisor is gone
 
+
+class StopRequest(Exception):
+    """The attempt is not to go on. A child is terminated for it; a step of the worker's own ends by raising it."""
+
+    def __init__(self, reason: StopReason) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+CheckStop = Callable[[], None]
+"""Raises StopRequest where the attempt is not to go on; never waits."""
 
 _GRACEFUL = (StopReason.CANCEL, StopReason.TIMEOUT)
 
@@ -57,21 +69,11 @@ class Termination:
             self._steps.pop(0)[1]()
 
     def _plan(self, reason: StopReason) -> list[tuple[float, Callable[[], None]]]:
-        def terminate() -> None:
-            self._send(signal.SIGTERM)
-
-        def kill() -> None:
-            self._send(signal.SIGKILL)
-
+        terminate, kill = partial(self._send, signal.SIGTERM), partial(self._send, signal.SIGKILL)
         if reason in _GRACEFUL:
-            return [
-                (0.0, self._ask),
-                (self._settings.terminate_after_seconds, terminate),
-                (self._settings.kill_after_seconds, kill),
-            ]
-        if reason is StopReason.SHUT_DOWN:
-            return [(0.0, self._ask), (SHUT_DOWN_GRACE_S, kill)]
-        return [(0.0, kill)]
+            times_s = self._settings.terminate_after_seconds, self._settings.kill_after_seconds
+            return [(0.0, self._ask), (times_s[0], terminate), (times_s[1], kill)]
+        return [(0.0, self._ask), (SHUT_DOWN_GRACE_S, kill)] if reason is StopReason.SHUT_DOWN else [(0.0, kill)]
 
     def _ask(self) -> None:
         with suppress(OSError):  # a full disk: the signals follow

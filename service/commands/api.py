@@ -7,6 +7,7 @@ import os
 from functools import partial
 from typing import TYPE_CHECKING
 
+from service.logs import add_log_level, configure
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -22,16 +23,13 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--host", help="address to listen on (MRASFM_HOST)")
     parser.add_argument("--port", type=int, help="port to listen on (MRASFM_PORT)")
-    parser.add_argument(
-        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="least severe messages"
-    )
+    add_log_level(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from service.api.server import serve
-    from service.logs import configure
 
     settings = Settings()
     configure(arguments.log_level)
@@ -47,7 +45,6 @@ def run(arguments: argparse.Namespace) -> int:
 def make_app(settings: Settings, log_level: str) -> FastAPI:
     """The application, in the process that serves it."""
     from service.api.app import create_app
-    from service.logs import configure
 
     configure(log_level)
     return create_app(settings)

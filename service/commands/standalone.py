@@ -11,6 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from service.commands.administration import EXIT_CANNOT_RUN
+from service.logs import add_log_level
 from service.settings import Settings
 
 
@@ -26,9 +27,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--host", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, help="port to listen on (default: 8000; 0 takes a free one)")
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="reconstructions at a time (default: 1)")
-    parser.add_argument(
-        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="of the files in DIR/logs"
-    )
+    add_log_level(parser, "of the files in DIR/logs")
     parser.set_defaults(run=run)
 
 

@@ -14,9 +14,9 @@ from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from service.settings import Settings
 from tests.helpers.service_world import World
-from worker.attempt import StopRequest
 from worker.child_protocol import Work
-from worker.progress import Progress, ProgressMeter
+from worker.progress import ProgressMeter
+from worker.termination import CheckStop, StopReason, StopRequest
 
 DEADLINE_S = 60.0
 
@@ -93,9 +93,18 @@ def meter_of(work: Work = Work.RECONSTRUCTION) -> ProgressMeter:
     return ProgressMeter(work, started_s=time.monotonic())
 
 
-def go_on(progress: Progress) -> StopRequest:
-    """The tick of an attempt that nobody stops."""
-    return StopRequest.GO_ON
+def go_on() -> None:
+    """The check of an attempt that nobody stops."""
+
+
+def stop_once_it_works(meter: ProgressMeter, reason: StopReason) -> CheckStop:
+    """The check of an attempt that is stopped as soon as it reports a stage."""
+
+    def check_stop() -> None:
+        if meter.stage:
+            raise StopRequest(reason)
+
+    return check_stop
 
 
 def wait_until(is_so: Callable[[], bool], what: str) -> None:

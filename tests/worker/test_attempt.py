@@ -18,14 +18,16 @@ from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import BodyAxes, Pose
 from schemas.manifest_check import check_manifest
 from schemas.parsing import parse_manifest
+from service.domain.jobs import ProgressNote
 from service.settings import Settings
 from tests.helpers import learned_graphs
 from tests.helpers.process_tree import children_of
-from tests.worker.conftest import go_on, meter_of, settings_with
-from worker.attempt import Attempt, AttemptFolder, StopRequest, Tick, run_attempt
-from worker.child_protocol import Work
-from worker.outcomes import Cancelled, Failed, Outcome, Succeeded
-from worker.progress import Progress
+from tests.worker.conftest import go_on, meter_of, settings_with, stop_once_it_works
+from worker.attempt import AttemptFolder, run_attempt
+from worker.child_protocol import Attempt, Work
+from worker.outcomes import Failed, Outcome, Succeeded
+from worker.progress import ProgressMeter
+from worker.termination import CheckStop, StopReason, StopRequest
 
 STAGES = ["preflight", "features", "matches", "mapping", "refinement", "pictures", "export"]
 
@@ -34,31 +36,31 @@ def attempt(
     drive: Path,
     scratch: Path,
     settings: Settings,
-    tick: Tick = go_on,
+    check_stop: CheckStop = go_on,
     work: Work = Work.RECONSTRUCTION,
+    meter: ProgressMeter | None = None,
     **asked: object,
 ) -> Outcome:
     return run_attempt(
         Attempt(work=work, drive=drive, settings=asked),
         scratch=scratch,
-        tick=tick,
-        meter=meter_of(work),
+        check_stop=check_stop,
+        meter=meter or meter_of(work),
         settings=settings,
     )
 
 
-def signal_once_it_works(number: signal.Signals) -> Tick:
-    """Sends a signal to the child as soon as it reports a stage."""
-    sent = []
+def attempt_with_a_signal(drive: Path, scratch: Path, settings: Settings, number: signal.Signals) -> Outcome:
+    """The child gets a signal as soon as it reports a stage."""
+    meter, sent = meter_of(), []
 
-    def tick(progress: Progress) -> StopRequest:
-        if progress.stage and not sent:
+    def check_stop() -> None:
+        if meter.stage and not sent:
             sent.append(number)
             (child,) = children_of(os.getpid(), "worker.child")
             os.kill(child.pid, number)
-        return StopRequest.GO_ON
 
-    return tick
+    return attempt(drive, scratch, settings, check_stop, meter=meter)
 
 
 def leftovers(scratch: Path) -> list[str]:
@@ -68,13 +70,11 @@ def leftovers(scratch: Path) -> list[str]:
 def test_reconstruction_and_another_that_reuses_its_stages(
     small_drive: Path, scratch: Path, settings: Settings, tmp_path: Path
 ) -> None:
-    seen: list[Progress] = []
-
-    def tick(progress: Progress) -> StopRequest:
-        seen.append(progress)
-        return StopRequest.GO_ON
-
-    outcome = attempt(small_drive, scratch, settings, tick, max_keypoints=1000, seed=5)
+    seen: list[ProgressNote] = []
+    meter = meter_of()
+    outcome = attempt(
+        small_drive, scratch, settings, lambda: seen.append(meter.at(0.0)), meter=meter, max_keypoints=1000, seed=5
+    )
     assert isinstance(outcome, Succeeded)
     report = outcome.report
     assert report == json.loads((outcome.out / "report.json").read_text(encoding="utf-8"))
@@ -97,7 +97,10 @@ def test_reconstruction_and_another_that_reuses_its_stages(
     second = tmp_path / "second"
     AttemptFolder(second).out.mkdir(parents=True)
     AttemptFolder(scratch).finished_stages.rename(AttemptFolder(second).finished_stages)
-    again = attempt(small_drive, second, settings, tick, max_keypoints=1000, seed=5)
+    meter = meter_of()
+    again = attempt(
+        small_drive, second, settings, lambda: seen.append(meter.at(0.0)), meter=meter, max_keypoints=1000, seed=5
+    )
     assert isinstance(again, Succeeded)
     reused = {stage["stage"]: stage["reused"] for stage in again.report["stages"]}
     assert reused == {"features": True, "matches": True, "mapping": True, "refinement": False, "pictures": False}
@@ -203,7 +206,7 @@ def test_preflight_finds_an_inverted_calibration(own_drive: Path, scratch: Path,
 
 
 def test_killed_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
-    outcome = attempt(small_drive, scratch, settings, signal_once_it_works(signal.SIGKILL))
+    outcome = attempt_with_a_signal(small_drive, scratch, settings, signal.SIGKILL)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable, outcome.blame) == ("engine-killed", True, 0.0)
     assert outcome.stage in STAGES
@@ -212,7 +215,7 @@ def test_killed_child(small_drive: Path, scratch: Path, settings: Settings) -> N
 
 
 def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
-    outcome = attempt(small_drive, scratch, settings, signal_once_it_works(signal.SIGABRT))
+    outcome = attempt_with_a_signal(small_drive, scratch, settings, signal.SIGABRT)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable) == ("engine-abort", True)
     assert "SIGABRT" in outcome.what
@@ -224,13 +227,11 @@ def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> 
 
 def test_cancel(small_drive: Path, scratch: Path, settings: Settings) -> None:
     """By the token alone: signals would come after 20 s."""
-
-    def tick(progress: Progress) -> StopRequest:
-        return StopRequest.CANCEL if progress.stage else StopRequest.GO_ON
-
-    outcome = attempt(small_drive, scratch, settings, tick)
-    assert isinstance(outcome, Cancelled)
-    assert outcome.stage in STAGES
+    meter = meter_of()
+    with pytest.raises(StopRequest) as stopped:
+        attempt(small_drive, scratch, settings, stop_once_it_works(meter, StopReason.CANCEL), meter=meter)
+    assert stopped.value.reason is StopReason.CANCEL
+    assert meter.stage in STAGES
     scene = AttemptFolder(scratch).out
     assert not scene.exists() or {path.name for path in scene.iterdir()} <= {".stages"}
     assert leftovers(scratch) == []

@@ -14,10 +14,8 @@ import worker.clock_guard
 from service.database.tables import now_us
 from service.domain import jobs
 from tests.helpers.service_world import World
-from worker.attempt import StopRequest
 from worker.clock_guard import ClockGuard
 from worker.heartbeat import Heartbeat
-from worker.progress import Progress
 from worker.reconciler import Reconciler
 
 LEASE_S = 40.0
@@ -143,16 +141,16 @@ def test_database_that_is_locked_for_longer_than_a_lease(world: World, brief_dri
     with world.database.write() as session:
         held = jobs.claim(session, job_id, owner="a worker", lease_us=500_000)
     assert held is not None
-    with Heartbeat(impatient, held, hasty) as heartbeat:
+    with Heartbeat(impatient, held, hasty, progress=jobs.ProgressNote) as heartbeat:
         lock = sqlite3.connect(world.settings.data_dir / "mrasfm.sqlite3", isolation_level=None)
         lock.execute("BEGIN IMMEDIATE")
         ends_s = time.monotonic() + 2.0
         while time.monotonic() < ends_s:
-            assert heartbeat.tell(Progress()) is StopRequest.GO_ON
+            heartbeat.check_stop()
             time.sleep(0.05)
         lock.execute("ROLLBACK")
         lock.close()
         time.sleep(0.5)
-        assert heartbeat.tell(Progress()) is StopRequest.GO_ON
+        heartbeat.check_stop()
     assert (world.job(job_id).heartbeat_us or 0) > now_us() - 2_000_000
     impatient.close()

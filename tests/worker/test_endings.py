@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 
 import mrasfm_engine
-from mrasfm_engine.errors import InputError
+from mrasfm_engine.errors import InputError, MrasfmError, ReconstructionError, StorageError
 from tests.worker.conftest import settings_with
 from worker.child import EXIT_OUT_OF_MEMORY
 from worker.child_output import TAIL_BYTES, ChildOutput
-from worker.child_protocol import ChildError, ChildRequest, ChildResult, ErrorKind, Work
+from worker.child_protocol import ChildError, ChildRequest, ChildResult, Work
+from worker.engine import described
 from worker.engine_settings import engine_config
 from worker.log_paths import LogPaths
 from worker.oom import MemoryKills, memory_kills
-from worker.outcomes import Abandoned, Cancelled, Ending, Failed, Succeeded, outcome_of
+from worker.outcomes import Ending, Failed, Succeeded, outcome_of
 from worker.termination import SHUT_DOWN_GRACE_S, StopReason, Termination
 
 GOOD = ChildResult(report={"sound": True})
@@ -29,13 +30,12 @@ GOOD = ChildResult(report={"sound": True})
 def ending(**fields: object) -> Ending:
     plain = Ending(
         returncode=0,
-        stopped_for=None,
+        timeout_s=None,
         result=None,
         stage="mapping",
         log_tail="the end\n",
         memory_kills=0,
         out=Path("scene"),
-        timeout_s=60.0,
     )
     return dataclasses.replace(plain, **fields)  # type: ignore[arg-type]
 
@@ -47,8 +47,9 @@ def failed(**fields: object) -> Failed:
     return outcome
 
 
-def error(kind: ErrorKind) -> ChildResult:
-    return ChildResult(error=ChildError(kind=kind, code="some-code", what="it is bad", remedy="Make it good."))
+def error(*, retryable: bool = False, is_storage: bool = False) -> ChildResult:
+    words = {"code": "some-code", "what": "it is bad", "remedy": "Make it good."}
+    return ChildResult(error=ChildError(**words, retryable=retryable, is_storage=is_storage))
 
 
 def test_result_decides_however_the_child_ended() -> None:
@@ -57,37 +58,28 @@ def test_result_decides_however_the_child_ended() -> None:
         assert outcome_of(ending(result=GOOD, returncode=code)) == Succeeded(report={"sound": True}, out=Path("scene"))
 
 
-def test_cancelled_even_where_it_was_done_already() -> None:
-    outcome = outcome_of(ending(result=GOOD, stopped_for=StopReason.CANCEL))
-    assert isinstance(outcome, Cancelled)
-    assert "'mapping'" in outcome.what
-
-
 def test_late_result_is_better_than_a_timeout() -> None:
-    assert isinstance(outcome_of(ending(result=GOOD, stopped_for=StopReason.TIMEOUT)), Succeeded)
-    late = failed(result=error(ErrorKind.CANCELLED), stopped_for=StopReason.TIMEOUT)
+    assert isinstance(outcome_of(ending(result=GOOD, timeout_s=60.0)), Succeeded)
+    late = failed(result=error(), timeout_s=60.0)
     assert (late.code, late.retryable) == ("timeout", False)
     assert "60 s" in late.what
 
 
-@pytest.mark.parametrize("reason", [StopReason.SHUT_DOWN, StopReason.FENCED, StopReason.ORPHANED])
-def test_abandoned_whatever_it_left(reason: StopReason) -> None:
-    assert outcome_of(ending(result=GOOD, stopped_for=reason)) == Abandoned(reason=reason)
-
-
 @pytest.mark.parametrize(
-    ("kind", "retryable"),
+    ("problem", "retryable", "is_storage"),
     [
-        (ErrorKind.INPUT, False),
-        (ErrorKind.RECONSTRUCTION, False),
-        (ErrorKind.STORAGE, True),
-        (ErrorKind.OTHER, True),
+        (InputError("it is bad", remedy="Make it good."), False, False),
+        (ReconstructionError("it is bad", remedy="Make it good."), False, False),
+        (StorageError("it is bad", remedy="Make it good."), True, True),
+        (MrasfmError("it is bad", remedy="Make it good."), True, False),
     ],
 )
-def test_errors_of_the_engine_keep_their_words(kind: ErrorKind, retryable: bool) -> None:
-    outcome = failed(result=error(kind))
-    assert (outcome.code, outcome.what, outcome.remedy) == ("some-code", "it is bad", "Make it good.")
-    assert (outcome.retryable, outcome.stage) == (retryable, "mapping")
+def test_errors_of_the_engine_keep_their_words(
+    tmp_path: Path, problem: MrasfmError, retryable: bool, is_storage: bool
+) -> None:
+    outcome = failed(result=ChildResult(error=described(problem, request_in(tmp_path))))
+    assert (outcome.code, outcome.what, outcome.remedy) == (problem.code, "it is bad", "Make it good.")
+    assert (outcome.retryable, outcome.is_storage, outcome.stage) == (retryable, is_storage, "mapping")
 
 
 def test_kernel_that_says_so_makes_it_certain() -> None:
@@ -261,22 +253,26 @@ def test_memory_kills_are_compared_within_one_counter(tmp_path: Path) -> None:
         assert MemoryKills.read(path) is None
 
 
-def test_messages_come_back_as_they_were(tmp_path: Path) -> None:
-    request = ChildRequest(
+def request_in(folder: Path) -> ChildRequest:
+    return ChildRequest(
         work=Work.PREFLIGHT,
-        drive=tmp_path / "drive",
-        out=tmp_path / "scene",
+        drive=folder / "drive",
+        out=folder / "scene",
         settings={"use_gnss": False, "seed": None},
         threads=2,
-        cancel_file=tmp_path / "cancel",
-        result_file=tmp_path / "result.json",
+        cancel_file=folder / "cancel",
+        result_file=folder / "result.json",
         progress_fd=5,
         parent_pid=77,
     )
+
+
+def test_messages_come_back_as_they_were(tmp_path: Path) -> None:
+    request = request_in(tmp_path)
     request.write(tmp_path / "request.json")
     assert ChildRequest.read(tmp_path / "request.json") == request
     assert ChildResult.read(tmp_path / "result.json") is None
-    for result in (GOOD, error(ErrorKind.INPUT)):
+    for result in (GOOD, error(retryable=True, is_storage=True)):
         result.write(tmp_path / "result.json")
         assert ChildResult.read(tmp_path / "result.json") == result
     assert sorted(path.name for path in tmp_path.iterdir()) == ["request.json", "result.json"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import shutil
@@ -27,12 +28,12 @@ from service.storage.process_folder import process_folder
 from tests.helpers.damaged_images import cut
 from tests.helpers.live_api import LIMITS
 from tests.helpers.service_world import World, is_gone, wait_until
-from worker.attempt import AttemptFolder, StopRequest
+from worker.attempt import AttemptFolder
 from worker.commit_with_retry import commit_with_retry
 from worker.heartbeat import Heartbeat
 from worker.job_execution import Runner
 from worker.oom import MemoryKills, memory_kills
-from worker.progress import Progress
+from worker.termination import StopReason, StopRequest
 
 
 @pytest.fixture
@@ -340,24 +341,38 @@ def test_request_to_cancel_is_seen_between_heartbeats(world: World, brief_drive:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     rarely = world.settings.model_copy(update={"heartbeat_seconds": 600.0, "lease_seconds": 3600.0})
     held = claimed(world, job_id)
-    with Heartbeat(world.database, held, rarely) as heartbeat:
-        assert heartbeat.tell(Progress()) is StopRequest.GO_ON
+    stopping = threading.Event()
+    with Heartbeat(
+        world.database, held, rarely, progress=jobs.ProgressNote, shutting_down=stopping.is_set
+    ) as heartbeat:
+        assert reason_to_stop(heartbeat) is None
+        stopping.set()
+        assert reason_to_stop(heartbeat) is StopReason.SHUT_DOWN
         world.cancel(job_id)
-        wait_until(lambda: heartbeat.tell(Progress()) is StopRequest.CANCEL, "the heartbeat's answer")
+        wait_until(lambda: reason_to_stop(heartbeat) is StopReason.CANCEL, "the heartbeat's answer")
         with world.database.write() as session:
             jobs.cancelled(session, held)
-        wait_until(lambda: heartbeat.tell(Progress()) is StopRequest.FENCED, "the heartbeat's end")
+        wait_until(lambda: reason_to_stop(heartbeat) is StopReason.FENCED, "the heartbeat's end")
+
+
+def reason_to_stop(heartbeat: Heartbeat) -> StopReason | None:
+    try:
+        heartbeat.check_stop()
+    except StopRequest as request:
+        return request.reason
+    return None
 
 
 def test_new_guess_at_the_end_is_no_news(world: World, brief_drive: Path) -> None:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     often = world.settings.model_copy(update={"heartbeat_seconds": 0.05})
-    with Heartbeat(world.database, claimed(world, job_id), often) as heartbeat:
-        heartbeat.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 2.0)))
+    note = jobs.ProgressNote(stage="features", done=1, total=2, percent=10.0, eta_low_s=1.0, eta_high_s=2.0)
+    notes = [note]
+    with Heartbeat(world.database, claimed(world, job_id), often, progress=lambda: notes[-1]):
         wait_until(lambda: world.events(job_id)[-1].kind == "progress", "the first progress")
         first, beaten_us = world.events(job_id)[-1], world.job(job_id).heartbeat_us or 0
         for guess_s in range(5):
-            heartbeat.tell(Progress(stage="features", done=1, total=2, percent=10.0, eta_s=(1.0, 3.0 + guess_s)))
+            notes.append(dataclasses.replace(note, eta_high_s=3.0 + guess_s))
             time.sleep(0.1)
         wait_until(lambda: (world.job(job_id).heartbeat_us or 0) > beaten_us, "another heartbeat")
     assert world.events(job_id)[-1].id == first.id

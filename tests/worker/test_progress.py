@@ -6,13 +6,21 @@ import time
 import pytest
 
 from schemas.api.jobs import ReconstructionSettings
+from service.domain.jobs import ProgressNote
 from worker.child_protocol import Work
-from worker.progress import UNITS, WEIGHTS, Progress, ProgressMeter
+from worker.progress import UNITS, WEIGHTS, ProgressMeter
 from worker.progress_pipe import ProgressReader, ProgressWriter, StageReport
 
 
 def meter(work: Work = Work.RECONSTRUCTION) -> ProgressMeter:
     return ProgressMeter(work, started_s=100.0)
+
+
+def eta_s(m: ProgressMeter, now_s: float) -> tuple[float, float]:
+    note = m.at(now_s)
+    assert note.eta_low_s is not None
+    assert note.eta_high_s is not None
+    return note.eta_low_s, note.eta_high_s
 
 
 @pytest.mark.parametrize("work", list(Work))
@@ -21,7 +29,7 @@ def test_weights_are_percent(work: Work) -> None:
 
 
 def test_begins_at_nothing() -> None:
-    assert meter().at(100.0) == Progress()
+    assert meter().at(100.0) == ProgressNote()
     assert meter().stage == ""
 
 
@@ -90,10 +98,10 @@ def test_unknown_stage_counts_nothing() -> None:
 def test_no_time_to_the_end_before_it_means_something() -> None:
     m = meter()
     m.update("features", 1, 2)
-    assert m.at(101.0).eta_s is None  # too early
+    assert m.at(101.0).eta_low_s is None  # too early
     slow = meter()
     slow.update("fetch", 1, 2)
-    assert slow.at(160.0).eta_s is None  # too little done
+    assert slow.at(160.0).eta_high_s is None  # too little done
 
 
 def test_time_to_the_end_holds_the_truth_and_narrows() -> None:
@@ -108,9 +116,7 @@ def test_time_to_the_end_holds_the_truth_and_narrows() -> None:
     }.items():
         m.update(*report)
         assert m.at(100.0).percent == pytest.approx(percent)
-        eta_s = m.at(100.0 + percent).eta_s
-        assert eta_s is not None
-        low_s, high_s = eta_s
+        low_s, high_s = eta_s(m, 100.0 + percent)
         assert 0 < low_s < 100.0 - percent < high_s
         assert high_s - low_s < width
         width = high_s - low_s
@@ -123,9 +129,8 @@ def test_time_to_the_end_does_not_count_on_what_was_reused() -> None:
     m.update("features", 1, 1)
     m.update("matches", 1, 1)
     m.update("mapping", 10, 20)
-    eta_s = m.at(117.0).eta_s  # 7 of preflight and 10 of mapping in 17 s
-    assert eta_s is not None
-    assert eta_s[0] < 26.0 < eta_s[1] < 40.0
+    low_s, high_s = eta_s(m, 117.0)  # 7 of preflight and 10 of mapping in 17 s
+    assert low_s < 26.0 < high_s < 40.0
 
 
 def test_reports_pass_through_a_pipe_in_pieces() -> None:

@@ -217,7 +217,7 @@ def test_checkpoint_that_cannot_be_kept(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Tried again less and less often, and hashed once; at the end once more, whatever the pause."""
-    monkeypatch.setattr(worker.checkpoints, "_LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr(worker.checkpoints, "_POLL_EVERY_S", 0.01)
     hashed: list[Path] = []
     monkeypatch.setattr(worker.checkpoints, "file_sha256", lambda path: (hashed.append(path), file_sha256(path))[1])
     errors: list[Exception] = [REFUSED, REFUSED]

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from service.settings import Settings
-from tests.worker.conftest import go_on, is_gone, meter_of, settings_with, wait_until
-from worker.attempt import AttemptFolder, Command, StopRequest, Tick, supervise
+from tests.worker.conftest import go_on, is_gone, meter_of, settings_with, stop_once_it_works, wait_until
+from worker.attempt import AttemptFolder, Command, supervise
 from worker.child_output import FILE_BYTES, TAIL_BYTES
-from worker.outcomes import Abandoned, Cancelled, Failed, Outcome
-from worker.progress import Progress
-from worker.termination import StopReason
+from worker.outcomes import Failed, Outcome
+from worker.progress import ProgressMeter
+from worker.termination import CheckStop, StopReason, StopRequest
 
 STUBBORN = """
 import os, signal, sys, time
@@ -35,6 +35,15 @@ while True:
     time.sleep(0.02)
 """
 
+FINISHED = """
+import os, sys, time
+with open("result.json", "w") as file:
+    file.write('{"report": {"sound": true}, "error": null}')
+os.write(int(sys.argv[1]), b'["export", 1, 1]\\n')
+while not os.path.exists("cancel"):
+    time.sleep(0.02)
+"""
+
 PARENT = """
 import os, subprocess, sys
 grandchild = subprocess.Popen(["sleep", "1000"])
@@ -47,16 +56,20 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from tests.worker.conftest import go_on, meter_of, settings_with
-from worker.child_protocol import Work
-from worker.attempt import Attempt, AttemptFolder, run_attempt, supervise
+from worker.child_protocol import Attempt, Work
+from worker.attempt import AttemptFolder, run_attempt, supervise
+from worker.termination import StopRequest
 scratch, what = Path(sys.argv[1]), sys.argv[2]
-common = dict(tick=go_on, meter=meter_of(), settings=settings_with(scratch))
+common = dict(check_stop=go_on, meter=meter_of(), settings=settings_with(scratch))
 if what == "drive":
     attempt = Attempt(work=Work.RECONSTRUCTION, drive=Path(sys.argv[4]), settings={})
     outcome = run_attempt(attempt, scratch=scratch, **common)
 else:
     program = lambda fd: [sys.executable, "-c", what, str(fd)]
-    outcome = supervise(program, folder=AttemptFolder(scratch), threads=1, **common)
+    try:
+        outcome = supervise(program, folder=AttemptFolder(scratch), threads=1, **common)
+    except StopRequest as stop:
+        outcome = stop
 (scratch / "outcome").write_text(repr(outcome))
 """
 
@@ -68,9 +81,20 @@ def program(source: str) -> Command:
     return command
 
 
-def run(source: str, scratch: Path, settings: Settings, tick: Tick = go_on) -> Outcome:
+def run(
+    source: str,
+    scratch: Path,
+    settings: Settings,
+    check_stop: CheckStop = go_on,
+    meter: ProgressMeter | None = None,
+) -> Outcome:
     return supervise(
-        program(source), folder=AttemptFolder(scratch), threads=3, tick=tick, meter=meter_of(), settings=settings
+        program(source),
+        folder=AttemptFolder(scratch),
+        threads=3,
+        check_stop=check_stop,
+        meter=meter or meter_of(),
+        settings=settings,
     )
 
 
@@ -89,16 +113,16 @@ def test_stubborn_child_is_stopped_step_by_step(scratch: Path, tmp_path: Path) -
     """Asked, then told, then killed."""
     impatient = settings_with(tmp_path, terminate_after_seconds=1.0, kill_after_seconds=2.0)
     stopped_s: list[float] = []
+    meter = meter_of()
 
-    def tick(progress: Progress) -> StopRequest:
-        if progress.stage != "mapping":
-            return StopRequest.GO_ON
-        stopped_s.append(time.monotonic())
-        return StopRequest.CANCEL
+    def check_stop() -> None:
+        if meter.stage == "mapping":
+            stopped_s.append(time.monotonic())
+            raise StopRequest(StopReason.CANCEL)
 
-    outcome = run(STUBBORN, scratch, impatient, tick)
-    assert isinstance(outcome, Cancelled)
-    assert outcome.stage == "mapping"
+    with pytest.raises(StopRequest) as stopped:
+        run(STUBBORN, scratch, impatient, check_stop, meter)
+    assert stopped.value.reason is StopReason.CANCEL
     assert notes(scratch)[1:] == ["asked", "SIGTERM"]
     assert is_gone(noted_pid(scratch))
     assert time.monotonic() - stopped_s[0] >= 2.0
@@ -114,37 +138,50 @@ def test_stubborn_child_runs_out_of_time(scratch: Path, tmp_path: Path) -> None:
 
 
 def test_fenced_attempt_is_killed_at_once(scratch: Path, settings: Settings) -> None:
-    outcome = run(STUBBORN, scratch, settings, lambda p: StopRequest.FENCED if p.stage else StopRequest.GO_ON)
-    assert outcome == Abandoned(reason=StopReason.FENCED)
+    meter = meter_of()
+    with pytest.raises(StopRequest) as stopped:
+        run(STUBBORN, scratch, settings, stop_once_it_works(meter, StopReason.FENCED), meter)
+    assert stopped.value.reason is StopReason.FENCED
     assert notes(scratch)[1:] == []
     assert is_gone(noted_pid(scratch))
 
 
+@pytest.mark.parametrize("reason", [StopReason.CANCEL, StopReason.SHUT_DOWN, StopReason.FENCED])
+def test_stopped_whatever_it_left(scratch: Path, settings: Settings, reason: StopReason) -> None:
+    """A result that came too late is none."""
+    meter = meter_of()
+    with pytest.raises(StopRequest) as stopped:
+        run(FINISHED, scratch, settings, stop_once_it_works(meter, reason), meter)
+    assert stopped.value.reason is reason
+    assert AttemptFolder(scratch).result.exists()
+
+
 def test_shut_down_overtakes_a_cancel(scratch: Path, settings: Settings) -> None:
     """Killed a few seconds after it was asked, not after the 40 s of a cancel."""
-    verdicts: list[StopRequest] = []
+    meter = meter_of()
+    reasons = iter([StopReason.CANCEL])
 
-    def tick(progress: Progress) -> StopRequest:
-        if progress.stage:
-            verdicts.append(StopRequest.SHUT_DOWN if verdicts else StopRequest.CANCEL)
-            return verdicts[-1]
-        return StopRequest.GO_ON
+    def check_stop() -> None:
+        if meter.stage:
+            raise StopRequest(next(reasons, StopReason.SHUT_DOWN))
 
     begun_s = time.monotonic()
-    outcome = run(STUBBORN, scratch, settings, tick)
-    assert outcome == Abandoned(reason=StopReason.SHUT_DOWN)
+    with pytest.raises(StopRequest) as stopped:
+        run(STUBBORN, scratch, settings, check_stop, meter)
+    assert stopped.value.reason is StopReason.SHUT_DOWN
     assert notes(scratch)[1:] == ["asked"]
     assert time.monotonic() - begun_s < 30.0
 
 
-def test_tick_that_fails_leaves_no_child(scratch: Path, settings: Settings) -> None:
-    def tick(progress: Progress) -> StopRequest:
-        if progress.stage:
+def test_check_that_fails_leaves_no_child(scratch: Path, settings: Settings) -> None:
+    meter = meter_of()
+
+    def check_stop() -> None:
+        if meter.stage:
             raise ConnectionError("the database is gone")
-        return StopRequest.GO_ON
 
     with pytest.raises(ConnectionError):
-        run(STUBBORN, scratch, settings, tick)
+        run(STUBBORN, scratch, settings, check_stop, meter)
     assert is_gone(noted_pid(scratch))
 
 
@@ -190,23 +227,17 @@ def test_what_is_reported_last_is_not_lost(scratch: Path, settings: Settings) ->
     """The child ends right after its report."""
     meter = meter_of()
     source = 'import os, sys; os.write(int(sys.argv[1]), b\'["matches", 7, 10]\\n["mapp\'); os.abort()'
-    outcome = supervise(
-        program(source), folder=AttemptFolder(scratch), threads=1, tick=go_on, meter=meter, settings=settings
-    )
+    outcome = run(source, scratch, settings, meter=meter)
     assert isinstance(outcome, Failed)
     assert outcome.stage == "matches"
     assert (meter.at(0.0).done, meter.at(0.0).total) == (7, 10)
 
 
 def test_child_that_closes_its_pipes_is_still_watched(scratch: Path, settings: Settings) -> None:
-    ticks: list[Progress] = []
-
-    def tick(progress: Progress) -> StopRequest:
-        ticks.append(progress)
-        return StopRequest.GO_ON
-
-    run("import os, time; os.closerange(0, 100); time.sleep(1.5)", scratch, settings, tick)
-    assert 3 <= len(ticks) <= 40
+    checks_s: list[float] = []
+    check_stop = lambda: checks_s.append(time.monotonic())  # noqa: E731
+    run("import os, time; os.closerange(0, 100); time.sleep(1.5)", scratch, settings, check_stop)
+    assert 3 <= len(checks_s) <= 40
 
 
 def test_environment_holds_threads_and_no_secrets(

@@ -6,6 +6,7 @@ import argparse
 import signal
 import threading
 
+from service.logs import add_log_level, configure
 from service.settings import Settings
 
 
@@ -17,15 +18,12 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Sends lost messages of jobs again, frees jobs of workers that died, deletes what "
         "has passed its retention date. Settings are environment variables, see mrasfm describe service.",
     )
-    parser.add_argument(
-        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="least severe messages"
-    )
+    add_log_level(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconcile until told to stop."""
-    from service.logs import configure
     from worker.reconciler import Reconciler
 
     configure(arguments.log_level)

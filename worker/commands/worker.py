@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from service.logs import add_log_level
 from service.settings import Settings
 
 QUEUES = ("checks", "reconstructions")
@@ -23,9 +24,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="checks (of drives), reconstructions, or both separated by a comma (default: both)",
     )
     parser.add_argument("--concurrency", type=int, default=1, help="jobs at one time (default: 1)")
-    parser.add_argument(
-        "--log-level", default="info", choices=("debug", "info", "warning", "error"), help="least severe messages"
-    )
+    add_log_level(parser)
     parser.set_defaults(run=run)
 
 

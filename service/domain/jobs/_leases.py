@@ -29,18 +29,31 @@ from service.domain.jobs._queries import (
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressNote:
-    """Progress of an attempt; `percent` is of the attempt itself, without the jobs that it waited for.
+    """The progress of an attempt.
 
-    `engine_ran` says whether the engine has begun in it.
+    Attributes
+    ----------
+    stage
+        Empty before the first one begins.
+    done, total, unit
+        Of the stage. Unit is None where the stage counts nothing: it was finished before, or has no parts.
+    percent
+        Of the attempt itself, without the jobs that it waited for; never falls.
+    eta_low_s, eta_high_s
+        Seconds to the end, at least and at most.
+    reused
+        Stages whose results were there already, as far as the reports tell; the scene's report has the last word.
+    engine_ran
+        Whether the engine has begun.
     """
 
-    stage: str
-    done: int
-    total: int
-    unit: str | None
-    percent: float
-    eta_low_s: float | None
-    eta_high_s: float | None
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+    unit: str | None = None
+    percent: float = 0.0
+    eta_low_s: float | None = None
+    eta_high_s: float | None = None
     reused: Sequence[str] = ()
     engine_ran: bool = False
 
