@@ -6,7 +6,10 @@ import base64
 import binascii
 import re
 
-from service.errors import ServiceError
+from service.errors import (
+    MalformedDigest,
+    ServiceError,
+)
 
 _ALGORITHM = "sha-256"
 # One member of RFC 8941's dictionary whose value is a byte sequence, with parameters that mean nothing here.
@@ -60,10 +63,7 @@ def _sha256(value: str) -> str:
 
 
 def _malformed(why: str) -> ServiceError:
-    return ServiceError(
-        400,
-        "malformed-digest",
-        "Malformed digest",
+    return MalformedDigest(
         f"the digest field cannot be read: {why}",
         remedy="Send Content-Digest: sha-256=:BASE64: with the base64 of the 32 bytes, or leave it out.",
         headers={"Want-Content-Digest": f"{_ALGORITHM}=10"},

@@ -17,7 +17,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from schemas.api.problems import ProblemItem
+from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
 from service.api.context import Context
 from service.api.http.head_routes import heads_of
 from service.api.http.problem_response import problem_response
@@ -31,7 +31,15 @@ from service.api.routes import aggregations, drives, files, jobs, maps, operatio
 from service.api.routes.documentation import add_documentation
 from service.database.tables import now_us
 from service.domain import uploads as upload_records
-from service.errors import ServiceError, store_unavailable
+from service.errors import (
+    DatabaseUnavailable,
+    DiskFull,
+    InternalError,
+    InvalidRequest,
+    OtherError,
+    ServiceError,
+    store_unavailable,
+)
 from service.settings import Settings
 from service.storage.spool import sweep
 from service.storage.uploads.resumable import sweep as sweep_resumable
@@ -142,8 +150,7 @@ def _answer_errors(app: FastAPI) -> None:
         ]
         what = "; ".join(f"{item.field}: {item.detail}" for item in items[:3])
         remedy = "Correct the parameters that are named; the page /docs of this service describes them."
-        title = "The request is not valid"
-        return problem_response(ServiceError(422, "invalid-request", title, what, remedy=remedy, errors=items))
+        return problem_response(InvalidRequest(what, remedy=remedy, errors=items))
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> Response:
@@ -153,9 +160,10 @@ def _answer_errors(app: FastAPI) -> None:
         headers = dict(error.headers or {})
         if error.status_code == 405:
             headers["Allow"] = ", ".join(allowed_methods(app, request.url.path)) or headers.get("Allow", "GET")
-        return problem_response(
-            ServiceError(error.status_code, code, str(error.detail), detail, remedy=remedy, headers=headers)
+        problem = Problem(
+            type=PROBLEM_TYPE + code, title=str(error.detail), status=error.status_code, detail=detail, remedy=remedy
         )
+        return problem_response(OtherError(problem, headers=headers))
 
     @app.exception_handler(ClientDisconnect)
     async def gone(request: Request, error: ClientDisconnect) -> Response:
@@ -179,24 +187,19 @@ def _answer_errors(app: FastAPI) -> None:
         if any(words in str(error) for words in _DATABASE_FULL):
             return problem_response(_disk_full())
         log.error("the database does not answer", exc_info=error)
-        title, detail = "The database does not answer", "the request could not be recorded, and had no effect"
+        detail = "the request could not be recorded, and had no effect"
         remedy, headers = "Repeat it in some seconds.", {"Retry-After": "5"}
-        return problem_response(
-            ServiceError(503, "database-unavailable", title, detail, remedy=remedy, headers=headers)
-        )
+        return problem_response(DatabaseUnavailable(detail, remedy=remedy, headers=headers))
 
 
 def _failed() -> Response:
-    title, detail = "The service failed", "an error of the service itself; it is in the service's log"
+    detail = "an error of the service itself; it is in the service's log"
     remedy = "Repeat the request; if it fails again, tell the operator the header X-Request-Id."
-    return problem_response(ServiceError(500, "internal-error", title, detail, remedy=remedy))
+    return problem_response(InternalError(detail, remedy=remedy))
 
 
 def _disk_full() -> ServiceError:
-    return ServiceError(
-        507,
-        "disk-full",
-        "Disk full",
+    return DiskFull(
         "the service has no space left to store this",
         remedy="Nothing was stored. The operator has to free space; then repeat the request.",
     )

@@ -21,7 +21,9 @@ from service.api.http.request_bodies import request_sha256
 from service.database.tables import Job
 from service.domain import jobs
 from service.domain.idempotency import Answer, once
-from service.errors import ServiceError
+from service.errors import (
+    Unauthorized,
+)
 from service.job_queue import BrokerError
 
 log = logging.getLogger("mrasfm.api")
@@ -64,10 +66,7 @@ class _ApiKey(HTTPBearer):
             project_id = context.keys.remembered(secret) or await run_in_threadpool(context.keys.look_up, secret)
         if project_id is None:
             given = "the API key is not valid" if credentials is not None else "the request carries no API key"
-            raise ServiceError(
-                401,
-                "unauthorized",
-                "No valid API key",
+            raise Unauthorized(
                 given,
                 remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",
                 headers={"WWW-Authenticate": 'Bearer realm="mrasfm"'},

@@ -10,7 +10,10 @@ from sqlalchemy import delete, false
 from service.api.context import Context
 from service.database.connections import is_current
 from service.database.tables import WorkerSeen
-from service.errors import ServiceError
+from service.errors import (
+    NotReady,
+    ServiceError,
+)
 
 _KEPT_S = 2.0  # many may ask, also without a key
 _TIMEOUT_S = 8.0
@@ -69,10 +72,7 @@ class Readiness:
 
 def _not_ready(what: str, error: Exception | None) -> ServiceError:
     why = "is not the one this version expects" if error is None else f"cannot be used ({type(error).__name__})"
-    return ServiceError(
-        503,
-        "not-ready",
-        "The service is not ready",
+    return NotReady(
         f"{what} {why}",
         remedy="Run 'mrasfm migrate'." if error is None else "The operator has to look at its log and at its disk.",
         headers={"Retry-After": "5"},

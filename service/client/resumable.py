@@ -11,6 +11,7 @@ from service.client.drive_folder import LocalFile
 from service.client.errors import ApiError
 from service.client.parallel import FileMeter, Meter
 from service.client.transport import RetryBudget, TroubleError
+from service.errors import UploadLocked, WrongOffset
 
 # Smaller ones are sent again from their beginning: the questions where to go on would take as long.
 FROM_BYTES = 8 << 20
@@ -76,7 +77,7 @@ class ResumableUpload:
                 budget.pause(trouble)
             except ApiError as error:
                 # Another request, perhaps an earlier one of ours, is still being served, or has just been.
-                if error.code not in ("wrong-offset", "upload-locked"):
+                if error.code not in (WrongOffset.code, UploadLocked.code):
                     raise
                 budget.pause(TroubleError(error, 1.0))
         self._meter.set(self._file.size_bytes)

@@ -21,6 +21,7 @@ from pydantic import ValidationError
 
 from schemas.api.problems import MEDIA_TYPE, PROBLEM_TYPE, Problem
 from service.client.errors import ApiError, ClientError, UnreachableError
+from service.errors import RequestInFlight
 
 CONNECT_TIMEOUT_S = 10.0
 IO_TIMEOUT_S = 60.0
@@ -279,7 +280,7 @@ def _refusal(response: httpx.Response) -> ApiError | TroubleError:
     given = _given_problem(response)
     error = ApiError(given or _made_up_problem(response), status=response.status_code)
     retry_after_s = _seconds(response.headers.get("retry-after"))
-    passing = response.status_code in _PASSING or error.code == "request-in-flight"
+    passing = response.status_code in _PASSING or error.code == RequestInFlight.code
     # Our own 429 without a time is a quota, and no waiting helps; another's comes from a proxy's rate limit.
     passing |= response.status_code == HTTPStatus.TOO_MANY_REQUESTS and (given is None or retry_after_s is not None)
     return TroubleError(error, retry_after_s) if passing else error

@@ -19,6 +19,7 @@ from service.client.errors import ApiError
 from service.client.parallel import FileMeter, Item, Meter, Report, Result, in_parallel, no_report
 from service.client.resumable import ResumableUpload, counted_pieces
 from service.client.upload_state import UploadState
+from service.errors import DriveCommitted, NotFound, WrongDigest
 
 PARALLEL = 4
 DECLARED_AT_ONCE = 1000
@@ -115,7 +116,7 @@ def _usable_job(client: Client, job_id: str) -> JobResource | None:
         if job.map_id is not None and job.map_version is not None:
             client.map_version(job.map_id, job.map_version)
     except ApiError as error:
-        if error.code != "not-found":
+        if error.code != NotFound.code:
             raise
         return None
     return None if job.state in (JobState.FAILED, JobState.CANCELLED) else job
@@ -164,7 +165,7 @@ class _Upload:
             try:
                 return self._client.drive(record.drive_id)
             except ApiError as error:
-                if error.code != "not-found":
+                if error.code != NotFound.code:
                     raise
                 self._state.begin_anew()
         self._state.save()  # before the request, so that a repetition has the same name
@@ -200,7 +201,7 @@ class _Upload:
                 body = partial(counted_pieces, self._client, file, FileMeter(meter))
                 self._client.put_file(drive_id, file, body=body, replace=True)
         except ApiError as error:
-            if error.code == "wrong-digest":
+            if error.code == WrongDigest.code:
                 raise file.changed() from error
             raise
 
@@ -217,5 +218,5 @@ class _Upload:
         try:
             self._client.commit(drive.id, idempotency_key=f"{self._state.record.upload}-commit")
         except ApiError as error:
-            if error.code != "drive-committed":  # by another run of the same command
+            if error.code != DriveCommitted.code:  # by another run of the same command
                 raise

@@ -21,7 +21,16 @@ from service.database.tables import TERMINAL, Drive, Job, JobMember, JobState, M
 from service.domain import drives, jobs, maps
 from service.domain.access import require
 from service.domain.checkpoints import settings_sha256
-from service.errors import ServiceError
+from service.errors import (
+    AggregationTooLarge,
+    DriveNotCommitted,
+    DriveRejected,
+    DriveTwice,
+    NothingToDo,
+    NotInMap,
+    RemovedTwice,
+    TooFewScenes,
+)
 
 # Of the whole tree's time, measured with drives of 40 units: two reconstructions at one time, then the aggregation.
 CHILDREN_PERCENT = 80.0
@@ -143,10 +152,10 @@ def _checked(session: Session, project_id: str, asked: AggregationRequest, of_ma
     _require_ready(plan.drives, require_all=asked.require_all)
     coming = len(plan.scenes) + len(plan.drives)
     if not coming and not plan.removed:
-        raise _unusable("nothing-to-do", "the request names neither drives nor scenes", "Name what the map is made of.")
+        raise NothingToDo("the request names neither drives nor scenes", remedy="Name what the map is made of.")
     if coming + len(plan.remaining) < jobs.MIN_SCENES:
         what = f"{coming + len(plan.remaining)} scene is left, a map needs {jobs.MIN_SCENES}"
-        raise _unusable("too-few-scenes", what, "Name more drives or scenes; a single scene needs no aggregation.")
+        raise TooFewScenes(what, remedy="Name more drives or scenes; a single scene needs no aggregation.")
     return plan
 
 
@@ -157,11 +166,11 @@ def _take_out(plan: _Plan, remove: Collection[str], of_map: Map | None) -> None:
         where = "a new map" if of_map is None else f"the current version of map {of_map.id}"
         errors = [ProblemItem(field="remove", detail=f"{given} is not in it") for given in unknown]
         what = f"{unknown[0]!r} is not in {where}"
-        raise _unusable("not-in-map", what, "See the version's scenes for what can be taken out.", errors)
+        raise NotInMap(what, remedy="See the version's scenes for what can be taken out.", errors=errors)
     taken = [named[given] for given in remove]
     twice = next((scene for i, scene in enumerate(taken) if scene in taken[:i]), None)
     if twice is not None:
-        raise _unusable("removed-twice", f"scene {twice.name!r} is to be taken out twice", "Name it once.")
+        raise RemovedTwice(f"scene {twice.name!r} is to be taken out twice", remedy="Name it once.")
     plan.removed = taken
     plan.remaining = [scene for scene in plan.remaining if scene not in taken]
 
@@ -171,19 +180,16 @@ def _require_once(plan: _Plan, drive_id: str, what: str) -> None:
     kept = next((scene for scene in plan.remaining if scene.drive_id == drive_id), None)
     if kept is not None:
         remedy = f"Take the one that is there out in the same request: remove {kept.scene_id}."
-        raise _unusable("drive-twice", f"{what} brings drive {drive_id}, which is in the map as {kept.name!r}", remedy)
+        raise DriveTwice(f"{what} brings drive {drive_id}, which is in the map as {kept.name!r}", remedy=remedy)
     if drive_id in plan.scenes or any(drive.id == drive_id for drive in plan.drives):
-        raise _unusable("drive-twice", f"{what} brings drive {drive_id} a second time", "Name each drive once.")
+        raise DriveTwice(f"{what} brings drive {drive_id} a second time", remedy="Name each drive once.")
 
 
 def _require_ready(found: Collection[Drive], *, require_all: bool) -> None:
     open_drives = [drive for drive in found if drive.state == DriveState.OPEN]
     if open_drives:
         more = f", and {len(open_drives) - 1} more" if len(open_drives) > 1 else ""
-        raise ServiceError(
-            409,
-            "drive-not-committed",
-            "The drive is not committed",
+        raise DriveNotCommitted(
             f"drive {open_drives[0].id} still takes files{more}",
             remedy="Upload what is missing, then commit them.",
             errors=[ProblemItem(field=drive.id, detail="is not committed") for drive in open_drives],
@@ -191,13 +197,8 @@ def _require_ready(found: Collection[Drive], *, require_all: bool) -> None:
     rejected = [drive for drive in found if drive.preflight_state == PreflightState.REJECTED]
     if rejected and require_all:
         problem = _rejection(rejected[0])
-        raise ServiceError(
-            422,
-            "drive-rejected",
-            problem.title,
-            f"drive {rejected[0].id}: {problem.detail}",
-            remedy=problem.remedy,
-            findings=problem.findings,
+        raise DriveRejected(
+            f"drive {rejected[0].id}: {problem.detail}", remedy=problem.remedy, findings=problem.findings
         )
 
 
@@ -216,10 +217,7 @@ def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
     """Room for the aggregation and all that it needs, before any of them is recorded."""
     needed, limit = 1 + len(plan.missing), session.get_one(Project, project_id).max_active_jobs
     if needed > limit:
-        raise ServiceError(
-            422,
-            "aggregation-too-large",
-            "The project's quota of jobs is too small for it",
+        raise AggregationTooLarge(
             f"the aggregation and the reconstructions that it needs are {needed} jobs at one time, the project's quota "
             f"is {limit}: waiting does not help",
             remedy=f"Reconstruct at least {needed - limit} of the drives first, no more than {limit} at one time, then "
@@ -288,7 +286,7 @@ def _rejection(drive: Drive) -> Problem:
     errors = [finding for finding in drive.findings if finding.get("severity") == "error"]
     first = errors[0] if errors else {}
     return Problem(
-        type=PROBLEM_TYPE + "drive-rejected",
+        type=PROBLEM_TYPE + DriveRejected.code,
         title="The check of the drive found errors",
         detail=str(first.get("what", "the check of the drive found errors")),
         remedy=str(first.get("remedy", "Correct the drive, and upload it as a new one.")),
@@ -310,7 +308,3 @@ def _name(wanted: str, taken: set[str]) -> str:
 def _map_name(plan: _Plan) -> str:
     names = [*(scene.name for scene in plan.scenes.values()), *(drive.name for drive in plan.drives)]
     return names[0][:180] if len(names) == 1 else f"{names[0][:180]} and {len(names) - 1} more"
-
-
-def _unusable(code: str, what: str, remedy: str, errors: Collection[ProblemItem] = ()) -> ServiceError:
-    return ServiceError(422, code, "No map can come of this", what, remedy=remedy, errors=list(errors))

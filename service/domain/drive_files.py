@@ -14,7 +14,13 @@ from sqlalchemy.orm import Session
 from schemas.api.drives import DriveState
 from service.database.tables import Blob, Drive, DriveFile, now_us
 from service.domain.access import is_id
-from service.errors import ServiceError, not_found
+from service.errors import (
+    DriveCommitted,
+    FileExists,
+    NotInManifest,
+    ServiceError,
+    not_found,
+)
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 
@@ -204,10 +210,7 @@ def _require_free(slot: Slot, stored: StoredFile, *, replace: bool) -> None:
 
 def not_in_manifest(drive_id: str, path: str) -> ServiceError:
     """422: the manifest names no such file."""
-    return ServiceError(
-        422,
-        "not-in-manifest",
-        "The manifest does not name the file",
+    return NotInManifest(
         f"the manifest of drive {drive_id} names no file {path!r}",
         remedy="Upload under exactly the names that the manifest gives, or create a drive with another manifest.",
     )
@@ -215,20 +218,14 @@ def not_in_manifest(drive_id: str, path: str) -> ServiceError:
 
 def drive_committed(drive_id: str) -> ServiceError:
     """409: a committed drive does not change."""
-    return ServiceError(
-        409,
-        "drive-committed",
-        "The drive is committed",
+    return DriveCommitted(
         f"drive {drive_id} was committed and does not change any more",
         remedy="Reconstruct it as it is, or create a new drive: files that are stored need not be sent again.",
     )
 
 
 def _occupied(path: str, *, before: str, given: str) -> ServiceError:
-    return ServiceError(
-        409,
-        "file-exists",
-        "Another content is stored under this name",
+    return FileExists(
         f"{path!r} is stored with SHA-256 {before}, these bytes have {given}",
         remedy="If these are the right ones, send them again with ?replace=true; if not, see who else writes this "
         "drive.",

@@ -18,7 +18,12 @@ from service.domain import drive_files, jobs
 from service.domain.access import require
 from service.domain.manifest_facts import ManifestFacts
 from service.domain.maps import require_unused
-from service.errors import ServiceError
+from service.errors import (
+    DriveChanging,
+    DriveIncomplete,
+    DriveInUse,
+    TooManyDrives,
+)
 from service.storage import blobs, durability
 from service.storage.blob_writer import StoredFile
 
@@ -63,10 +68,7 @@ def create(
     project = session.get_one(Project, project_id, with_for_update={"key_share": True})
     count = session.scalar(select(func.count()).select_from(Drive).where(Drive.project_id == project_id)) or 0
     if count >= project.max_drives:
-        raise ServiceError(
-            429,
-            "too-many-drives",
-            "Too many drives",
+        raise TooManyDrives(
             f"the project has {count} drives, its quota is {project.max_drives}",
             remedy="Delete drives that are not needed any more, or ask the operator for a larger quota "
             "('mrasfm projects set').",
@@ -203,10 +205,7 @@ def require_complete(session: Session, drive: Drive) -> None:
             select(DriveFile.path).where(missing_files).order_by(DriveFile.path).limit(_SHOWN)
         ).all()
         more = f" and {count - 3} more" if count > 3 else ""
-        raise ServiceError(
-            409,
-            "drive-incomplete",
-            "The drive is not complete",
+        raise DriveIncomplete(
             f"{count} of {drive.files_expected} files have not been uploaded: {', '.join(paths[:3])}{more}",
             remedy="Upload them, then commit again.",
             errors=[ProblemItem(field=path, detail="has not been uploaded") for path in paths],
@@ -232,10 +231,7 @@ def commit(
     """
     require_complete(session, drive)
     if durability.unsynced_of(session, drive.id, limit=1):
-        raise ServiceError(
-            409,
-            "drive-changing",
-            "The drive is being written",
+        raise DriveChanging(
             f"files of drive {drive.id} came while it was being committed",
             remedy="Wait until all uploads are done, then commit again.",
             headers={"Retry-After": "1"},
@@ -265,10 +261,7 @@ def remove(session: Session, drive: Drive) -> None:
     active = session.scalars(jobs.active_of_drive(drive.id)).all()
     needing = [job.id for job in active if job.kind != JobKind.PREFLIGHT]
     if needing:
-        raise ServiceError(
-            409,
-            "drive-in-use",
-            "Jobs need the drive",
+        raise DriveInUse(
             f"drive {drive.id} is needed by {len(needing)} jobs: {', '.join(needing[:3])}",
             remedy="Wait for their end, or cancel them.",
         )

@@ -21,7 +21,11 @@ from sqlalchemy.orm import Session
 from service.database.connections import Database, clock_us
 from service.database.tables import IdempotencyKey, Job, new_id
 from service.domain.request_holds import Hold, HoldKeeper
-from service.errors import ServiceError
+from service.errors import (
+    IdempotencyKeyReused,
+    RequestInFlight,
+    ServiceError,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,10 +125,7 @@ def _take(session: Session, hold: Hold, *, request_sha256: str, keep_us: int, he
     if row is None:  # the other request failed at this moment, and freed the key
         raise _in_flight(key)
     if row.request_sha256 != request_sha256:
-        raise ServiceError(
-            422,
-            "idempotency-key-reused",
-            "The idempotency key was used for another request",
+        raise IdempotencyKeyReused(
             f"Idempotency-Key {key!r} was used before, for a request with another path or body",
             remedy="Make a new key for every new request; repeat a request unchanged.",
         )
@@ -156,10 +157,7 @@ def _replay(row: IdempotencyKey) -> Answer | None:
 
 
 def _in_flight(key: str) -> ServiceError:
-    return ServiceError(
-        409,
-        "request-in-flight",
-        "The same request is being served",
+    return RequestInFlight(
         f"a request with Idempotency-Key {key!r} has not been answered yet",
         remedy="Repeat it in a second.",
         headers={"Retry-After": "1"},

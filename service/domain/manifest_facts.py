@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from schemas.api.drives import FileRole
 from schemas.api.problems import ProblemItem
 from schemas.drive import DriveManifest
-from service.errors import ServiceError
+from service.errors import (
+    InvalidDocument,
+    ServiceError,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,11 +66,6 @@ def _roles(manifest: DriveManifest) -> dict[str, FileRole]:
 
 
 def _unusable(field: str, what: str, remedy: str) -> ServiceError:
-    return ServiceError(
-        422,
-        "invalid-document",
-        "The document does not follow its contract",
-        f"the manifest cannot be used: {field!r} {what}",
-        remedy=remedy,
-        errors=[ProblemItem(field=field, detail=what)],
+    return InvalidDocument(
+        f"the manifest cannot be used: {field!r} {what}", remedy=remedy, errors=[ProblemItem(field=field, detail=what)]
     )

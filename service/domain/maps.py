@@ -13,7 +13,13 @@ from service.database.tables import TERMINAL, Job, JobMember, Map, MapFile, MapS
 from service.domain import jobs
 from service.domain.access import require
 from service.domain.scenes import media_type
-from service.errors import ServiceError, not_found
+from service.errors import (
+    MapBusy,
+    UsedByJob,
+    UsedByMap,
+    VersionCurrent,
+    not_found,
+)
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 
@@ -69,10 +75,7 @@ def require_idle(session: Session, found: Map) -> None:
     """
     job_id = job_under_way(session, found.id)
     if job_id is not None:
-        raise ServiceError(
-            409,
-            "map-busy",
-            "A version of the map is being made",
+        raise MapBusy(
             f"job {job_id} is making the next version of map {found.id}",
             remedy="Wait for its end, or cancel it.",
             headers={"Retry-After": "10"},
@@ -196,10 +199,7 @@ def remove_version(session: Session, found: Map, number: str) -> None:
     version = version_of(session, found, number)
     require_idle(session, found)
     if version.number == found.current_version:
-        raise ServiceError(
-            409,
-            "version-current",
-            "The map shows this version",
+        raise VersionCurrent(
             f"version {version.number} is the current one of map {found.id}",
             remedy="Make another version the current one first, or delete the map.",
         )
@@ -228,10 +228,7 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
     if found:
         named = ", ".join(f"version {row.number} of map {row.name!r} ({row.id})" for row in found[:3])
         more = " and others" if len(found) > 3 else ""
-        raise ServiceError(
-            409,
-            "used-by-map",
-            "A map needs it",
+        raise UsedByMap(
             f"{what} is part of {named}{more}",
             remedy="Make a version without it and delete the versions that have it, or delete the map.",
         )
@@ -239,13 +236,7 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
     active = select(Job.id).join(JobMember, JobMember.job_id == Job.id).where(wanted, Job.state.not_in(TERMINAL))
     job_id = session.scalar(active.limit(1))
     if job_id is not None:
-        raise ServiceError(
-            409,
-            "used-by-job",
-            "A job needs it",
-            f"{what} is needed by the aggregation {job_id}",
-            remedy="Wait for its end, or cancel it.",
-        )
+        raise UsedByJob(f"{what} is needed by the aggregation {job_id}", remedy="Wait for its end, or cancel it.")
 
 
 def forget_expired(session: Session, now: int, *, limit: int = 20) -> int:

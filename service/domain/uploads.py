@@ -12,7 +12,11 @@ from schemas.api.drives import DriveState
 from service.database.tables import Drive, Project, Upload, new_id, now_us
 from service.domain import drive_files, drives
 from service.domain.access import require
-from service.errors import ServiceError, not_found
+from service.errors import (
+    TooManyUploads,
+    UploadExpired,
+    not_found,
+)
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 
@@ -89,10 +93,7 @@ def _require_room(session: Session, project_id: str, size_bytes: int) -> None:
     announced = announced.join(Drive, Drive.id == Upload.drive_id).where(still_open, Drive.state == DriveState.OPEN)
     count, coming_bytes = session.execute(announced).one()
     if count >= MAX_OPEN:
-        raise ServiceError(
-            429,
-            "too-many-uploads",
-            "Too many uploads are open",
+        raise TooManyUploads(
             f"the project has {count} uploads that are not complete, the bound is {MAX_OPEN}",
             remedy="Finish some, or end them with DELETE.",
         )
@@ -112,10 +113,7 @@ def get(session: Session, project_id: str, drive_id: str, upload_id: str) -> Upl
     if upload.drive_id != drive_id:
         raise not_found("upload", upload_id)
     if upload.expires_us < now_us() and not upload.is_done:
-        raise ServiceError(
-            410,
-            "upload-expired",
-            "The upload has expired",
+        raise UploadExpired(
             f"upload {upload_id} was not gone on with in time, and its bytes were dropped",
             remedy="Create a new upload and send the file from its beginning.",
         )

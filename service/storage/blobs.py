@@ -26,7 +26,11 @@ from service.database.tables import (
     new_id,
     now_us,
 )
-from service.errors import ServiceError
+from service.errors import (
+    QuotaFull,
+    ServiceError,
+    StorageChanged,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,10 +202,7 @@ def _recorded_before(session: Session, project_id: str, sha256: str) -> Recorded
 
 
 def _storage_changed(sha256: str) -> ServiceError:
-    return ServiceError(
-        503,
-        "storage-changed",
-        "The storage changed meanwhile",
+    return StorageChanged(
         f"the bytes with SHA-256 {sha256} were there when this began, and have been deleted since as unused",
         remedy="Repeat it from the start: the bytes are stored anew then.",
         headers={"Retry-After": "1"},
@@ -219,10 +220,7 @@ def _take_space(session: Session, project_id: str, size_bytes: int, *, within_qu
 def quota_full(project: Project, size_bytes: int, *, coming_bytes: int = 0) -> ServiceError:
     """413: what is to be stored does not fit the project's quota; `coming_bytes` are announced by open uploads."""
     coming = f", {coming_bytes} are being uploaded" if coming_bytes else ""
-    return ServiceError(
-        413,
-        "quota-full",
-        "The project's storage quota is full",
+    return QuotaFull(
         f"{size_bytes} bytes do not fit: {project.used_bytes} of {project.max_bytes} bytes are used{coming}",
         remedy="Delete drives or scenes that are not needed any more, or ask the operator for a larger quota "
         "('mrasfm projects set').",

@@ -19,7 +19,13 @@ from typing import Generic, Protocol, TypeVar
 
 import anyio
 
-from service.errors import ServiceError
+from service.errors import (
+    DiskFull,
+    ServiceError,
+    TooLarge,
+    WrongDigest,
+    WrongLength,
+)
 
 Result = TypeVar("Result")
 Written = TypeVar("Written", covariant=True)
@@ -319,10 +325,7 @@ def full_disk_is_507() -> Iterator[None]:
 
 def _checked(spooled: Spooled, expected_sha256: str | None) -> Spooled:
     if expected_sha256 is not None and spooled.sha256 != expected_sha256.lower():
-        raise ServiceError(
-            422,
-            "wrong-digest",
-            "Wrong digest",
+        raise WrongDigest(
             f"the bytes received have the SHA-256 {spooled.sha256}, announced is {expected_sha256.lower()}",
             remedy="Send the file again; if it was changed since the digest was taken, take it anew.",
         )
@@ -330,30 +333,18 @@ def _checked(spooled: Spooled, expected_sha256: str | None) -> Spooled:
 
 
 def _too_large(size: str, max_bytes: int) -> ServiceError:
-    return ServiceError(
-        413,
-        "too-large",
-        "Too large",
-        f"the body has {size} bytes, the bound is {max_bytes}",
-        remedy="Send a smaller file, or several.",
-    )
+    return TooLarge(f"the body has {size} bytes, the bound is {max_bytes}", remedy="Send a smaller file, or several.")
 
 
 def _wrong_length(received: str, expected_bytes: int) -> ServiceError:
-    return ServiceError(
-        400,
-        "wrong-length",
-        "Wrong length",
+    return WrongLength(
         f"{received} the {expected_bytes} bytes announced were received",
         remedy="Send the whole file again, with its size as it is now.",
     )
 
 
 def _disk_full(why: str) -> ServiceError:
-    return ServiceError(
-        507,
-        "disk-full",
-        "Disk full",
+    return DiskFull(
         f"the service has no room for these bytes: {why}",
         remedy="Try again later; who runs the service has to free space on the disk of its data folder.",
     )

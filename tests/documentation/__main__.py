@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tests.documentation.commands import command_page
 from tests.documentation.links import broken_links
+from tests.documentation.problems import problems_page
 from tests.documentation.settings import settings_page
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -22,6 +23,7 @@ def pages() -> dict[str, str]:
     return {
         "cli.md": command_page(),
         "configuration.md": settings_page(),
+        "service/problems.md": problems_page(),
         "input/manifest.md": f"<!-- A copy of schemas/README.md, made by make docs. -->\n\n{manifest}",
     }
 

@@ -17,7 +17,12 @@ from service.api.context import DOCUMENT_WITHIN_S, Context
 from service.api.dependencies import CallerDep
 from service.api.http.request_bodies import BODY, Body
 from service.api.manifests.bounded_process import LARGE_BYTES
-from service.errors import ServiceError, invalid_document, too_slow
+from service.errors import (
+    ServiceError,
+    TooLarge,
+    TooSlow,
+    invalid_document,
+)
 from service.settings import Settings
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -143,7 +148,7 @@ async def _at_bearable_rate(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes
 
 
 def _slow(size_bytes: int, elapsed_s: float) -> ServiceError:
-    return too_slow(
+    return TooSlow(
         f"{size_bytes} bytes of the body came in the {elapsed_s:.0f} s since its turn: large ones have to come at "
         f"{_MIN_RATE_BYTES_S // 1000} kB/s on average and within {_WITHIN_S:g} s, as others wait for their place",
         remedy="Repeat it over a faster connection or with fewer uploads beside it, or split the drive.",
@@ -152,10 +157,7 @@ def _slow(size_bytes: int, elapsed_s: float) -> ServiceError:
 
 
 def _too_large(size: str, max_bytes: int) -> ServiceError:
-    return ServiceError(
-        413,
-        "too-large",
-        "The request is too large",
+    return TooLarge(
         f"the body has {size} bytes, the bound is {max_bytes}",
         remedy="Split the drive, or ask the operator for a larger bound.",
     )

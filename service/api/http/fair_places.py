@@ -9,7 +9,11 @@ from dataclasses import dataclass, field
 
 import anyio
 
-from service.errors import ServiceError
+from service.errors import (
+    Busy,
+    ServiceError,
+    TooManyLargeBodies,
+)
 
 _RETRY_AFTER_S = 10
 
@@ -130,10 +134,7 @@ class FairPlaces:
 
 
 def _too_many(within_s: float) -> ServiceError:
-    return ServiceError(
-        429,
-        "too-many-large-bodies",
-        "Too many large requests of this project",
+    return TooManyLargeBodies(
         f"the project's other large requests took all of its places for {within_s:g} s, or too many wait already",
         remedy="Send large manifests one after another; repeat this one in some seconds.",
         headers={"Retry-After": str(_RETRY_AFTER_S), "Connection": "close"},
@@ -141,10 +142,7 @@ def _too_many(within_s: float) -> ServiceError:
 
 
 def _busy(within_s: float) -> ServiceError:
-    return ServiceError(
-        503,
-        "busy",
-        "The service is busy with large requests",
+    return Busy(
         f"large requests of other projects took all places for {within_s:g} s; this one had no effect",
         remedy="Repeat it in some seconds.",
         headers={"Retry-After": str(_RETRY_AFTER_S), "Connection": "close"},

@@ -8,7 +8,9 @@ import json
 from typing import Any
 
 from schemas.drive import MAX_PATH_CHARACTERS
-from service.errors import ServiceError
+from service.errors import (
+    BadCursor,
+)
 
 MAX_LIMIT = 1000
 # Of the longest position, a path: four bytes a character in UTF-8, and four characters of base64 for three bytes.
@@ -40,10 +42,7 @@ def position_of(cursor: str | None, *kinds: type) -> tuple[Any, ...] | None:
         if not all(str(value).isprintable() for value in position):
             raise ValueError  # databases refuse NUL and halves of surrogate pairs in a parameter
     except (ValueError, binascii.Error, RecursionError):
-        raise ServiceError(
-            422,
-            "bad-cursor",
-            "The cursor is not valid",
+        raise BadCursor(
             "the query parameter 'cursor' was not given by this service",
             remedy="Give 'next' of the page before, unchanged, or nothing for the first page.",
         ) from None

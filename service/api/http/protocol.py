@@ -16,7 +16,12 @@ from uvicorn.server import ServerState
 
 from service.api.http.problem_response import problem_response
 from service.api.middleware.security_headers import add_security_headers
-from service.errors import ServiceError, too_slow
+from service.errors import (
+    HeadTooLarge,
+    MalformedRequest,
+    ServiceError,
+    TooSlow,
+)
 
 if TYPE_CHECKING:
     from uvicorn._types import ASGI3Application
@@ -61,10 +66,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         super().data_received(data)
         if self._around_bytes > MAX_HEAD_BYTES and not (self._refused or self.transport.is_closing()):
             self._refuse(
-                ServiceError(
-                    431,
-                    "head-too-large",
-                    "The request's head is too large",
+                HeadTooLarge(
                     f"request line, headers and trailers have over {MAX_HEAD_BYTES} bytes",
                     remedy="Send fewer and shorter headers.",
                 )
@@ -95,11 +97,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
 
     def send_400_response(self, msg: str) -> None:
         """As uvicorn's, as a problem."""
-        self._refuse(
-            ServiceError(
-                400, "malformed-request", "Malformed request", "this is not HTTP/1.1", remedy="Use an HTTP client."
-            )
-        )
+        self._refuse(MalformedRequest("this is not HTTP/1.1", remedy="Use an HTTP client."))
 
     def _wait_for_head(self) -> None:
         self._waiting = self.loop.call_later(HEAD_WITHIN_S, self._too_slow)
@@ -116,7 +114,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         if self._around_bytes == 0:  # it never said anything
             self.transport.close()
             return
-        self._refuse(too_slow(f"its head was not here within {HEAD_WITHIN_S:g} s", remedy="Send it again."))
+        self._refuse(TooSlow(f"its head was not here within {HEAD_WITHIN_S:g} s", remedy="Send it again."))
 
     def _refuse(self, error: ServiceError) -> None:
         """Answer the request that is at fault and hang up; complete requests before it are answered first."""

@@ -7,7 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from urllib.parse import quote
 
-from service.errors import ServiceError
+from service.errors import (
+    PreconditionFailed,
+    RangeOutside,
+)
 
 _RANGE = re.compile(r"bytes\s*=\s*(\d{0,19})\s*-\s*(\d{0,19})", re.ASCII | re.IGNORECASE)
 
@@ -47,10 +50,7 @@ def requested_part(headers: Mapping[str, str], *, size_bytes: int, etag: str) ->
         if last and int(last) < int(first):
             return None  # malformed: to be ignored
     if start >= size_bytes or start >= stop:
-        raise ServiceError(
-            416,
-            "range-outside",
-            "The range lies outside the file",
+        raise RangeOutside(
             f"the file has {size_bytes} bytes, asked for is {given!r}",
             remedy="Ask for bytes that exist, or leave the header Range out.",
             headers={"Content-Range": f"bytes */{size_bytes}"},
@@ -79,10 +79,7 @@ def require_match(if_match: Sequence[str], etag: str) -> None:
     tags = [tag for line in if_match for tag in _ENTITY_TAG.findall(line)]
     if etag in tags or any(line.strip() == "*" for line in if_match):
         return
-    raise ServiceError(
-        412,
-        "precondition-failed",
-        "The file has another version",
+    raise PreconditionFailed(
         f"If-Match asks for another version than {etag}, which the file has",
         remedy="Read the file's ETag anew, and begin the download again.",
         headers={"ETag": etag},

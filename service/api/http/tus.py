@@ -10,7 +10,11 @@ from datetime import UTC, datetime
 from email.utils import format_datetime
 
 from service.domain.uploads import Announced
-from service.errors import ServiceError
+from service.errors import (
+    MalformedUpload,
+    ServiceError,
+    TusVersion,
+)
 
 VERSION = "1.0.0"
 EXTENSIONS = "creation,checksum,expiration,termination"
@@ -40,10 +44,7 @@ def require_version(given: str | None) -> None:
         412.
     """
     if given != VERSION:
-        raise ServiceError(
-            412,
-            "tus-version",
-            "Another version of tus",
+        raise TusVersion(
             f"the header Tus-Resumable is {given!r}, this service speaks {VERSION}",
             remedy=f"Send Tus-Resumable: {VERSION}.",
             headers={"Tus-Version": VERSION},
@@ -147,7 +148,7 @@ def http_date(time_us: int) -> str:
 
 def malformed(what: str, remedy: str) -> ServiceError:
     """400: a header does not follow the protocol."""
-    return ServiceError(400, "malformed-upload", "Not as tus has it", what, remedy=remedy)
+    return MalformedUpload(what, remedy=remedy)
 
 
 def _decoded(name: str, value: str) -> bytes:

@@ -13,7 +13,12 @@ from typing import TypeVar
 from schemas.api.resource import Finding
 from service.api.context import Context
 from service.api.manifests.bounded_process import TooCostlyError, end_of_log, run_on_document
-from service.errors import ServiceError, store_unavailable
+from service.errors import (
+    CheckFailed,
+    ManifestTooLarge,
+    ServiceError,
+    store_unavailable,
+)
 
 log = logging.getLogger("mrasfm.api")
 
@@ -103,20 +108,14 @@ def result_of(
 
 
 def _too_large(bounds: Bounds) -> ServiceError:
-    return ServiceError(
-        422,
-        "manifest-too-large",
-        "The manifest is too large to be checked",
+    return ManifestTooLarge(
         f"the check of the manifest needs over {bounds.memory_mb} MB of memory or {bounds.timeout_s} s",
         remedy="Split the drive in several.",
     )
 
 
 def _check_failed() -> ServiceError:
-    return ServiceError(
-        503,
-        "check-failed",
-        "The check of the manifest did not answer",
+    return CheckFailed(
         "the check of the manifest could not be run; why is in the service's log",
         remedy="Repeat the request in a minute; if it fails again, tell the operator.",
         headers={"Retry-After": "60"},

@@ -18,7 +18,7 @@ from schemas.api.drives import FileRole
 from schemas.api.problems import Problem
 from schemas.parsing import DocumentError, parse_new_manifest
 from service.domain.manifest_facts import ManifestFacts, facts_of
-from service.errors import ServiceError, invalid_document, of_problem
+from service.errors import OtherError, ServiceError, invalid_document
 
 _LETTERS = {FileRole.IMAGE: "i", FileRole.MASK: "m"}
 _ROLES = {letter: role for role, letter in _LETTERS.items()}
@@ -82,7 +82,7 @@ def result_in(output: bytes) -> ManifestFacts:
     end = output.index(b"\n")
     header = json.loads(output[:end])
     if "problem" in header:
-        raise of_problem(Problem.model_validate(header["problem"]))
+        raise OtherError(Problem.model_validate(header["problem"]))
     return ManifestFacts(**header["facts"], files=_Files(output, end + 1))
 
 

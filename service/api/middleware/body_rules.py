@@ -8,7 +8,11 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.http.problem_response import problem_response
-from service.errors import ServiceError, too_slow
+from service.errors import (
+    EncodedBody,
+    ServiceError,
+    TooSlow,
+)
 
 
 class BodyRules:
@@ -55,7 +59,7 @@ class BodyRules:
 
 
 def _silent(idle_s: float) -> ServiceError:
-    return too_slow(
+    return TooSlow(
         f"no byte of the body came for {idle_s:g} s",
         remedy="Send it again; a resumable upload goes on at the offset that HEAD gives.",
         headers={"Connection": "close"},
@@ -63,10 +67,7 @@ def _silent(idle_s: float) -> ServiceError:
 
 
 def _encoded(encoding: str) -> ServiceError:
-    return ServiceError(
-        415,
-        "encoded-body",
-        "The body is encoded",
+    return EncodedBody(
         f"Content-Encoding {encoding[:40]!r} is not taken: digests and lengths are those of the bytes sent",
         remedy="Send the bytes as they are, without Content-Encoding.",
         headers={"Accept-Encoding": "identity"},

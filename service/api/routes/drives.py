@@ -26,7 +26,10 @@ from service.domain import drives
 from service.domain.drives import Stored
 from service.domain.idempotency import Answer
 from service.domain.manifest_facts import ManifestFacts
-from service.errors import ServiceError
+from service.errors import (
+    DriveRejected,
+    ServiceError,
+)
 from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.durability import secure_drive
 from service.storage.garbage_collection import collect_unused
@@ -197,14 +200,7 @@ def rejected(drive_id: str, findings: list[Finding]) -> ServiceError:
     """422: the check of the drive found errors."""
     errors = [finding for finding in findings if finding.severity == "error"]
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return ServiceError(
-        422,
-        "drive-rejected",
-        "The check of the drive found errors",
-        f"drive {drive_id}: {errors[0].what}{more}",
-        remedy=errors[0].remedy,
-        findings=findings,
-    )
+    return DriveRejected(f"drive {drive_id}: {errors[0].what}{more}", remedy=errors[0].remedy, findings=findings)
 
 
 def _shown(session: Session, drive: Drive) -> DriveResource:

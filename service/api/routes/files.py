@@ -28,7 +28,10 @@ from service.database.tables import Blob, DriveFile
 from service.digests import parse_digest
 from service.domain import drive_files, drives
 from service.domain.idempotency import Answer
-from service.errors import ServiceError
+from service.errors import (
+    PartialBody,
+    ServiceError,
+)
 from service.storage.spool import receive, receive_into
 
 router = APIRouter(prefix="/v1/drives/{drive_id}", tags=["files"])
@@ -202,10 +205,7 @@ class _Announced(TypedDict):
 def _announced(request: Request, context: Context) -> _Announced:
     """Properties of a body that are known before it comes, and how it may be written."""
     if "content-range" in request.headers:
-        raise ServiceError(
-            400,
-            "partial-body",
-            "A part of a file",
+        raise PartialBody(
             "the request has a Content-Range, and a PUT stores whole files",
             remedy="Send the whole file, or its parts as a resumable upload: POST /v1/drives/{id}/uploads.",
         )

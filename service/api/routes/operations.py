@@ -20,7 +20,9 @@ from service.api.http.responses import gives, problems
 from service.api.metrics import CONTENT_TYPE, ONLINE_US, Metrics
 from service.api.readiness import Readiness
 from service.database.tables import Job, JobState, WorkerSeen, now_us
-from service.errors import ServiceError
+from service.errors import (
+    Unauthorized,
+)
 from service.job_queue import QUEUES, BrokerError
 
 router = APIRouter(tags=["operation"])
@@ -158,11 +160,9 @@ class _MetricsToken(HTTPBearer):
         credentials = await super().__call__(request)
         given = b"" if credentials is None else credentials.credentials.encode()
         if not secrets.compare_digest(given, self._token):
-            raise ServiceError(
-                401,
-                "unauthorized",
-                "No valid token",
+            raise Unauthorized(
                 "the metrics of this service are for its operator",
                 remedy="Send 'Authorization: Bearer TOKEN' with the value of MRASFM_METRICS_TOKEN.",
                 headers={"WWW-Authenticate": 'Bearer realm="mrasfm metrics"'},
+                title="No valid token",
             )

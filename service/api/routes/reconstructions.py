@@ -19,7 +19,9 @@ from service.api.routes.drives import rejected
 from service.database.tables import now_us
 from service.domain import drives, jobs
 from service.domain.idempotency import Answer
-from service.errors import ServiceError
+from service.errors import (
+    DriveNotCommitted,
+)
 
 router = APIRouter(prefix="/v1/reconstructions", tags=["reconstructions"])
 
@@ -50,10 +52,7 @@ def create_reconstruction(
     def effect(session: Session) -> Answer:
         drive = drives.get(session, caller.project_id, request.drive_id, lock=True)
         if drive.state == DriveState.OPEN:
-            raise ServiceError(
-                409,
-                "drive-not-committed",
-                "The drive is not committed",
+            raise DriveNotCommitted(
                 f"drive {drive.id} still takes files",
                 remedy=f"Upload what is missing, then POST /v1/drives/{drive.id}:commit.",
             )

@@ -16,7 +16,13 @@ from service.api.http.tus import Checksum
 from service.api.routes.file_ingest import keep_archive, keep_file, require_open, require_wanted
 from service.database.tables import Upload, now_us
 from service.domain import uploads
-from service.errors import ServiceError
+from service.errors import (
+    ChecksumMismatch,
+    ServiceError,
+    TooLarge,
+    WrongDigest,
+    WrongOffset,
+)
 from service.storage.blob_writer import file_sha256
 from service.storage.durability import boot_id
 from service.storage.spool import Spooled, require_space
@@ -166,20 +172,14 @@ class _Held:
     def begin(self, offset: int, length: int | None, *, counts_at_once: bool) -> None:
         """Make ready to append at an offset."""
         if offset != self.offset:
-            raise ServiceError(
-                409,
-                "wrong-offset",
-                "The offset is another",
+            raise WrongOffset(
                 f"upload {self.upload.id} goes on at byte {self.offset}, the request begins at {offset}",
                 remedy="Ask for the offset with HEAD and go on from there.",
                 headers={"Upload-Offset": str(self.offset)},
             )
         missing_bytes = self.upload.size_bytes - offset
         if length is not None and length > missing_bytes:
-            raise ServiceError(
-                413,
-                "too-large",
-                "Too large",
+            raise TooLarge(
                 f"the request has {length} bytes, upload {self.upload.id} misses {missing_bytes}",
                 remedy="Send no more than Upload-Length says.",
             )
@@ -225,10 +225,7 @@ class _Held:
         """Take what was appended, where it is right."""
         if checksum is not None and compared is not None and compared.digest() != checksum.digest:
             self.keep(begin)
-            raise ServiceError(
-                460,
-                "checksum-mismatch",
-                "Checksum mismatch",
+            raise ChecksumMismatch(
                 f"the bytes from {begin} to {offset} have another {checksum.algorithm} than Upload-Checksum says",
                 remedy="They were dropped; send them again.",
                 headers={"Upload-Offset": str(begin)},
@@ -290,10 +287,7 @@ class _Held:
 
 
 def _wrong_digest(upload: Upload, sha256: str) -> ServiceError:
-    return ServiceError(
-        422,
-        "wrong-digest",
-        "Wrong digest",
+    return WrongDigest(
         f"the bytes received have the SHA-256 {sha256}, announced is {upload.sha256}",
         remedy="They were dropped: create a new upload. If the file was changed since its digest was taken, take it "
         "anew.",

@@ -18,7 +18,12 @@ from service.api.routes.upload_writing import UploadWriting, current_offset, dis
 from service.database.tables import Upload, now_us
 from service.domain import drives, uploads
 from service.domain.idempotency import Answer
-from service.errors import ServiceError
+from service.errors import (
+    MethodNotAllowed,
+    ServiceError,
+    TooLarge,
+    WrongMediaType,
+)
 from service.storage.spool import require_space
 
 
@@ -108,10 +113,7 @@ def create_upload(
     settings = context.settings
     bound = settings.max_archive_bytes if announced.path is None else settings.max_file_bytes
     if announced.size_bytes > bound:
-        raise ServiceError(
-            413,
-            "too-large",
-            "Too large",
+        raise TooLarge(
             f"the upload has {announced.size_bytes} bytes, the bound is {bound}",
             remedy="Send a smaller file, or several.",
             headers={"Tus-Max-Size": str(bound)},
@@ -205,12 +207,8 @@ async def append_to_upload(
     """
     tus.require_version(tus_resumable)
     if request.headers.get("content-type", "").partition(";")[0].strip() != tus.CONTENT_TYPE:
-        raise ServiceError(
-            415,
-            "wrong-media-type",
-            "Another media type",
-            f"Content-Type is {request.headers.get('content-type')!r}",
-            remedy=f"Send Content-Type: {tus.CONTENT_TYPE}.",
+        raise WrongMediaType(
+            f"Content-Type is {request.headers.get('content-type')!r}", remedy=f"Send Content-Type: {tus.CONTENT_TYPE}."
         )
     writing = UploadWriting(context, caller.project_id, drive_id, upload_id)
     upload, offset = await writing.run(
@@ -257,10 +255,7 @@ async def override_method(
             return Response(status_code=204)
         case "HEAD":
             return await get_upload_offset(drive_id, upload_id, caller, context, resumable)
-    raise ServiceError(
-        405,
-        "method-not-allowed",
-        "Method not allowed",
+    raise MethodNotAllowed(
         f"POST {request.url.path} needs X-HTTP-Method-Override: PATCH, DELETE or HEAD",
         remedy="Send PATCH itself, or the header.",
         headers={"Allow": "HEAD, PATCH, DELETE, OPTIONS"},

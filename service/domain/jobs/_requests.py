@@ -15,7 +15,14 @@ from service.database.tables import Drive, Job, JobState, Project, new_id
 from service.domain.jobs._completion import after_end
 from service.domain.jobs._dependencies import orphans
 from service.domain.jobs._queries import ACTIVE, active_of_drive, change, close_attempts, locked, tell_state
-from service.errors import ServiceError
+from service.errors import (
+    CheckActive,
+    DriveDeleted,
+    JobEnded,
+    JobNotFailed,
+    QuotaFull,
+    TooManyJobs,
+)
 
 
 class OfTree(TypedDict, total=False):
@@ -86,10 +93,7 @@ def require_places(session: Session, project_id: str, count: int) -> None:
     # Locked, so that two requests cannot take the last place together.
     project = session.get_one(Project, project_id, with_for_update=True)
     if project.used_bytes >= project.max_bytes:
-        raise ServiceError(
-            413,
-            "quota-full",
-            "The project's storage quota is full",
+        raise QuotaFull(
             f"{project.used_bytes} of {project.max_bytes} bytes are used: there is no space for what a job makes",
             remedy="Delete drives, scenes or maps that are not needed any more (their space is free within about an "
             "hour), or ask the operator for a larger quota.",
@@ -98,10 +102,7 @@ def require_places(session: Session, project_id: str, count: int) -> None:
     active = session.scalar(select(func.count()).select_from(Job).where(mine)) or 0
     if active + count > project.max_active_jobs:
         wanted = f", and this needs {count} more at one time" if count > 1 else ""
-        raise ServiceError(
-            429,
-            "too-many-jobs",
-            "Too many jobs",
+        raise TooManyJobs(
             f"the project has {active} jobs queued or running, its quota is {project.max_active_jobs}{wanted}",
             remedy="Wait until some have ended, or cancel some, or ask the operator for a larger quota "
             "('mrasfm projects set').",
@@ -132,10 +133,7 @@ def request_cancel(session: Session, job_id: str) -> None:
         tell_state(session, job_id)
         return
     if job.state in (JobState.SUCCEEDED, JobState.FAILED):
-        raise ServiceError(
-            409,
-            "job-ended",
-            "The job has ended",
+        raise JobEnded(
             f"job {job_id} has {job.state.lower()} and cannot be cancelled",
             remedy="Delete its scene if the result is not wanted." if job.scene_id else "Nothing is left to do.",
         )
@@ -162,10 +160,7 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     require_failed(job)
     drive = session.get(Drive, job.drive_id or "", with_for_update=True, populate_existing=True)
     if drive is None:
-        raise ServiceError(
-            409,
-            "drive-deleted",
-            "The drive was deleted",
+        raise DriveDeleted(
             f"drive {job.drive_id} of job {job.id} was deleted",
             remedy="Create the drive again and ask for its reconstruction.",
         )
@@ -196,10 +191,7 @@ def require_failed(job: Job) -> None:
         409.
     """
     if job.state not in (JobState.FAILED, JobState.CANCELLED):
-        raise ServiceError(
-            409,
-            "job-not-failed",
-            "The job did not fail",
+        raise JobNotFailed(
             f"job {job.id} is {job.state}: only a job that failed or was cancelled can be retried",
             remedy="Wait for its end, or ask for a new one.",
         )
@@ -214,10 +206,4 @@ def _require_unchecked(session: Session, drive: Drive) -> None:
         what = f"drive {drive.id} was checked already: it is {drive.preflight_state}"
     else:
         return
-    raise ServiceError(
-        409,
-        "check-active",
-        "The drive has its check",
-        what,
-        remedy="Look at the drive: it shows its findings, and the job that checks it.",
-    )
+    raise CheckActive(what, remedy="Look at the drive: it shows its findings, and the job that checks it.")

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from schemas.file_names import MANIFEST_NAME
+from service.errors import ArchiveTooLarge, OtherManifest
 from service.storage.spool import Spooled, SpoolWriter
-from service.storage.uploads.archive_errors import Refusal, shown
+from service.storage.uploads.archive_errors import shown
 from service.storage.uploads.archive_limits import ArchiveLimits
 from service.storage.uploads.archive_names import EntryNames, is_ignored, may_be_manifest
 from service.storage.uploads.decompress import compression_of
@@ -103,10 +104,10 @@ class _Unpacking:
     def write(self, name: str, size_bytes: int, content: Iterable[bytes]) -> None:
         """Unpack an entry, and check that it is an image."""
         if may_be_manifest(name) and size_bytes > self._limits.max_manifest_bytes:
-            raise Refusal.TOO_LARGE(
+            raise ArchiveTooLarge(
                 f"entry {shown(name)} of the archive has {size_bytes} bytes, the bound of a manifest is "
                 f"{self._limits.max_manifest_bytes}",
-                "Leave it out: the drive has its manifest.",
+                remedy="Leave it out: the drive has its manifest.",
             )
         writer = SpoolWriter(self._folder, min_free_bytes=self._limits.min_free_bytes)
         try:
@@ -139,8 +140,8 @@ class _Unpacking:
 
     def _check_manifest(self, name: str, spooled: Spooled, same_manifest: SameManifest) -> None:
         if not same_manifest(spooled.path.read_bytes()):
-            raise Refusal.OTHER_MANIFEST(
+            raise OtherManifest(
                 f"entry {shown(name)} of the archive is another manifest than the drive's",
-                "Leave it out to use the drive's manifest, or create a new drive with this one.",
+                remedy="Leave it out to use the drive's manifest, or create a new drive with this one.",
             )
         spooled.discard()

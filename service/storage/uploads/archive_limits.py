@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.errors import ServiceError
-from service.storage.uploads.archive_errors import Refusal, shown
+from service.errors import (
+    ArchiveTooLarge,
+    ServiceError,
+)
+from service.storage.uploads.archive_errors import shown
 
 # Below this nothing is a bomb, and short files of one colour compress a thousandfold.
 SMALL_BYTES = 65_536
@@ -61,10 +64,10 @@ class Budget:
         if self._entries > limits.max_entries:
             raise too_many_entries(f"over {limits.max_entries}", limits.max_entries)
         if size_bytes > limits.max_file_bytes:
-            raise Refusal.TOO_LARGE(
+            raise ArchiveTooLarge(
                 f"entry {shown(name)} of the archive has {size_bytes} bytes, the bound of one file is "
                 f"{limits.max_file_bytes}",
-                "Leave it out, or make it smaller.",
+                remedy="Leave it out, or make it smaller.",
             )
         if self._bytes > limits.max_bytes:
             raise too_many_bytes(f"over {limits.max_bytes}", limits.max_bytes, name)
@@ -72,17 +75,17 @@ class Budget:
 
 def too_many_entries(count: str, max_entries: int) -> ServiceError:
     """The archive holds more entries than the limit."""
-    return Refusal.TOO_LARGE(
+    return ArchiveTooLarge(
         f"the archive has {count} entries, the bound is {max_entries}",
-        "Put only the drive's files into it, or send several archives.",
+        remedy="Put only the drive's files into it, or send several archives.",
     )
 
 
 def too_many_bytes(size: str, max_bytes: int, name: str | bytes) -> ServiceError:
     """The archive unpacks to more bytes than the limit, from the named entry on."""
-    return Refusal.TOO_LARGE(
+    return ArchiveTooLarge(
         f"the archive unpacks to {size} bytes with entry {shown(name)}, the bound is {max_bytes}",
-        "Send the drive in several archives.",
+        remedy="Send the drive in several archives.",
     )
 
 
@@ -100,8 +103,8 @@ def require_ratio(what: str, *, packed_bytes: int, unpacked_bytes: int, max_rati
         422 `archive-too-large`, if the compression ratio is over `max_ratio`.
     """
     if unpacked_bytes > SMALL_BYTES and unpacked_bytes > max_ratio * packed_bytes:
-        raise Refusal.TOO_LARGE(
+        raise ArchiveTooLarge(
             f"{what} unpacks to {unpacked_bytes} bytes from {packed_bytes}: the compression ratio is over "
             f"{max_ratio:g}, as no image's is",
-            "Make the archive of the drive's images, without compression if need be.",
+            remedy="Make the archive of the drive's images, without compression if need be.",
         )

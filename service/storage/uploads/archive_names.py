@@ -6,8 +6,13 @@ import re
 from collections.abc import Collection
 
 from schemas.file_names import MANIFEST_NAME, composed, portable_key
-from service.errors import ServiceError
-from service.storage.uploads.archive_errors import Refusal, shown
+from service.errors import (
+    EmptyArchive,
+    ServiceError,
+    UnexpectedFile,
+    UnsafeArchive,
+)
+from service.storage.uploads.archive_errors import shown
 
 _MAX_NAME_BYTES = 1024  # the manifest's paths have up to 512 characters, and a top folder may come before them
 _SHOWN_NAMES = 5
@@ -25,7 +30,9 @@ def safe_name(raw: bytes, *, is_folder: bool = False) -> str:
         422 `unsafe-archive`, if the name could mean a place outside the drive, or not the same on every system.
     """
     if not raw:
-        raise Refusal.UNSAFE("an entry of the archive has an empty name", "Make the archive again with another tool.")
+        raise UnsafeArchive(
+            "an entry of the archive has an empty name", remedy="Make the archive again with another tool."
+        )
     if len(raw) > _MAX_NAME_BYTES:
         raise _unsafe(raw, f"has a name of {len(raw)} bytes, the bound is {_MAX_NAME_BYTES}", "Give it a shorter name.")
     try:
@@ -80,7 +87,7 @@ class EntryNames:
         if len(self._keys) == len(self._names):
             how = "twice" if first == name else f"beside {shown(first)}, which many systems take for the same file"
             remedy = "Make the archive again with each file once, under names that differ in more than case."
-            raise Refusal.UNSAFE(f"entry {shown(name)} is in the archive {how}", remedy)
+            raise UnsafeArchive(f"entry {shown(name)} is in the archive {how}", remedy=remedy)
         self._names.append(name)
         return self._file(name) is not None or self._file(_without_top(name)) is not None
 
@@ -93,7 +100,7 @@ class EntryNames:
             422 `empty-archive` if no name was added, 422 `unexpected-file` if one is no file of the drive.
         """
         if not self._names:
-            raise Refusal.EMPTY("the archive holds no file", "Put the drive's images into it.")
+            raise EmptyArchive("the archive holds no file", remedy="Put the drive's images into it.")
         found = {name: self._file(name) for name in self._names}
         if None in found.values() and self._has_common_top():
             stripped = {name: self._file(_without_top(name)) for name in self._names}
@@ -138,13 +145,13 @@ def _problem(name: str) -> str | None:
 
 
 def _unsafe(name: bytes, problem: str, remedy: str) -> ServiceError:
-    return Refusal.UNSAFE(f"entry {shown(name)} of the archive {problem}", remedy)
+    return UnsafeArchive(f"entry {shown(name)} of the archive {problem}", remedy=remedy)
 
 
 def _unexpected(names: list[str], expected: int) -> ServiceError:
     more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
     listed = ", ".join(shown(name) for name in names[:_SHOWN_NAMES])
-    return Refusal.UNEXPECTED(
+    return UnexpectedFile(
         f"{len(names)} files of the archive are none of the {expected} files of the drive's manifest: {listed}{more}",
-        "Leave them out, or name them as the manifest does; one top folder around all files is fine.",
+        remedy="Leave them out, or name them as the manifest does; one top folder around all files is fine.",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from schemas.image_header import ImageHeader, ImageHeaderError, header_of
-from service.errors import ServiceError
+from service.errors import ImageRefused
 
 
 def check_image(path: Path, name: str) -> ImageHeader:
@@ -28,4 +28,4 @@ def check_image(path: Path, name: str) -> ImageHeader:
         with open(path, "rb") as stream:
             return header_of(stream, name)
     except ImageHeaderError as error:
-        raise ServiceError(422, error.code, "The image is refused", error.what, remedy=error.remedy) from None
+        raise ImageRefused(error.what, remedy=error.remedy, code=error.code) from None

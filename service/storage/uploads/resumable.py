@@ -20,7 +20,11 @@ from typing import Protocol
 
 import anyio
 
-from service.errors import ServiceError
+from service.errors import (
+    ServiceError,
+    TooLarge,
+    UploadLocked,
+)
 from service.storage.spool import BATCH_BYTES, BatchWriter, DiskLimiter, Part, full_disk_is_507, require_space
 
 _FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC
@@ -235,10 +239,7 @@ def _listed(folder: Path) -> list[str]:
 
 
 def _locked(upload_id: str) -> ServiceError:
-    return ServiceError(
-        423,
-        "upload-locked",
-        "The upload is being written",
+    return UploadLocked(
         f"another request is sending bytes of upload {upload_id}",
         remedy="Wait until it has ended, then ask for the offset and go on from there.",
         headers={"Retry-After": "1"},
@@ -246,10 +247,7 @@ def _locked(upload_id: str) -> ServiceError:
 
 
 def _too_long(max_bytes: int) -> ServiceError:
-    return ServiceError(
-        413,
-        "too-large",
-        "Too large",
+    return TooLarge(
         f"the request has more than the {max_bytes} bytes that are missing",
         remedy="Send no more than Upload-Length says.",
     )

@@ -14,8 +14,14 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any, BinaryIO, cast
 
-from service.errors import ServiceError
-from service.storage.uploads.archive_errors import Refusal, damaged, shown
+from service.errors import (
+    ArchiveTooLarge,
+    NotAnArchive,
+    ServiceError,
+    UnsafeArchive,
+    UnsupportedArchive,
+)
+from service.storage.uploads.archive_errors import damaged, shown
 from service.storage.uploads.archive_limits import SMALL_BYTES, ArchiveLimits, Budget, require_ratio
 from service.storage.uploads.archive_names import safe_name
 from service.storage.uploads.decompress import ERRORS, MAX_XZ_MEMORY_BYTES, Packed, unpacked
@@ -104,9 +110,9 @@ class _Stream(io.BufferedIOBase):
             raise damaged(f"a header behind {self.where} declares a negative size")
         self._left_bytes -= size
         if self._left_bytes < 0:
-            raise Refusal.TOO_LARGE(
+            raise ArchiveTooLarge(
                 f"the archive has headers of over {_MAX_HEADER_BYTES} bytes for one entry, behind {self.where}",
-                "Make the archive without extended attributes (tar --no-xattrs).",
+                remedy="Make the archive without extended attributes (tar --no-xattrs).",
             )
         self.latest = self._whole(size)
         return self.latest
@@ -126,8 +132,8 @@ class _Stream(io.BufferedIOBase):
             raise self._refusal(error) from None
         self._packed.unpacked_bytes += len(data)
         if self._packed.unpacked_bytes > self._max_bytes:
-            raise Refusal.TOO_LARGE(
-                f"the archive unpacks to over {self._max_bytes} bytes", "Send the drive in several archives."
+            raise ArchiveTooLarge(
+                f"the archive unpacks to over {self._max_bytes} bytes", remedy="Send the drive in several archives."
             )
         self._check_ratio("the archive", self._packed.packed_bytes, self._packed.unpacked_bytes)
         # What was read ahead of the entry may belong to it.
@@ -147,9 +153,9 @@ class _Stream(io.BufferedIOBase):
 
     def _refusal(self, error: Exception) -> ServiceError:
         if isinstance(error, lzma.LZMAError) and "emory" in str(error):
-            return Refusal.UNSUPPORTED(
+            return UnsupportedArchive(
                 f"the archive needs over {MAX_XZ_MEMORY_BYTES // 1_000_000} MB of memory to be unpacked",
-                "Compress it with xz -9 at most, or with gzip.",
+                remedy="Compress it with xz -9 at most, or with gzip.",
             )
         return damaged(f"its {self._compression} data are damaged or truncated, or other bytes follow them")
 
@@ -161,9 +167,9 @@ def _require_tar(stream: _Stream) -> None:
         if block != bytes(tarfile.BLOCKSIZE):
             tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
     except tarfile.HeaderError:
-        raise Refusal.NOT_AN_ARCHIVE(
+        raise NotAnArchive(
             "the file is neither a zip nor a tar archive",
-            "Send a zip, or a tar that is plain or compressed with gzip, bzip2 or xz.",
+            remedy="Send a zip, or a tar that is plain or compressed with gzip, bzip2 or xz.",
         ) from None
 
 
@@ -186,8 +192,9 @@ def _forget(archive: Any) -> None:
     """Drop the entry and the comments for all entries, as git's, that the archive keeps in memory."""
     for key in archive.pax_headers:
         if key in ("path", "size", "linkpath") or key.startswith(_SPARSE_KEY):
-            raise Refusal.UNSUPPORTED(
-                f"the archive gives all its entries the same {key!r}", "Make the archive again with another tool."
+            raise UnsupportedArchive(
+                f"the archive gives all its entries the same {key!r}",
+                remedy="Make the archive again with another tool.",
             )
     archive.pax_headers.clear()
     archive.members.clear()
@@ -201,8 +208,8 @@ def _checked_name(member: tarfile.TarInfo) -> str:
     elif kind is None and member.type not in _FILES and not member.isdir():
         kind = f"of the unknown type {shown(member.type)}"
     if kind is not None:
-        raise Refusal.UNSAFE(
-            f"entry {shown(raw_name)} of the archive is {kind}", "Put the file itself into the archive."
+        raise UnsafeArchive(
+            f"entry {shown(raw_name)} of the archive is {kind}", remedy="Put the file itself into the archive."
         )
     name = safe_name(raw_name, is_folder=member.isdir())
     # Tarfile takes a pax size that is not a number for 0.

@@ -14,7 +14,8 @@ import zlib
 from collections.abc import Iterator
 from typing import BinaryIO
 
-from service.storage.uploads.archive_errors import Refusal, damaged, shown
+from service.errors import ArchiveTooLarge, UnsafeArchive, UnsupportedArchive
+from service.storage.uploads.archive_errors import damaged, shown
 from service.storage.uploads.archive_limits import ArchiveLimits, Budget, require_ratio, too_many_entries
 from service.storage.uploads.archive_names import safe_name
 
@@ -106,9 +107,9 @@ def _check_directory(stream: BinaryIO, archive_bytes: int, limits: ArchiveLimits
         raise too_many_entries(str(declared), limits.max_entries)
     max_bytes = limits.max_entries * _DIRECTORY_BYTES_PER_ENTRY
     if size_bytes > max_bytes:
-        raise Refusal.TOO_LARGE(
+        raise ArchiveTooLarge(
             f"the archive's directory has {size_bytes} bytes, the bound is {max_bytes}",
-            "Make the archive without comments and extended attributes.",
+            remedy="Make the archive without comments and extended attributes.",
         )
     stream.seek(offset)
     if stream.read(size_bytes).count(b"PK\x01\x02") > limits.max_entries:  # zipfile goes by the size, not the number
@@ -138,7 +139,7 @@ def _find_directory(stream: BinaryIO, archive_bytes: int) -> tuple[int, int, int
             raise damaged("its zip64 directory end does not lie where it says")
         disk = disk or disks > 1
     if disk or start_disk or entries_here != entries:
-        raise Refusal.UNSUPPORTED("the archive is one part of several", "Send one archive that is not split.")
+        raise UnsupportedArchive("the archive is one part of several", remedy="Send one archive that is not split.")
     if offset + size_bytes != end_offset:
         raise damaged("its directory does not lie where it says")
     return entries, size_bytes, offset
@@ -152,7 +153,7 @@ def _checked_name(info: zipfile.ZipInfo) -> tuple[str, bool]:
     name = safe_name(raw_name, is_folder=is_folder)
     if kind in _FILE_KINDS:
         what = f"entry {shown(name)} of the archive is {_FILE_KINDS[kind]}"
-        raise Refusal.UNSAFE(what, "Put the file itself into the archive.")
+        raise UnsafeArchive(what, remedy="Put the file itself into the archive.")
     return name, is_folder
 
 
@@ -160,13 +161,15 @@ def _check_content(info: zipfile.ZipInfo, name: str, end: int, max_ratio: float)
     """Refuse what is encrypted, not deflated, or in another's place; `end` is where the next entry begins."""
     entry = f"entry {shown(name)} of the archive"
     if info.flag_bits & _ENCRYPTED:
-        raise Refusal.UNSUPPORTED(f"{entry} is encrypted", "Make the archive without a password.")
+        raise UnsupportedArchive(f"{entry} is encrypted", remedy="Make the archive without a password.")
     if info.volume not in (0, 0xFFFF):
-        raise Refusal.UNSUPPORTED(f"{entry} lies in another of several parts", "Send one archive that is not split.")
+        raise UnsupportedArchive(
+            f"{entry} lies in another of several parts", remedy="Send one archive that is not split."
+        )
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & _PATCH:
         method = _METHODS.get(info.compress_type, f"method {info.compress_type}")
-        raise Refusal.UNSUPPORTED(
-            f"{entry} is compressed with {method}", "Make the archive with Deflate, or without compression."
+        raise UnsupportedArchive(
+            f"{entry} is compressed with {method}", remedy="Make the archive with Deflate, or without compression."
         )
     # The local header has the same name, so that the content ends here at the earliest.
     name_bytes = len(info.orig_filename.encode("utf-8"))
