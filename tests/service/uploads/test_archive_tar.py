@@ -15,7 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from test_archive import Unpacker, png, tar_of
+
+from tests.service.uploads.test_archive import Unpacker, png, tar_of
 
 NAME = "front/0.png"
 IMAGE = png()

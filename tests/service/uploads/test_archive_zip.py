@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_archive import LIMITS, Unpacker, png, zip_of
 
 from service.storage.uploads.archive import ArchiveLimits
 from service.storage.uploads.zip_reader import ZipReader
+from tests.service.uploads.test_archive import LIMITS, Unpacker, png, zip_of
 
 NAME = "front/0.png"
 

@@ -179,7 +179,7 @@ def following(case: Case) -> tuple[Problem, State]:
     return problem, follow(perturbed(truth, np.random.default_rng(0), units=range(1, units), unit_m=0.02, point_m=0.05))
 
 
-def test_pitfall_1_derivatives_follow_the_trajectory_that_moves_the_bands() -> None:
+def test_derivatives_follow_the_trajectory_that_moves_the_bands() -> None:
     free = {"free_units": [False] + [True] * 4, "free_cameras": [True] * 3}
     problem, state = following(make_case(units=5, cameras=3, points=120, **free))  # type: ignore[arg-type]
     n = problem.layout.size

@@ -67,7 +67,7 @@ def test_covariances_are_the_inverse_of_the_full_hessian(free_focal: bool) -> No
     assert found.sigma_scale == pytest.approx(np.sqrt(functional @ covariance[:12, :12] @ functional), rel=1e-3)
 
 
-def test_pitfall_9_the_sigma_of_scale_is_that_of_the_baseline() -> None:
+def test_the_sigma_of_scale_is_that_of_the_baseline() -> None:
     found = covariances(replace(stereo(1).problem, terms=[prior_of(stereo(1).truth)]), stereo(1).truth)
     # The baseline of 0.5 m is the difference of two positions with 0.01 m each: 2.8 %, and the images add little.
     assert 0.02 < found.sigma_scale < 0.04
@@ -77,7 +77,7 @@ def test_pitfall_9_the_sigma_of_scale_is_that_of_the_baseline() -> None:
     assert 1.7 < looser.sigma_scale / found.sigma_scale < 2.1
 
 
-def test_pitfall_9_the_sigma_of_scale_is_honest() -> None:
+def test_the_sigma_of_scale_is_honest() -> None:
     normalised = []
     for seed in range(20):
         case = stereo(seed)
@@ -113,7 +113,7 @@ def test_one_free_unit_has_no_scale() -> None:
     assert np.isnan(covariances(case.problem, case.truth).sigma_scale)
 
 
-def test_pitfall_9_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> None:
+def test_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> None:
     """On a straight flat drive the images tell the cameras from one another, and neither their mean nor their scale."""
     case = make_case(
         units=8,

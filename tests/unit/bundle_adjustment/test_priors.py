@@ -107,7 +107,7 @@ def test_camera_pose_prior_holds_each_direction_by_its_own_sigma_and_the_gauge_b
 
 
 @pytest.mark.parametrize("lever_arm_m", [[0.0, 0.0, 0.0], [-0.8, 0.3, 1.9]])
-def test_pitfall_4_position_prior_differentiates_its_lever_arm(lever_arm_m: list[float]) -> None:
+def test_position_prior_differentiates_its_lever_arm(lever_arm_m: list[float]) -> None:
     case, state = free_case()
     arm = np.array(lever_arm_m)
     prior = PositionPrior(
@@ -139,7 +139,7 @@ def test_position_prior_is_zero_where_the_antenna_was_measured() -> None:
     assert without_arm.cost(case.truth) > 10
 
 
-def test_pitfall_4_one_wrong_position_loses_its_pull() -> None:
+def test_one_wrong_position_loses_its_pull() -> None:
     case, _ = free_case()
 
     def pull(off_m: float) -> float:
@@ -303,7 +303,7 @@ def gauge_case(seed: int = 0) -> Case:
     )
 
 
-def test_pitfall_9_moving_all_cameras_together_changes_no_image_and_is_held() -> None:
+def test_moving_all_cameras_together_changes_no_image_and_is_held() -> None:
     case = gauge_case()
     # Every rig_from_cam moves by one transform, every unit by its inverse.
     shift = se3.transform(se3.exp_so3(np.radians([0.3, -0.5, 0.8])), [0.03, -0.02, 0.04])
@@ -342,7 +342,7 @@ def solve_with_bad_camera(axis: int, error_deg: float) -> tuple[Case, Calibratio
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_pitfall_9_one_bad_camera_is_found_and_the_others_keep_their_places_to_each_other(axis: int) -> None:
+def test_one_bad_camera_is_found_and_the_others_keep_their_places_to_each_other(axis: int) -> None:
     case, prior, solution, _ = solve_with_bad_camera(axis, 3.0)
     relative = np.swapaxes(solution.camera_rotation[[0]], 1, 2) @ solution.camera_rotation
     true_relative = np.swapaxes(case.truth.camera_rotation[[0]], 1, 2) @ case.truth.camera_rotation
@@ -353,7 +353,7 @@ def test_pitfall_9_one_bad_camera_is_found_and_the_others_keep_their_places_to_e
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_pitfall_9_one_bad_camera_does_not_pull_the_others(axis: int) -> None:
+def test_one_bad_camera_does_not_pull_the_others(axis: int) -> None:
     case, _, solution, _ = solve_with_bad_camera(axis, 3.0)
     errors = rotation_errors_deg(solution.camera_rotation, case.truth.camera_rotation)
     assert 1e-4 < errors.max() < 0.1

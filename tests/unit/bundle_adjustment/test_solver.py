@@ -214,7 +214,7 @@ def test_repeating_a_solve_gives_the_same_bits() -> None:
     np.testing.assert_array_equal(a.points_m, b.points_m)
 
 
-def test_pitfall_2_scale_comes_from_the_rig() -> None:
+def test_scale_comes_from_the_rig() -> None:
     """The same images with baselines twice as long are the same scene twice as large."""
     case = make_case(units=6, cameras=2, points=600, noise_px=0.0, free_units=[False] + [True] * 5)
     doubled = replace(

@@ -29,7 +29,7 @@ def track(t_us: np.ndarray, position: np.ndarray, sigma_m: float = 0.05, good: n
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pitfall_4_gross_errors_are_found_and_only_those(seed: int) -> None:
+def test_gross_errors_are_found_and_only_those(seed: int) -> None:
     rng = np.random.default_rng(seed)
     t = times_us(120)
     position, _ = bend(t)
@@ -41,7 +41,7 @@ def test_pitfall_4_gross_errors_are_found_and_only_those(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pitfall_4_gross_errors_in_bursts_are_all_found(seed: int) -> None:
+def test_gross_errors_in_bursts_are_all_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
     t = times_us(120)
     position, _ = bend(t)
@@ -54,7 +54,7 @@ def test_pitfall_4_gross_errors_in_bursts_are_all_found(seed: int) -> None:
     assert bad.sum() - 10 <= 3
 
 
-def test_pitfall_4_a_jump_that_stays_costs_no_more_than_its_edge() -> None:
+def test_a_jump_that_stays_costs_no_more_than_its_edge() -> None:
     t = times_us(100)
     position, _ = bend(t)
     position[50:] += [0.0, 0.0, 30.0]
@@ -108,7 +108,7 @@ def test_a_track_of_hardly_any_samples_answers_all_the_same(samples: int) -> Non
     assert np.isfinite(position).all(1).sum() == samples
 
 
-def test_pitfall_4_the_rough_trajectory_applies_the_lever_arm() -> None:
+def test_the_rough_trajectory_applies_the_lever_arm() -> None:
     rng = np.random.default_rng(0)
     t = times_us(100)
     rig, heading = bend(t)
@@ -125,7 +125,7 @@ def test_pitfall_4_the_rough_trajectory_applies_the_lever_arm() -> None:
 
 @pytest.mark.parametrize("drift", [False, True])
 @pytest.mark.parametrize("sigma_m", [0.05, 1.0])
-def test_pitfall_4_a_standing_car_keeps_the_heading_it_came_with(sigma_m: float, drift: bool) -> None:
+def test_a_standing_car_keeps_the_heading_it_came_with(sigma_m: float, drift: bool) -> None:
     rng = np.random.default_rng(1)
     t = times_us(400)
     along = np.minimum(np.arange(400) * 0.5, 50.0)  # 5 m/s north-east for 10 s, then 30 s at a light
@@ -142,7 +142,7 @@ def test_pitfall_4_a_standing_car_keeps_the_heading_it_came_with(sigma_m: float,
     assert np.linalg.norm(poses[-1, :3, 3] - [30.0, 40.0, 0.0]) < max(0.3, 4 * sigma_m)
 
 
-def test_pitfall_4_gross_errors_are_left_out_of_the_rough_trajectory() -> None:
+def test_gross_errors_are_left_out_of_the_rough_trajectory() -> None:
     t = times_us(60)
     rig, _ = bend(t)
     antenna = rig.copy()

@@ -76,7 +76,7 @@ def judge(mapper: Mapper, *, georeferenced: bool = False) -> str:
     return ("free: " if verdict.free else "held: ") + verdict.reason
 
 
-def test_pitfall_9_calibration_is_freed_only_where_it_is_observed() -> None:
+def test_calibration_is_freed_only_where_it_is_observed() -> None:
     assert "straight" in judge(true_model(straight=True))
     assert judge(true_model(straight=True)).startswith("held")
     assert judge(true_model(units=40)).startswith("free")

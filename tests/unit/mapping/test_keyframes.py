@@ -52,7 +52,7 @@ def reconstruct(simulated: SimulatedDrive) -> Mapper:
 
 
 @pytest.mark.parametrize("where", STOPS)
-def test_pitfall_6_a_stop_has_one_keyframe_and_all_its_units_have_poses(where: str) -> None:
+def test_a_stop_has_one_keyframe_and_all_its_units_have_poses(where: str) -> None:
     simulated = drive(STOPS[where])
     mapper = reconstruct(simulated)
     stands = np.diff(np.cumsum(STOPS[where]), prepend=-1.0) == 0

@@ -54,7 +54,7 @@ def between(poses: np.ndarray, a: int, b: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pitfall_10_closing_a_loop_spreads_the_drift(seed: int) -> None:
+def test_closing_a_loop_spreads_the_drift(seed: int) -> None:
     true = ring()
     start = drifted(true, np.random.default_rng(seed))
     before = np.linalg.norm(start[:, :3, 3] - true[:, :3, 3], axis=1)
@@ -77,7 +77,7 @@ def test_a_graph_that_agrees_does_not_move() -> None:
     np.testing.assert_allclose(closed, true, atol=1e-9)
 
 
-def test_pitfall_7_one_wrong_loop_among_right_ones_is_outvoted() -> None:
+def test_one_wrong_loop_among_right_ones_is_outvoted() -> None:
     true = ring()
     start = drifted(true, np.random.default_rng(0))
     right = [(a, b, between(true, a, b)) for a in (0, 1, 2) for b in (37, 38, 39)]
@@ -131,7 +131,7 @@ def test_pairs_are_split_by_the_gap_between_their_units() -> None:
     assert {int(unit[p.image_b] - unit[p.image_a]) for p in far} == {5, 6, 7}
 
 
-def test_pitfall_10_revisits_tell_the_drift_and_close_it() -> None:
+def test_revisits_tell_the_drift_and_close_it() -> None:
     simulated, mapper, far = drifted_model()
     revisits, tried = find_revisits(mapper, far)
     assert tried >= len(revisits) >= 3
@@ -151,7 +151,7 @@ def test_pitfall_10_revisits_tell_the_drift_and_close_it() -> None:
     assert 0.2 < moved_m < 0.7
 
 
-def test_pitfall_7_alike_places_are_not_believed() -> None:
+def test_alike_places_are_not_believed() -> None:
     """Matches between places that only look alike: each pair of units tells another drift, or none."""
     _, mapper, far = drifted_model()
     rng = np.random.default_rng(0)

@@ -57,7 +57,7 @@ def relative_errors_deg(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray
 
 
 @pytest.mark.parametrize("straight", [False, True])
-def test_pitfall_5_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
+def test_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
     """Also on a straight street without positions, where the calibration as a whole is held."""
     simulated = drive(turned(2), straight=straight)
     mapper, result = refined(simulated)

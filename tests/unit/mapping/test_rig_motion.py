@@ -114,7 +114,7 @@ def test_a_unit_is_registered_with_the_motion_of_its_neighbours() -> None:
 
 
 @pytest.mark.parametrize("with_prior", [True, False])
-def test_pitfall_1_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_prior: bool) -> None:
+def test_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_prior: bool) -> None:
     def mapped(simulated: SimulatedDrive, config: EngineConfig) -> tuple[Mapper, MappingLog]:
         pairs = true_matches(simulated)
         mapper = make_model(simulated, pairs, config)

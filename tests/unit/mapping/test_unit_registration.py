@@ -50,7 +50,7 @@ def test_a_unit_is_registered_over_all_its_cameras(cameras: int) -> None:
 
 @pytest.mark.parametrize("camera", [0, 5])
 @pytest.mark.parametrize("error_deg", [3.0, 15.0])
-def test_pitfall_5_a_camera_with_a_wrong_extrinsic_is_voted_out_by_name(camera: int, error_deg: float) -> None:
+def test_a_camera_with_a_wrong_extrinsic_is_voted_out_by_name(camera: int, error_deg: float) -> None:
     simulated, mapper = scene()
     turn_camera(mapper, camera, error_deg)
     result = register_unit(mapper, UNIT)
@@ -61,7 +61,7 @@ def test_pitfall_5_a_camera_with_a_wrong_extrinsic_is_voted_out_by_name(camera: 
     assert 1e-5 < rotation_deg < 0.3
 
 
-def test_pitfall_5_an_occluded_camera_gets_its_pose_from_the_unit() -> None:
+def test_an_occluded_camera_gets_its_pose_from_the_unit() -> None:
     simulated, mapper = scene(hidden=lambda unit, camera: camera == 0 and unit >= 4)
     names = [c.name for c in simulated.drive.cameras]
     result = register_unit(mapper, UNIT)

@@ -48,7 +48,7 @@ def test_planted_matches_are_found_and_nothing_else() -> None:
     assert sorted(map(tuple, matches.tolist())) == sorted(zip(order.tolist(), range(120), strict=True))
 
 
-def test_pitfall_7_what_repeats_does_not_match() -> None:
+def test_what_repeats_does_not_match() -> None:
     rng = np.random.default_rng(2)
     d = random_descriptors(30, rng)
     alike = [np.clip(d.astype(int) + rng.integers(-6, 7, d.shape), 0, 255).astype(np.uint8) for _ in range(2)]

@@ -60,7 +60,7 @@ def test_pairs_of_different_places_are_rejected_and_counted() -> None:
     assert result.few_matches + result.few_inliers == 1
 
 
-def test_pitfall_5_inside_a_unit_the_calibration_must_agree() -> None:
+def test_inside_a_unit_the_calibration_must_agree() -> None:
     """With a camera turned by far more than the gate, matches inside units go, those over time stay."""
     config = MatchConfig()
     results = []

@@ -44,7 +44,7 @@ def places_of_a_loop() -> list[int]:
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_pitfall_10_a_place_seen_again_is_found(cameras: int) -> None:
+def test_a_place_seen_again_is_found(cameras: int) -> None:
     drive = drive_of(cameras)
     pairs = revisit_pairs(drive, features_of(places_of_a_loop(), cameras), PairConfig(revisit_pairs_per_unit=2))
     unit = np.array([i.unit for i in drive.images])[pairs]

@@ -1,4 +1,4 @@
-"""Whole drives: files, truth, and every pitfall that can be asked for."""
+"""Whole drives: files, truth, and every difficulty that an option adds."""
 
 import argparse
 import json
@@ -182,7 +182,7 @@ def test_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pitfalls_show_in_the_manifest(tmp_path: Path) -> None:
+def test_difficulties_show_in_the_manifest(tmp_path: Path) -> None:
     out = tmp_path / "drive"
     render_drives(
         small_options(

@@ -87,7 +87,7 @@ def test_random_matches_never_put_two_keypoints_of_an_image_together(seed: int) 
     assert len(tracks) > 5
 
 
-def test_pitfall_7_planted_wrong_matches_do_not_merge_everything() -> None:
+def test_planted_wrong_matches_do_not_merge_everything() -> None:
     simulated = make_simulated_drive(units=6, cameras=2, points=500, clutter=20)
     keypoints = Keypoints.from_features(simulated.drive, simulated.features)
     truth = np.concatenate(simulated.point_of_keypoint)

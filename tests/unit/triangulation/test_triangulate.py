@@ -167,7 +167,7 @@ def test_too_small_an_angle_gives_no_point() -> None:
     assert not strict.triangulated.any()
 
 
-def test_pitfall_6_a_standing_car_gives_no_points() -> None:
+def test_a_standing_car_gives_no_points() -> None:
     s = setting(some_points(20), step_m=0.0, noise_px=0.3)
     s.state.unit_position_m[:] = 0.0
     s.run()

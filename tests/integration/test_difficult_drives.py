@@ -1,4 +1,4 @@
-"""What drives do to a reconstruction (pitfalls of the method), each on a small rendered drive."""
+"""Difficult drives: standing, moving objects, occlusion, cameras apart in time; each on a small rendered drive."""
 
 from __future__ import annotations
 
