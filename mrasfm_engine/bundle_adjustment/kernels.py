@@ -20,8 +20,8 @@ Where the motion within a unit follows from the trajectory, a row band's pose ta
 (`support`, with `weight` w): d/dtau_i = -w_i N and d/domega_i = w_i N x (X - t_band). Left out is that a turned unit
 also bends the way to its neighbours, which is small where a unit's step is short against the depth of points. A row
 band that is held to its unit has no other support, and the derivatives above. Where all images are taken at their
-unit's time, band_r, band_t, support, weight and obs_band are None: numba compiles the kernels without them, so that
-nobody pays for what is not there.
+unit's time, `bands` and `motion` are None: numba compiles the kernels without them, so that nobody pays for what is
+not there.
 
 Products of Jacobians need not be formed one observation at a time. With d = X - t_u and V = N' N all that an
 observation adds to its unit's block follows from V and V [d]x, and as d/dcamera = d/dunit T with a T that all
@@ -39,68 +39,128 @@ border of the cameras' rows, and of the cameras' own square; each holds its entr
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS
+from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS, Groups
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.types import Bools, Floats, Ints
 
 BEHIND_PX = 1000.0  # what an observation costs whose point is behind the camera
 MIN_DEPTH_M = 1e-3
 IMAGE_SUMS = 35  # unit's block by its lower triangle, gradient, with the focal length, focal length's own
 
 
+class Views(NamedTuple):
+    """Poses of units (u, 3, 3), (u, 3) and of cameras (c, 3, 3), (c, 3); the cameras' kinds and parameters (c, 8)."""
+
+    unit_r: Floats
+    unit_t: Floats
+    cam_r: Floats
+    cam_t: Floats
+    kind: Ints
+    params: Floats
+
+
+class Bands(NamedTuple):
+    """Poses (s, 3, 3) and (s, 3) of row bands in their units, and the row band (n,) of every observation."""
+
+    r: Floats
+    t: Floats
+    of_observation: Ints
+
+
+class Motion(NamedTuple):
+    """Units (s, 3) whose steps move a row band, and their weights (s, 3): see `problem.RowBandMotion`."""
+
+    support: Ints
+    weight: Floats
+
+
+class Observed(NamedTuple):
+    """Unit, camera, point (n,) and pixel (n, 2) of every observation, by point; first one (p + 1,) of every point."""
+
+    unit: Ints
+    camera: Ints
+    point: Ints
+    xy: Floats
+    first: Ints
+    fixed: Bools
+
+
+class Slots(NamedTuple):
+    """Slots of units and cameras in the reduced vector, -1 where held; number of free units."""
+
+    unit: Ints
+    camera: Ints
+    num_units: int
+
+
+class Sums(NamedTuple):
+    """Output of `accumulate`: sums by image, blocks of the reduced matrix, its gradient, V^-1 and e of the points."""
+
+    images: Floats
+    units: Floats
+    border: Floats
+    cameras: Floats
+    gradient: Floats
+    v_inverse: Floats
+    v_gradient: Floats
+
+
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def camera_point(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, band: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
+    unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
     from_unit: Any, rig: Any, cam: Any,
 ) -> None:  # fmt: skip
     """from_unit = X - t_u (X - t_band where the row band follows several units), rig = x_band - t_c, cam = x_cam."""
     for i in range(3):
         from_unit[i] = x[i] - unit_t[i]
-    if band_r is None:
+    if bands is None:
         for i in range(3):
             rig[i] = unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2] - cam_t[i]
     else:
         for i in range(3):
             cam[i] = (
                 unit_r[0, i] * from_unit[0] + unit_r[1, i] * from_unit[1] + unit_r[2, i] * from_unit[2]
-                - band_t[band, i]
+                - bands.t[band, i]
             )  # fmt: skip
         if follows:
             for i in range(3):
                 from_unit[i] = unit_r[i, 0] * cam[0] + unit_r[i, 1] * cam[1] + unit_r[i, 2] * cam[2]
         for i in range(3):
-            rig[i] = band_r[band, 0, i] * cam[0] + band_r[band, 1, i] * cam[1] + band_r[band, 2, i] * cam[2] - cam_t[i]
+            rig[i] = (
+                bands.r[band, 0, i] * cam[0] + bands.r[band, 1, i] * cam[1] + bands.r[band, 2, i] * cam[2] - cam_t[i]
+            )
     for i in range(3):
         cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def squared_errors(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_point: Any, obs_xy: Any, lo: int, hi: int, out: Any,
-) -> None:  # fmt: skip
+    views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any
+) -> None:
     """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared behind the camera."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for n in range(lo, hi):
-        u, c = obs_unit[n], obs_camera[n]
-        band = 0 if obs_band is None else obs_band[n]
+        u, c = observed.unit[n], observed.camera[n]
+        band = 0 if bands is None else bands.of_observation[n]
         camera_point(
-            unit_r[u], unit_t[u], band_r, band_t, band, False, cam_r[c], cam_t[c], points[obs_point[n]], d, rig, cam
-        )
+            views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c],
+            points[observed.point[n]], d, rig, cam,
+        )  # fmt: skip
         if cam[2] < MIN_DEPTH_M:
             out[n] = BEHIND_PX * BEHIND_PX
             continue
-        project(kind[c], params[c], cam[0], cam[1], cam[2], work, proj)
-        out[n] = (proj[0] - obs_xy[n, 0]) ** 2 + (proj[1] - obs_xy[n, 1]) ** 2
+        project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj)
+        out[n] = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def linearise(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, band: int, follows: bool, cam_r: Any, cam_t: Any,
+    unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, cam_r: Any, cam_t: Any,
     kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
 ) -> bool:  # fmt: skip
@@ -108,7 +168,7 @@ def linearise(
 
     Those in the unit follow from jx = N and d = X - t_u.
     """
-    camera_point(unit_r, unit_t, band_r, band_t, band, follows, cam_r, cam_t, x, d, rig, cam)
+    camera_point(unit_r, unit_t, bands, band, follows, cam_r, cam_t, x, d, rig, cam)
     if cam[2] < MIN_DEPTH_M:
         return False
     project(kind, k, cam[0], cam[1], cam[2], work, proj)
@@ -121,12 +181,12 @@ def linearise(
         m0 = p0 * cam_r[0, 0] + p1 * cam_r[0, 1] + p2 * cam_r[0, 2]
         m1 = p0 * cam_r[1, 0] + p1 * cam_r[1, 1] + p2 * cam_r[1, 2]
         m2 = p0 * cam_r[2, 0] + p1 * cam_r[2, 1] + p2 * cam_r[2, 2]
-        if band_r is None:
+        if bands is None:
             q0, q1, q2 = m0, m1, m2
         else:
-            q0 = m0 * band_r[band, 0, 0] + m1 * band_r[band, 0, 1] + m2 * band_r[band, 0, 2]
-            q1 = m0 * band_r[band, 1, 0] + m1 * band_r[band, 1, 1] + m2 * band_r[band, 1, 2]
-            q2 = m0 * band_r[band, 2, 0] + m1 * band_r[band, 2, 1] + m2 * band_r[band, 2, 2]
+            q0 = m0 * bands.r[band, 0, 0] + m1 * bands.r[band, 0, 1] + m2 * bands.r[band, 0, 2]
+            q1 = m0 * bands.r[band, 1, 0] + m1 * bands.r[band, 1, 1] + m2 * bands.r[band, 1, 2]
+            q2 = m0 * bands.r[band, 2, 0] + m1 * bands.r[band, 2, 1] + m2 * bands.r[band, 2, 2]
         n0 = q0 * unit_r[0, 0] + q1 * unit_r[0, 1] + q2 * unit_r[0, 2]
         n1 = q0 * unit_r[1, 0] + q1 * unit_r[1, 1] + q2 * unit_r[1, 2]
         n2 = q0 * unit_r[2, 0] + q1 * unit_r[2, 1] + q2 * unit_r[2, 2]
@@ -165,20 +225,21 @@ def invert3(v: Any, out: Any) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    support: Any, weight: Any, obs_unit: Any, obs_band: Any, obs_camera: Any, obs_image: Any, obs_xy: Any, first: Any,
-    fixed: Any, unit_slot: Any, camera_slot: Any, num_units: int,
-    order: Any, first_point: Any, blocks: Any, first_block: Any, places: Any, first_place: Any,
-    sigma: float, loss2: float, damping: float, lo: int, hi: int,
-    images: Any, s_units: Any, s_border: Any, s_cameras: Any, g: Any, v_inverse: Any, v_gradient: Any,
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, obs_image: Any,
+    slots: Slots, groups: Groups, sigma: float, loss2: float, damping: float, lo: int, hi: int, sums: Sums,
 ) -> None:  # fmt: skip
     """Eliminate points order[lo:hi].
 
-    Sums of observations by image are added to images (images, IMAGE_SUMS). What elimination takes off the matrix is
-    taken off blocks s_units (b, 36) of the units' pattern, s_border (cameras, units, 42) and s_cameras (cameras,
-    cameras, 49), of all three the lower blocks; what it takes off the gradient, off g (n,). Every point's V^-1 (p, 6)
-    and gradient (p, 3) are kept.
+    Sums of observations by image are added to `sums.images` (images, IMAGE_SUMS). The elimination is subtracted from
+    the matrix: from blocks (b, 36) of the units' pattern, (cameras, units, 42) of the border and (cameras, cameras, 49)
+    of the cameras, of all three the lower blocks, and from the gradient (n,). Every point's V^-1 (p, 6) and gradient
+    (p, 3) are kept.
     """
+    unit_r, unit_t, cam_r, cam_t, kind, params = views
+    obs_unit, obs_camera, _, obs_xy, first, fixed = observed
+    unit_slot, camera_slot, num_units = slots
+    order, first_point, blocks, first_block, places, first_place = groups
+    images, s_units, s_border, s_cameras, g, v_inverse, v_gradient = sums
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     jx, jc = np.empty((2, 3)), np.empty((2, 7))
     v, inv, e = np.empty(6), np.empty(6), np.empty(3)
@@ -195,10 +256,10 @@ def accumulate(
         w[: b1 - b0] = 0.0
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
-            band = 0 if obs_band is None else obs_band[n]
-            follows = False if weight is None else weight[band, 0] != 1.0
+            band = 0 if bands is None else bands.of_observation[n]
+            follows = False if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
-                unit_r[u], unit_t[u], band_r, band_t, band, follows, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], bands, band, follows, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
@@ -251,18 +312,18 @@ def accumulate(
             s[24] -= e0
             s[25] -= e1
             s[26] -= e2
-            if weight is None:
+            if motion is None:
                 su = unit_slot[u]
                 at = -1 if su < 0 else _find(blocks, b0, b1, su)
                 if at >= 0:
                     _add_unit(w[at], 1.0, t00, t01, t02, t10, t11, t12, t20, t21, t22, v00, v01, v02, v11, v12, v22)
             else:
                 for k in range(3):
-                    su = -1 if weight[band, k] == 0.0 else unit_slot[support[band, k]]
+                    su = -1 if motion.weight[band, k] == 0.0 else unit_slot[motion.support[band, k]]
                     at = -1 if su < 0 else _find(blocks, b0, b1, su)
                     if at >= 0:
                         _add_unit(
-                            w[at], weight[band, k],
+                            w[at], motion.weight[band, k],
                             t00, t01, t02, t10, t11, t12, t20, t21, t22, v00, v01, v02, v11, v12, v22,
                         )  # fmt: skip
             sc = camera_slot[c]
@@ -382,9 +443,9 @@ def _subtract_products(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def add_images(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_t: Any, support: Any, weight: Any, image_unit: Any,
-    image_camera: Any, image_band: Any, unit_slot: Any, camera_slot: Any, num_units: int, first_row: Any, rows: Any,
-    images: Any, s_units: Any, s_border: Any, s_cameras: Any, diagonal: Any, g: Any,
+    views: Views, bands: Bands | None, motion: Motion | None, image_unit: Any, image_camera: Any, image_band: Any,
+    slots: Slots, first_row: Any, rows: Any, images: Any, s_units: Any, s_border: Any, s_cameras: Any, diagonal: Any,
+    g: Any,
 ) -> None:  # fmt: skip
     """Add the sums of every image to the matrix, to the undamped diagonal (n,) and to the gradient (n,).
 
@@ -395,6 +456,7 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
+    unit_slot, camera_slot, num_units = slots
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
         u, c, band = image_unit[image], image_camera[image], image_band[image]
@@ -406,7 +468,7 @@ def add_images(
                 k += 1
         sc = camera_slot[c]
         if sc >= 0:
-            _camera_from_unit(unit_r[u], band_r, band_t, weight, band, cam_t[c], r, q, t)
+            _camera_from_unit(views.unit_r[u], bands, motion, band, views.cam_t[c], r, q, t)
             for i in range(6):
                 for j in range(6):
                     x = 0.0
@@ -433,13 +495,13 @@ def add_images(
             square[48] += s[33]
             diagonal[o + 6] += s[33]
         for a in range(3):
-            if weight is None:
+            if motion is None:
                 if a > 0:
                     break
                 wa, sa = 1.0, unit_slot[u]
             else:
-                wa = weight[band, a]
-                sa = -1 if wa == 0.0 else unit_slot[support[band, a]]
+                wa = motion.weight[band, a]
+                sa = -1 if wa == 0.0 else unit_slot[motion.support[band, a]]
             if sa < 0:
                 continue
             for i in range(6):
@@ -452,13 +514,13 @@ def add_images(
                         border[6 * i + j] += wa * th[i, j]
                     border[36 + j] += wa * s[27 + j]
             for b in range(3):
-                if weight is None:
+                if motion is None:
                     if b > 0:
                         break
                     wb, sb = 1.0, sa
                 else:
-                    wb = weight[band, b]
-                    sb = -1 if wb == 0.0 else unit_slot[support[band, b]]
+                    wb = motion.weight[band, b]
+                    sb = -1 if wb == 0.0 else unit_slot[motion.support[band, b]]
                 if sb < 0 or sb > sa:
                     continue
                 at = first_row[sb] + np.searchsorted(rows[first_row[sb] : first_row[sb + 1]], sa)
@@ -472,26 +534,26 @@ def add_images(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _camera_from_unit(
-    unit_r: Any, band_r: Any, band_t: Any, weight: Any, band: int, cam_t: Any, r: Any, q: Any, t: Any
+    unit_r: Any, bands: Bands | None, motion: Motion | None, band: int, cam_t: Any, r: Any, q: Any, t: Any
 ) -> None:
     """R, q and T of `add_images` for one image."""
-    if band_r is None:
+    if bands is None:
         for i in range(3):
             q[i] = 0.0
             for j in range(3):
                 r[i, j] = unit_r[i, j]
                 q[i] += unit_r[i, j] * cam_t[j]
     else:
-        follows = False if weight is None else weight[band, 0] != 1.0
+        follows = False if motion is None else motion.weight[band, 0] != 1.0
         for i in range(3):
             q[i] = 0.0
             for j in range(3):
                 r[i, j] = 0.0
                 for k in range(3):
-                    r[i, j] += unit_r[i, k] * band_r[band, k, j]
+                    r[i, j] += unit_r[i, k] * bands.r[band, k, j]
                 q[i] += r[i, j] * cam_t[j]
                 if not follows:
-                    q[i] += unit_r[i, j] * band_t[band, j]
+                    q[i] += unit_r[i, j] * bands.t[band, j]
     for j in range(3):
         for i in range(3):
             t[i, j] = t[3 + i, 3 + j] = r[i, j]
@@ -502,26 +564,27 @@ def _camera_from_unit(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    support: Any, weight: Any, obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any,
-    unit_slot: Any, camera_slot: Any, num_units: int,
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, slots: Slots,
     sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     jx, jc, e = np.empty((2, 3)), np.empty((2, 7)), np.empty(3)
+    unit_r, unit_t, cam_r, cam_t, kind, params = views
+    obs_unit, obs_camera, _, obs_xy, first, _ = observed
+    unit_slot, camera_slot, num_units = slots
     for p in range(lo, hi):
         for i in range(3):
             e[i] = v_gradient[p, i]
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
             su, sc = unit_slot[u], camera_slot[c]
-            if weight is None and su < 0 and sc < 0:
+            if motion is None and su < 0 and sc < 0:
                 continue
-            band = 0 if obs_band is None else obs_band[n]
-            follows = False if weight is None else weight[band, 0] != 1.0
+            band = 0 if bands is None else bands.of_observation[n]
+            follows = False if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
-                unit_r[u], unit_t[u], band_r, band_t, band, follows, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], bands, band, follows, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
@@ -529,13 +592,13 @@ def substitute(
             # A unit's step moves the residual as moving the point by (X - t_u) x omega - tau does.
             x0, x1, x2 = 0.0, 0.0, 0.0
             for a in range(3):
-                if weight is None:
+                if motion is None:
                     if a > 0:
                         break
                     wa, sa = 1.0, su
                 else:
-                    wa = weight[band, a]
-                    sa = -1 if wa == 0.0 else unit_slot[support[band, a]]
+                    wa = motion.weight[band, a]
+                    sa = -1 if wa == 0.0 else unit_slot[motion.support[band, a]]
                 if sa >= 0:
                     o = 6 * sa
                     x0 += wa * (d[1] * step[o + 2] - d[2] * step[o + 1] - step[o + 3])

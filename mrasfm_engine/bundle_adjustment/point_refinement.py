@@ -15,7 +15,16 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from mrasfm_engine.bundle_adjustment.kernels import BEHIND_PX, MIN_DEPTH_M, camera_point, invert3, linearise
+from mrasfm_engine.bundle_adjustment.kernels import (
+    BEHIND_PX,
+    MIN_DEPTH_M,
+    Bands,
+    Observed,
+    Views,
+    camera_point,
+    invert3,
+    linearise,
+)
 from mrasfm_engine.geometry.camera_model import project
 
 SETTLED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
@@ -24,20 +33,21 @@ WORTH = 3e-2  # gain an observation, after which a point is still far enough fro
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_cost(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
-    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, scale2: float, x: Any,
+    views: Views, bands: Bands | None, observed: Observed, begin: int, end: int, scale2: float, x: Any,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any,
 ) -> float:  # fmt: skip
     """Sum of log(1 + r^2 / scale^2) over a point's observations begin..end, were it at x; r in pixels."""
     result, product = 0.0, 1.0
     for n in range(begin, end):
-        u, c = obs_unit[n], obs_camera[n]
-        band = 0 if obs_band is None else obs_band[n]
-        camera_point(unit_r[u], unit_t[u], band_r, band_t, band, False, cam_r[c], cam_t[c], x, d, rig, cam)
+        u, c = observed.unit[n], observed.camera[n]
+        band = 0 if bands is None else bands.of_observation[n]
+        camera_point(
+            views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c], x, d, rig, cam
+        )
         r2 = BEHIND_PX * BEHIND_PX
         if cam[2] >= MIN_DEPTH_M:
-            project(kind[c], params[c], cam[0], cam[1], cam[2], work, proj)
-            r2 = (proj[0] - obs_xy[n, 0]) ** 2 + (proj[1] - obs_xy[n, 1]) ** 2
+            project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj)
+            r2 = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
         product *= 1.0 + r2 / scale2
         if product > 1e200:  # one logarithm for many factors
             result += math.log(product)
@@ -47,19 +57,18 @@ def _point_cost(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_system(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any,
-    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, begin: int, end: int, sigma: float, loss2: float,
+    views: Views, bands: Bands | None, observed: Observed, begin: int, end: int, sigma: float, loss2: float,
     x: Any, d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
 ) -> None:  # fmt: skip
     """V (6,) and gradient e (3,) of a point at x over its observations begin..end."""
     v[:] = 0.0
     e[:] = 0.0
     for n in range(begin, end):
-        u, c = obs_unit[n], obs_camera[n]
-        band = 0 if obs_band is None else obs_band[n]
+        u, c = observed.unit[n], observed.camera[n]
+        band = 0 if bands is None else bands.of_observation[n]
         if not linearise(
-            unit_r[u], unit_t[u], band_r, band_t, band, False, cam_r[c], cam_t[c], kind[c], params[c], x, obs_xy[n],
-            sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
+            views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c], views.kind[c],
+            views.params[c], x, observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
         ):  # fmt: skip
             continue
         a0, a1, a2 = jx[0, 0], jx[0, 1], jx[0, 2]
@@ -77,9 +86,8 @@ def _point_system(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def refine_points(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any, fixed: Any,
-    sigma: float, loss2: float, before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
+    views: Views, bands: Bands | None, points: Any, observed: Observed, sigma: float, loss2: float,
+    before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
     """Move points lo..hi, in place, to where the poses and the calibration of now want them; what they cost to costs.
 
@@ -92,22 +100,20 @@ def refine_points(
     x, trial = np.empty(3), np.empty(3)
     scale2 = loss2 * sigma * sigma
     for p in range(lo, hi):
-        begin, end = first[p], first[p + 1]
+        begin, end = observed.first[p], observed.first[p + 1]
         for i in range(3):
             x[i] = points[p, i]
         cost = _point_cost(
-            unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
-            begin, end, scale2, x, d, rig, cam, work, proj,
+            views, bands, observed, begin, end, scale2, x, d, rig, cam, work, proj,
         )  # fmt: skip
-        if fixed[p]:
+        if observed.fixed[p]:
             costs[p] = cost
             continue
         if cost > costs_before[p]:
             for i in range(3):
                 trial[i] = before[p, i]
             back = _point_cost(
-                unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
-                begin, end, scale2, trial, d, rig, cam, work, proj,
+                views, bands, observed, begin, end, scale2, trial, d, rig, cam, work, proj,
             )  # fmt: skip
             if back < cost:
                 cost = back
@@ -120,8 +126,7 @@ def refine_points(
             enough = WORTH
             gained = 0.0
             _point_system(
-                unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
-                begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
+                views, bands, observed, begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
             )  # fmt: skip
             if not invert3(v, inv):
                 break
@@ -129,8 +134,7 @@ def refine_points(
             trial[1] = x[1] - (inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2])
             trial[2] = x[2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])
             own = _point_cost(
-                unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
-                begin, end, scale2, trial, d, rig, cam, work, proj,
+                views, bands, observed, begin, end, scale2, trial, d, rig, cam, work, proj,
             )  # fmt: skip
             if own < cost:
                 gained = cost - own
@@ -144,13 +148,12 @@ def refine_points(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def point_costs(
-    unit_r: Any, unit_t: Any, band_r: Any, band_t: Any, cam_r: Any, cam_t: Any, kind: Any, params: Any, points: Any,
-    obs_unit: Any, obs_band: Any, obs_camera: Any, obs_xy: Any, first: Any, scale2: float, lo: int, hi: int, costs: Any,
-) -> None:  # fmt: skip
+    views: Views, bands: Bands | None, points: Any, observed: Observed, scale2: float, lo: int, hi: int, costs: Any
+) -> None:
     """Compute the cost of points lo..hi: sums of log(1 + r^2 / scale^2) over their observations."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for p in range(lo, hi):
         costs[p] = _point_cost(
-            unit_r, unit_t, band_r, band_t, cam_r, cam_t, kind, params, obs_unit, obs_band, obs_camera, obs_xy,
-            first[p], first[p + 1], scale2, points[p], d, rig, cam, work, proj,
+            views, bands, observed, observed.first[p], observed.first[p + 1], scale2, points[p],
+            d, rig, cam, work, proj,
         )  # fmt: skip

@@ -8,7 +8,7 @@ neighbours in time are neighbours in memory.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -18,6 +18,17 @@ from mrasfm_engine.bundle_adjustment.problem import Layout, Observations, RowBan
 from mrasfm_engine.types import Ints
 
 MAX_BLOCKS = 128  # free units and cameras one point may couple; more observations of it still count for themselves
+
+
+class Groups(NamedTuple):
+    """Groups of points that couple the same blocks, see `SchurStructure`."""
+
+    order: Ints
+    first_point: Ints
+    blocks: Ints
+    first_block: Ints
+    places: Ints
+    first_place: Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +84,10 @@ class SchurStructure:
         )
 
     @property
-    def arrays(self) -> tuple[Ints, ...]:
-        """As the compiled loops take them."""
-        return (
-            self.points, self.first_point, self.blocks, self.first_block, self.places, self.first_place,
+    def groups(self) -> Groups:
+        """Groups as the compiled loops take them."""
+        return Groups(
+            self.points, self.first_point, self.blocks, self.first_block, self.places, self.first_place
         )  # fmt: skip
 
     def shares(self, parts: int) -> Ints:

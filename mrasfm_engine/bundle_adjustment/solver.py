@@ -8,10 +8,21 @@ from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from mrasfm_engine.bundle_adjustment.kernels import IMAGE_SUMS, accumulate, add_images, squared_errors, substitute
+from mrasfm_engine.bundle_adjustment.kernels import (
+    IMAGE_SUMS,
+    Bands,
+    Motion,
+    Observed,
+    Slots,
+    Sums,
+    Views,
+    accumulate,
+    add_images,
+    squared_errors,
+    substitute,
+)
 from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, refine_points
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, RowBandMotion, retract
@@ -79,19 +90,41 @@ class Problem:
 
     def errors_px2(self, state: State) -> Floats:
         """Squared reprojection errors (n,) of all observations."""
-        o = self.observations
-        out = np.empty(len(o.unit))
+        views, out = self._views(state), np.empty(len(self.observations.unit))
         in_ranges(
             self.options.threads,
             len(out),
-            lambda lo, hi, _: squared_errors(
-                *_arrays(state, self.camera_kind), o.unit, o.band, o.camera, o.point, o.xy_px, lo, hi, out
-            ),
+            lambda lo, hi, _: squared_errors(*views, state.points_m, self._observed, lo, hi, out),
         )
         return out
 
-    def _motion(self) -> tuple[NDArray[np.generic] | None, ...]:
-        return (None, None) if self.motion is None else (self.motion.support, self.motion.weight)
+    def _views(self, state: State) -> tuple[Views, Bands | None]:
+        views = Views(
+            state.unit_rotation,
+            state.unit_position_m,
+            state.camera_rotation,
+            state.camera_position_m,
+            self.camera_kind,
+            state.camera_params,
+        )
+        if state.simultaneous:
+            return views, None
+        assert self.observations.band is not None, "a state with row bands has observations in them"
+        return views, Bands(state.band_rotation, state.band_position_m, self.observations.band)
+
+    @property
+    def _motion(self) -> Motion | None:
+        return None if self.motion is None else Motion(self.motion.support, self.motion.weight)
+
+    @property
+    def _observed(self) -> Observed:
+        o = self.observations
+        assert o.fixed is not None, "set when observations are made"
+        return Observed(o.unit, o.camera, o.point, o.xy_px, o.first_of_point, o.fixed)
+
+    @property
+    def _slots(self) -> Slots:
+        return Slots(self.layout.unit_slot, self.layout.camera_slot, self.layout.num_units)
 
     def retract(self, state: State, step: Floats, points_m: Floats) -> State:
         """The state after a step of the reduced vector, with new points."""
@@ -109,15 +142,13 @@ class Problem:
 
     def point_costs(self, state: State) -> Floats:
         """Sums (p,) of log(1 + r^2 / s^2) over the observations of every point."""
-        o, out = self.observations, np.empty(self.observations.num_points)
+        views, observed, out = self._views(state), self._observed, np.empty(self.observations.num_points)
+        scale2 = (self.options.loss_scale * self.options.sigma_px) ** 2
         in_ranges(
             self.options.threads,
             len(out),
-            lambda lo, hi, _: point_costs(
-                *_arrays(state, self.camera_kind), o.unit, o.band, o.camera, o.xy_px, o.first_of_point,
-                (self.options.loss_scale * self.options.sigma_px) ** 2, lo, hi, out,
-            ),
-        )  # fmt: skip
+            lambda lo, hi, _: point_costs(*views, state.points_m, observed, scale2, lo, hi, out),
+        )
         return out
 
     def of_points(self, chosen: Bools) -> Problem:
@@ -149,13 +180,14 @@ class Problem:
         self, state: State, before: State, costs_before: Floats, *, steps: int = 1
     ) -> tuple[Floats, float]:
         """Let points, in place, follow a step of poses and calibration by themselves; their costs, and that of all."""
-        o, options, costs = self.observations, self.options, np.empty(self.observations.num_points)
+        views, observed, options = self._views(state), self._observed, self.options
+        costs = np.empty(self.observations.num_points)
         in_ranges(
             options.threads,
             len(costs),
             lambda lo, hi, _: refine_points(
-                *_arrays(state, self.camera_kind), o.unit, o.band, o.camera, o.xy_px, o.first_of_point, o.fixed,
-                options.sigma_px, options.loss_scale**2, before.points_m, costs_before, steps, lo, hi, costs,
+                *views, state.points_m, observed, options.sigma_px, options.loss_scale**2,
+                before.points_m, costs_before, steps, lo, hi, costs,
             ),
         )  # fmt: skip
         return costs, self._sum(state, costs)
@@ -178,20 +210,20 @@ class Problem:
         )
         gradient = np.zeros((parts, layout.size))
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
-        slots = layout.unit_slot, layout.camera_slot, units
+        views, motion, observed, slots, groups = (
+            self._views(state), self._motion, self._observed, self._slots, structure.groups
+        )  # fmt: skip
         in_parts(
             structure.shares(parts),
             lambda lo, hi, t: accumulate(
-                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.band, o.camera, structure.image, o.xy_px,
-                o.first_of_point, o.fixed, *slots, *structure.arrays,
-                options.sigma_px, options.loss_scale**2, damping, lo, hi,
-                images[t], *(part[t] for part in blocks), gradient[t], v_inverse, v_gradient,
+                *views, motion, state.points_m, observed, structure.image, slots, groups, options.sigma_px,
+                options.loss_scale**2, damping, lo, hi,
+                Sums(images[t], blocks[0][t], blocks[1][t], blocks[2][t], gradient[t], v_inverse, v_gradient),
             ),
         )  # fmt: skip
         sums = tuple(part[0] if parts == 1 else part.sum(0) for part in (*blocks, np.zeros_like(gradient), gradient))
         add_images(
-            *_arrays(state, self.camera_kind)[:4], state.camera_position_m, *self._motion(),
-            structure.image_unit, structure.image_camera, structure.image_band, *slots,
+            *views, motion, structure.image_unit, structure.image_camera, structure.image_band, slots,
             structure.pattern.first, structure.pattern.row,
             images.sum(0), *sums,
         )  # fmt: skip
@@ -211,32 +243,17 @@ class Problem:
 
     def points_after(self, state: State, system: ReducedCameraSystem, step: Floats) -> Floats:
         """Points (p, 3) that go with a step of the reduced vector."""
-        o, layout, options = self.observations, self.layout, self.options
-        out = np.empty_like(state.points_m)
+        views, motion, observed, slots = self._views(state), self._motion, self._observed, self._slots
+        options, out = self.options, np.empty_like(state.points_m)
         in_ranges(
             options.threads,
-            o.num_points,
+            len(out),
             lambda lo, hi, _: substitute(
-                *_arrays(state, self.camera_kind), *self._motion(), o.unit, o.band, o.camera, o.xy_px, o.first_of_point,
-                layout.unit_slot, layout.camera_slot, layout.num_units, options.sigma_px, options.loss_scale**2,
+                *views, motion, state.points_m, observed, slots, options.sigma_px, options.loss_scale**2,
                 step, system.v_inverse, system.v_gradient, lo, hi, out,
             ),
         )  # fmt: skip
         return out
-
-
-def _arrays(state: State, kind: Ints) -> tuple[NDArray[np.generic] | None, ...]:
-    return (
-        state.unit_rotation,
-        state.unit_position_m,
-        None if state.simultaneous else state.band_rotation,
-        None if state.simultaneous else state.band_position_m,
-        state.camera_rotation,
-        state.camera_position_m,
-        kind,
-        state.camera_params,
-        state.points_m,
-    )
 
 
 _THREADS = ThreadpoolController()
