@@ -27,7 +27,7 @@ class Compilation:
 
 
 class _Watch(event.Listener):  # type: ignore[misc]
-    """numba tells when it begins and ends; functions that a function calls are compiled within."""
+    """numba reports its begin and end; functions that a function calls are compiled within."""
 
     def __init__(self, result: Compilation, begins: Callable[[], None]) -> None:
         self._result, self._begins, self._lock = result, begins, threading.Lock()

@@ -65,7 +65,7 @@ class Run:
 
     @cached_property
     def components(self) -> Components:
-        """Extractor, matcher and segmenter; their models are loaded when first asked for, once."""
+        """Extractor, matcher and segmenter; their models are loaded at the first use, once."""
         return load_components(self.config, self.drive.manifest.label_map)
 
     @property

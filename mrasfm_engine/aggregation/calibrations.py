@@ -1,8 +1,9 @@
 """Priors on every drive's calibration in a map's last adjustment.
 
-Each drive has its own. A short one tells little of it, and the shape of its scene leans on that little: two scenes with
-calibrations a tenth of a degree off each their own way cannot both be rigid where they share points, and what gives way
-is scale. So calibrations settle with the units, as far as their scene left them uncertain.
+Each drive keeps its own extrinsics. A short drive determines them weakly, and the shape of its scene depends on them:
+two scenes whose extrinsics are off by a tenth of a degree in different ways cannot both stay rigid where they share
+points, and scale gives way. So extrinsics are refined with the units, only in directions that the drive's own
+reconstruction observed, with that reconstruction's uncertainty as prior.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Overlap of images' footprints on the ground: images of two scenes that may show the same.
 
-A camera's footprint are the places on the ground, seen from the rig at its usual height, that it sees within some
-depth. The homography from the ground to an image is what its pose and calibration make it; here it is applied to a few
-points of every footprint. Where a camera sees no ground, points on its optical axis' height stand in.
+A camera's footprint is the part of the ground that it sees within some depth, from the rig at its usual height. The
+camera's pose and calibration give the homography from the ground to the image; it is applied to a few points of every
+footprint. For a camera that sees no ground, points at the height of its optical axis stand in.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from mrasfm_engine.types import Floats, Ints
 GRID = (5, 6)  # rays across and down an image
 RANGES = (0.15, 0.35, 0.65, 1.0)  # of the depth, along rays that do not meet the ground before it ends
 GROUND_BELOW_M = 4.0  # no vehicle carries its rig's origin higher
-NEAR_M = 6.0  # points this near to the vehicle's way tell the ground's height
+NEAR_M = 6.0  # points this near to the trajectory give the ground's height
 MIN_GROUND_POINTS = 30
 
 
 def rig_height_m(scene: SourceScene) -> float:
-    """Height of the rig's origin above the ground, from the lowest points near the way; zero where none tell."""
+    """Height of the rig's origin above the ground, from the lowest points near the trajectory; zero without any."""
     known = np.flatnonzero(scene.unit_registered)
     heights = []
     for unit in known[:: max(1, len(known) // 12)]:

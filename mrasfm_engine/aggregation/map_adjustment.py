@@ -1,9 +1,8 @@
-"""The last adjustment of a map: units vary on their own again, those at the seams or all of them.
+"""Last adjustment of a map: units vary on their own again, those at the seams or all of them.
 
-Scenes that moved as one each are as bent as they were. Where two overlap, their units now settle between what their own
-scene and what the other one says. Every drive has a calibration of its own, which settles within what its scene left
-uncertain (see `calibrations`), and its receiver's positions as a prior, with a constant error of its own that is
-estimated in turns with the units.
+Scenes that moved rigidly are still bent as before. Where two scenes overlap, the observations of both now determine
+their units. Every drive keeps its own calibration, which varies within its scene's uncertainty (see `calibrations`),
+and its GNSS positions as prior, with a constant offset per drive that is estimated in turns with the units.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The map as a scene: one drive of all drives, with a vehicle of its own for each, so that it is written as scenes are.
+"""A map as a scene: one drive made of all drives, with a rig for each, so that scenes' writers serve for maps.
 
 Cameras and files are called SCENE/NAME; units and images are numbered through, scene by scene.
 """

@@ -1,9 +1,9 @@
-"""All scenes of a component together: joined points over all seams, one adjustment of all transforms, and its place.
+"""Multi-scene adjustment: one adjustment of the transforms of all scenes of a component, over joined points.
 
-Points that seams join become tracks over any number of scenes. All scenes but one vary as one each, over all tracks at
-once, so that no seam is better than the others because it came first. Then positions say where the whole lies: every
-drive's receiver has a constant error of its own, so only shapes tell how the whole is turned, and it is shifted to the
-middle of what the receivers say.
+Points that seams join become tracks over any number of scenes. All scenes but one vary rigidly, over all tracks at
+once, so that no seam is favoured by its order. GNSS then places the result: every drive's receiver has a constant
+offset of its own, so only the shapes of the trajectories determine the rotation, and the translation is the mean of
+what the receivers measured.
 """
 
 from __future__ import annotations

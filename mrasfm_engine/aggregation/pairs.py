@@ -1,9 +1,9 @@
 """Image pairs between two scenes: few, and where their footprints on the ground overlap.
 
-How two scenes lie to one another is known at first from their positions only, metres wrong. So a few units of one are
-compared with all that the other may have seen from around there; when it is known how they lie, images are paired by
-the overlap of their footprints and the angle between their views, over all cameras of both: a vehicle that comes the
-other way has seen with its back camera what the other's front camera saw.
+GNSS gives the initial alignment of two scenes, with an error of metres. A few units of one scene are therefore compared
+with all units of the other that may have seen the same place. Once the transform is known, images are paired by the
+overlap of their footprints and the angle between their views, over all cameras of both: the back camera of a vehicle in
+the opposite direction has seen what the other's front camera saw.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SIMILAR_DISTANCE_M = 10.0  # cameras this far apart count half
 
 @dataclass(frozen=True, kw_only=True)
 class Probe:
-    """A unit of scene b, and image pairs (n, 2) of a and b that may tell where it is in a."""
+    """A unit of scene b, and image pairs (n, 2) of a and b that may relocalise it in a."""
 
     unit: int
     pairs: Ints

@@ -1,11 +1,10 @@
 """Relocalisation of several units of one scene in another, and the transform on which they agree.
 
-Every unit of scene b that sees points of scene a gets a pose there by one PnP over its cameras, and with it says how
-all of b lies in a: a_from_b = a_from_rig * inverse(b_from_rig). One unit alone can be wrong: a facade that repeats
-gives it a perfect pose at another house. So the hypothesis with which most units agree wins, it must be a clear
-majority of those that have something to say, and no other place may explain nearly as much: what is left of a unit's
-matches without those that fit is asked for a pose again, and where several units have a second one that is nearly as
-good as the first, something repeats, and which of the places is the right one nothing says.
+Every unit of scene b that observes points of scene a gets a pose in a by generalised PnP over its cameras. Each pose is
+a hypothesis of the transform: a_from_b = a_from_rig * inverse(b_from_rig). One unit alone can be wrong: a repeated
+facade gives it a perfect pose at another house. So the hypothesis with which most units agree wins. It needs a clear
+majority of the units with enough matches, and no second hypothesis may have a similar number of inliers: every unit is
+relocalised again from the matches that do not fit, and several units with a good second pose mean a repeated structure.
 """
 
 from __future__ import annotations

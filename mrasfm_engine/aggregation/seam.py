@@ -28,7 +28,7 @@ from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.matching.pair_matching import Matcher
 from mrasfm_engine.types import CountProgress, Floats, Ints
 
-BATCH_UNITS = 4  # that are looked for before it is asked whether they agree
+BATCH_UNITS = 4  # relocalised between two tests of their agreement
 ENOUGH_AGREEING = 4  # units, after which no more are looked for
 ROUNDS = ((0.012, 0.006), (0.005, 0.004))  # how far matches and merges may be off, shares of the focal length
 MAX_SHIFT_M, MAX_TURN_DEG = 0.5, 1.0  # by which the fine assembly may correct the consensus

@@ -1,8 +1,8 @@
-"""Fine assembly: points that two scenes share, and the transform between the scenes that fits them best.
+"""Refinement of a seam: points that two scenes share, and the transform between the scenes that fits them best.
 
-Transformation-based camera set bundle adjustment (MRASfM): of two scenes the first stays where it is, all units of the
-second move as one (see `adjustment.unit_sets`), and the shared points vary. Points that only one scene sees say nothing
-about the transform. Matching, merging and adjusting are repeated, as a better transform finds more of what is shared.
+Transformation-based camera set bundle adjustment (MRASfM): the first scene is held, all units of the second move
+rigidly together (see `bundle_adjustment.rigid_groups`), and the shared points vary. Points of one scene alone do not
+constrain the transform. Matching, merging and adjusting are repeated, as a better transform finds more shared points.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A scene as aggregation needs it: poses, calibration, points, keypoints and descriptors, in a few arrays.
+"""A scene as input of an aggregation: poses, calibration, points, keypoints and descriptors, in a few arrays.
 
-Everything comes from the folder that `mrasfm reconstruct` wrote, without its images and its finished stages.
+All of it comes from the folder that `mrasfm reconstruct` wrote, without its images and its finished stages.
 """
 
 from __future__ import annotations

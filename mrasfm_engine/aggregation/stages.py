@@ -45,7 +45,7 @@ class Run:
 
     @cached_property
     def components(self) -> Components:
-        """The matcher; its model is loaded when first asked for, once."""
+        """The matcher; its model is loaded at the first use, once."""
         return load_components(self.config, None)
 
     def step(self, stage: Stage) -> CountProgress:

@@ -157,7 +157,7 @@ def baselines_named(text: str) -> list[str]:
 
 
 def compare_mappers(drive_folder: Path, truth: Trajectory | None, work: Path, settings: Settings) -> Comparison:
-    """Extract and match once, then map with everything that is asked for.
+    """Extract and match once, then map with our method and all chosen baselines.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def poses_of_units(drive: Drive, truth: Trajectory) -> Floats:
 
 
 def our_row(settings: Settings, work: Callable[..., Mapped], *arguments: object) -> Row:
-    """Our mapping, as often as asked for."""
+    """Our mapping, repeated as the settings say."""
     return _median([_ours(settings, work, *arguments) for _ in range(settings.repeat)])
 
 
@@ -244,7 +244,7 @@ def _ours(settings: Settings, work: Callable[..., Mapped], *arguments: object) -
 
 
 def peer_rows(settings: Settings, database: Path) -> list[Row]:
-    """All baselines that are asked for, as often as asked for."""
+    """All chosen baselines, repeated as the settings say."""
     return [
         _median([_baseline(settings, name, database) for _ in range(settings.repeat)]) for name in settings.baselines
     ]

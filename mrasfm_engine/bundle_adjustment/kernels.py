@@ -32,8 +32,8 @@ its coupling to free block i,
 
     S_ij -= W_i V^-1 W_j'         g_i -= W_i V^-1 e
 
-Points are damped as V + lambda diag V. S is kept as blocks: of the units' pattern (`coupling`), of a dense border of
-the cameras' rows, and of the cameras' own square; each holds its entries row by row.
+Points are damped as V + lambda diag V. S is kept as blocks: of the units' pattern (`schur_structure`), of a dense
+border of the cameras' rows, and of the cameras' own square; each holds its entries row by row.
 """
 
 from __future__ import annotations

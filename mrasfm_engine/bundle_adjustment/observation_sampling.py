@@ -1,8 +1,8 @@
 """Sampling of the points from which poses are estimated, where there are far more than needed.
 
-Long tracks tie a unit to others; observations all over an image hold its rotation and position apart. So the tracks
-with most observations are asked first, and one is taken if any of its images still wants an observation in the cell of
-its grid where it is seen.
+Long tracks tie a unit to others; observations all over an image hold its rotation and position apart. So tracks
+are tried in the order of their number of observations. A track is chosen if one of its images has no observation yet in
+the cell of its grid where it is seen.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def run_in_subprocess(
     """Run `work(progress, *arguments)` in a fresh process; function, arguments and result (not None) must be picklable.
 
     An `MrasfmError` of the work is raised here. Whatever else ends it, a crash or the kernel when memory runs out, is
-    told as `failure`.
+    reported as `failure`.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def _exit_description(process: BaseProcess) -> str:
 
 
 def peak_memory_bytes(pid: int | None = None) -> int | None:
-    """The most memory that this or another process had resident at once; None where the system does not tell.
+    """The most memory that this or another process had resident at once; None where the system does not report it.
 
     Of Linux not `ru_maxrss`: that begins with what the parent had when it started the process.
     """
@@ -129,7 +129,7 @@ def peak_memory_bytes(pid: int | None = None) -> int | None:
 
 
 def memory_bytes() -> int | None:
-    """The memory that this process has resident now; None where the system does not tell."""
+    """The memory that this process has resident now; None where the system does not report it."""
     return _status_bytes(None, "VmRSS")
 
 

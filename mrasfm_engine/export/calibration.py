@@ -39,7 +39,7 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
 
 
 def _common(observability: CalibrationObservability) -> dict[str, Any]:
-    """Motions of all cameras together: images show none of them, and only positions can tell the scale."""
+    """Motions of all cameras together: no image observes them, and only positions determine the scale."""
     scale: dict[str, Any] = {"observed": observability.scale_observed}
     if np.isfinite(observability.sigma_scale):
         scale["sigma_relative"] = observability.sigma_scale

@@ -48,7 +48,7 @@ class Detector(Protocol):
     def detect(self, pixels: Bytes, wanted: int, min_score: float | None) -> Detections:
         """Detections in an image (h, w, 3) of a size that the network takes.
 
-        `wanted` and `min_score` are hints: not all networks can be told.
+        `wanted` and `min_score` are hints, which some networks ignore.
         """
         ...
 

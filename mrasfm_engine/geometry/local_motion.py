@@ -31,7 +31,7 @@ class LocalMotion:
     bend: Floats  # (u, 6) half an acceleration, 1/s^2
     earliest_s: Floats  # (u,) as far back, and
     latest_s: Floats  # (u,) as far forward, as anything is known: beyond, the vehicle is taken to stand
-    support: Ints  # (u, 3) the units that tell the motion: itself, and one or two others; -1 where there is none
+    support: Ints  # (u, 3) the units that determine the motion: itself, and one or two others; -1 where there is none
     support_s: Floats  # (u, 2) times of the others, from the unit's own on
 
     @property

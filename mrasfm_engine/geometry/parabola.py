@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-MIN_BEND = 1e-6  # of samples that bend less, rounding would tell the place
+MIN_BEND = 1e-6  # of samples that bend less, rounding would determine the place
 
 
 def vertex(before: NDArray[np.floating], at: NDArray[np.floating], after: NDArray[np.floating]) -> NDArray[np.floating]:

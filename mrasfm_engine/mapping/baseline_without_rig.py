@@ -1,7 +1,8 @@
-"""Registration of images one by one, as without a camera set: for comparison (`camera_set_registration = false`).
+"""Registration of single images, without the camera set: a baseline (`camera_set_registration = false`).
 
-Every image has its pose by its own PnP. The unit's pose is that of its best supported image; images that agree with it
-belong to the set, one with another pose keeps that, and one whose PnP fails is missing. Everything else is as ever.
+Every image gets its pose by its own PnP. The unit takes the pose of its best supported image. Images that agree with it
+belong to the set, an image with another pose keeps that pose, and an image whose PnP fails is missing. All other steps
+are the same.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def assess_calibration(
 ) -> CalibrationDecision:
     """Decide whether the drive observes the calibration: freeing an unobserved one makes everything worse.
 
-    A straight way without GNSS never does. Else it is asked what freeing would cost: the images, the priors and the
+    A straight trajectory without GNSS never does. Else the cost of freeing decides: the images, the priors and the
     positions must still know the scale.
 
     Parameters

@@ -1,9 +1,9 @@
-"""Things that move along with the vehicle: a lorry in the next lane, the own bonnet, a car that is followed.
+"""Dynamic objects that move along with the vehicle: a lorry in the next lane, the own bonnet, a car ahead.
 
-They hardly move in the image, so they match best of all, and nothing in a pair of images contradicts them: what stands
-still in an image looks like something very far away, and in a curve like something at the curve's centre. The poses
-that the other cameras give tell the difference. A ray that points below the horizon meets the ground after some metres;
-what it shows must therefore move by so much between two units, and what moves by less is no part of the world.
+They hardly move in the image, so they match best, and no single image pair contradicts them: a static keypoint looks
+like a point at infinity, or in a curve like a point at the curve's centre. The poses from the other cameras resolve
+this. A viewing ray below the horizon meets the ground after some metres; its keypoint must therefore move by a known
+least amount between two units. Keypoints that move by less are on dynamic objects.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MIN_FLOW_PX = 6.0  # what the world must move by before standing still means som
 STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
 STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the world
 MIN_KEYPOINTS = 30  # that move along, before an image is called covered
-TELLING_SHARE = 0.5  # of the keypoints that tell, in a covered image
+TELLING_SHARE = 0.5  # of the keypoints with a measure, in a covered image
 COVERED_SHARE = 0.75  # of all matched ones
 
 
@@ -66,8 +66,8 @@ def find_moving_along(mapper: Mapper, pairs: Sequence[PairMatches]) -> MovingAlo
     seen, moves = np.zeros((2, len(keypoints.image)), dtype=np.bool_)
     for a, b, least_px, moved_px in _flows(mapper, pairs):
         _vote(a, b, least_px, moved_px, along, seen, moves)
-    # What stands still may be far away where no ground tells: above the horizon of a straight street. It counts with
-    # what moves along only where most of the keypoints that do tell are such.
+    # A static keypoint above the horizon of a straight street may be far away. It counts as moving along only where
+    # most of the keypoints below the horizon do.
     with_it, still = along > 0, seen & (along == 0) & ~moves
     count, counter, total, quiet = (
         np.bincount(keypoints.image[which], minlength=images) for which in (with_it, along < 0, seen, still)

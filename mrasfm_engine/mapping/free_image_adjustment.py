@@ -1,9 +1,9 @@
-"""Bundle adjustment as it is without camera sets: every image is a variable of its own.
+"""Bundle adjustment without camera sets: every image is a variable of its own.
 
-With `[bundle_adjustment] camera_set_adjustment = false` this takes the place of camera set bundle adjustment: 6 n k
-unknowns for n units of k cameras instead of 6 (n + k). Observations, points, priors, solver and tolerances are the
-same. Every image is treated as a unit of its own, whose vehicle carries that one camera as the rig's calibration says;
-nothing ties the images of a unit together any more.
+With `[bundle_adjustment] camera_set_adjustment = false` it replaces camera set bundle adjustment, with 6 n k unknowns
+for n units of k cameras instead of 6 (n + k). Observations, points, priors, solver and tolerances are the same. Every
+image becomes a unit of its own, whose rig holds that one camera at its calibrated pose; nothing ties the images of a
+unit together.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Putting the scene where it belongs: rigid alignment with the receiver's positions, gross errors rejected.
+"""Rigid alignment of the reconstruction with GNSS positions; gross errors are rejected.
 
-Scale is not touched: it comes from the rig, and the receiver takes part in it only through the adjustment that follows.
-Positions along a straight line leave the rotation about that line free; the vehicle's own up direction decides it.
+The alignment does not change scale, which comes from the rig; positions take part in it only through the adjustment
+that follows. Positions along a straight line leave the rotation about that line free; the vehicle's up direction
+determines it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class GnssAlignment:
     world_from_model: Floats  # (4, 4), rigid
     inlier: Bools  # (n,)
     residual_m: Floats  # (n,) distance after the similarity fit
-    scale: float  # by which the model would have to be multiplied to fit the receiver best: told, not applied
+    scale: float  # by which the model would have to be multiplied to fit the receiver best: reported, not applied
     sigma_scale: float  # its standard deviation, from independent positions with the noise that was seen
     noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
 

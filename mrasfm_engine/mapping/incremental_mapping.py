@@ -137,7 +137,7 @@ def map_units(
     if prior_world_from_rig is not None:
         mapper.motion.follow_prior(prior_world_from_rig)
     log = run_incremental_mapping(mapper, sound, prior_world_from_rig, progress=progress, cancel=cancel)
-    # Only the poses of all cameras together tell surely what moves along, so the scene grows before it is cleaned.
+    # Only the poses of all cameras together separate dynamic objects reliably, so mapping comes before the cleaning.
     moving = find_moving_along(mapper, near)
     if moving.any:
         log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}

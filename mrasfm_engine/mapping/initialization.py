@@ -26,7 +26,7 @@ MOTION_ROUNDS = 3
 FULL_PARALLAX_RAD = np.radians(0.5)
 MAX_PARALLAX_MATCHES = 100  # looked at of a pair
 MIN_POINTS = 30
-GOOD_START_POINTS = 300  # with so many, no other source of the pose is asked
+GOOD_START_POINTS = 300  # with so many, no other source of the pose is tried
 INSIDE = "points inside the first unit"
 
 
@@ -44,7 +44,7 @@ class UnitScores:
     """Scores of pairs of units by their matches.
 
     Parallax takes its time to compute, and no pair of units has more matches that show motion than it has matches:
-    those that come into question are asked first.
+    the candidates are tried first.
     """
 
     mapper: Mapper
@@ -199,7 +199,7 @@ def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: 
 def _single_camera_relative_pose(
     mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int, prior_world_from_rig: Floats | None
 ) -> Floats | None:
-    """rig_u_from_rig_v of a rig with one camera: its length is the prior's, or one metre, as images do not tell it."""
+    """rig_u_from_rig_v of a rig with one camera: its length, which no image observes, is the prior's or one metre."""
     a, b = _matches_between(mapper, pairs, u, v)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed

@@ -1,8 +1,8 @@
-"""A car that stands or creeps: units that show nothing new take no part in mapping, and get their poses afterwards.
+"""Keyframes: units of a standing or creeping car take no part in mapping, and get their poses afterwards.
 
-Whether the car moved is measured in the images: receivers jitter when they stand. A unit whose keypoints are where
-those of the last keyframe were adds no parallax, only more of the same equations. When the scene is finished, such
-units are registered against it one by one, its points held, so that a hundred of them neither drift nor bend anything.
+Motion is measured in the images, as GNSS positions jitter when the car stands. A unit whose keypoints are where those
+of the last keyframe were adds no parallax, only more of the same equations. After the refinement, each such unit is
+registered against the reconstruction with all points held, so that a hundred of them neither drift nor bend anything.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""A route that returns to where it was: finding it, believing it, and closing it.
+"""Loop closure: find revisits, verify them, and distribute the drift.
 
-The scene first grows along the drive from matches of neighbouring units alone, so that no wrong revisit bends it. Then
+Mapping first uses the matches of neighbouring units alone, so that no wrong revisit bends the reconstruction. Then
 every pair of units that matches across a larger gap is tried: the later unit is registered against points that the
-earlier one sees. The difference to its current pose is the drift since, as this pair sees it. Drift changes slowly: a
-revisit is believed where several pairs of neighbouring units report the same drift, and where that drift is plausible
-for the way in between. A pose graph then spreads it over the loop.
+earlier one observes. The difference to its current pose is the drift since, as this pair measures it. Drift changes
+slowly: a revisit is accepted if several pairs of neighbouring units measure the same drift, and if that drift is
+plausible for the trajectory in between. A pose graph then distributes it over the loop.
 """
 
 from __future__ import annotations

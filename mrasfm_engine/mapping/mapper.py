@@ -92,7 +92,7 @@ class Mapper:
             min_angle_deg=config.mapping.min_angle_deg,
             threads=config.threads,
         )
-        # What registration asks for again and again: how many points every unit sees, as of which points; keypoints
+        # Caches for registration: the number of points that every unit sees, and as of which points; keypoints
         # by unit, and the tracks they are in.
         self._visible, self._visible_of = np.zeros(units, dtype=np.int64), np.zeros(len(tracks), dtype=np.bool_)
         order = np.argsort(keypoints.unit, kind="stable")

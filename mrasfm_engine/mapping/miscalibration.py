@@ -1,4 +1,4 @@
-"""Cameras whose given place in the rig is wrong, told by their corrections and by the units' votes."""
+"""Miscalibrated cameras, found by their corrections and by the units' votes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Miscalibration:
 
 @dataclass(frozen=True, kw_only=True)
 class MiscalibratedPair:
-    """Two cameras that stand or look otherwise to each other than given: which of them is wrong, nothing tells."""
+    """Two cameras whose relative pose differs from the given one: which of them is wrong is not observable."""
 
     rotation_deg: float
     translation_m: float

@@ -1,7 +1,7 @@
-"""The vote of a unit's cameras on the unit's pose, each by its own PnP.
+"""Votes of a unit's cameras on the unit's pose, each by its own PnP.
 
-A camera that is covered, or sees too little, has no vote: its points fit no pose at all. A camera with a wrong
-extrinsic has one, well supported and far from the others', and is voted out by name.
+A camera that is covered, or observes too few points, has no vote: no pose fits its points. A camera with a wrong
+extrinsic has a vote that is well supported and far from the others; it is voted out by name.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def refine(
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> Refinement:
-    """Georeference the model where positions allow, adjust everything with all priors, and tell how certain it is.
+    """Georeference the model where positions allow, adjust everything with all priors, and estimate the uncertainty.
 
     Parameters
     ----------

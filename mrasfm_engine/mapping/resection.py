@@ -1,8 +1,8 @@
-"""The pose of a camera set from points that it sees, where a pose is expected.
+"""Pose of a camera set from points that it observes, refined from a predicted pose.
 
-A vehicle goes on as it went: its last poses tell the next one to some pixels. A robust descent from there ends where a
-search from nothing would, in a fraction of its time. The loss is wide at first and narrows, so that points that are off
-because the expectation is do count, and in the end points that are wrong do not.
+The motion model predicts the next pose from the last ones, to some pixels. A robust descent from there finds the
+minimum of a global search in a fraction of its time. The loss is wide at first and narrows: points that are off because
+the prediction is off count at first, and wrong points do not count in the end.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Motion of the rig within a unit: its pose at the time of each image, relative to the unit's timestamp.
 
 `State.unit_from_band` comes from the units' own trajectory: the motion around a unit is interpolated from the
-registered units before and after it, and follows them when they are adjusted: were it held meanwhile, baselines between
-cameras that are not simultaneous would hold on to the scale that it has, and adjusting and renewing in turns need not
-converge. The same place holds poses that images have of their own, apart from the rig.
+registered units before and after it. It follows these units during their adjustment. If it were held, baselines between
+cameras that are not simultaneous would preserve the present scale, and alternating between adjustment and interpolation
+need not converge. The same array holds the poses of images that are apart from the rig.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Semantic-aided triangulation: points of the road that are off its surface are dropped.
 
 Edges of shadows that move with cars, and wrong matches on asphalt, triangulate above and below the road. Where masks
-say what is road, every point of the road must lie on its surface. Where there are none, the vehicle's own way tells:
-nothing that stands is below the road, and nothing was where the vehicle drove.
+label the road, every point of it must lie on its surface. Without masks the vehicle's trajectory decides: nothing
+stands below the road, and nothing stood in the lane that the vehicle drove.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
         # In the map, what is off the road is wrong however uncertain it is; to poses, weak rays do no harm.
         limit = np.minimum(limit, max(config.road_max_offset_m, config.road_sigmas * fitted.roughness_m))
     off = np.abs(distance) > limit
-    # Where no patch reaches, the nearest one tells roughly: the farther away, the less.
+    # Where no patch reaches, the nearest one is an estimate, the weaker the farther away.
     alone = np.isnan(distance)
     offset, beyond = fitted.surface.beyond(points[alone])
     off[alone] = np.abs(offset) > limit[alone] + MAX_SLOPE_CHANGE * beyond

@@ -1,10 +1,10 @@
-"""Images that stand still while the vehicle moves, told from matches alone, before there are poses.
+"""Static images while the vehicle moves, found from matches alone, before there are poses.
 
-A lorry that fills an image and drives along has more and better matches than the world, and it reaches into the views
-beside it. It can win every vote on a unit's pose, and the unit then stands where the one before stood. So cameras are
-compared first: where most of them have matches that show motion between two units, one whose ground stands still shows
-something else. What is found here is only kept from misleading the first poses; `moving_along` decides with poses, and
-names images.
+A lorry that fills an image and drives along has more and better matches than the static world, and it reaches into the
+neighbouring views. It can win every vote on a unit's pose, and the unit then stands where the one before stood. So
+cameras are compared first: where most of them have matches that show motion between two units, a camera whose ground is
+static shows something else. The result only keeps such images from misleading the first poses; `dynamic_objects`
+decides with poses, and names images.
 """
 
 from __future__ import annotations

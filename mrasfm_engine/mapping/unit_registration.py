@@ -1,10 +1,10 @@
-"""Camera set registration: the pose of a rigid unit from points its cameras see, as one.
+"""Camera set registration: the pose of a rigid unit from the points that all of its cameras observe.
 
-First the pose that the vehicle's motion lets expect is refined; where that does not explain what all cameras see, one
-generalised PnP over all cameras is asked. Where that fails, or a camera disagrees with it, every camera is registered
-alone, its pose turned into one of the unit through `rig_from_cam`, and the unit's pose is their robust average (MRASfM,
-section 3(a), see `camera_vote`); cameras far from it are voted out by name. Either way all images of the unit get their
-pose from the unit, also those that see too little to be registered alone, or nothing but what covers them.
+First refine the pose predicted by the motion model; if it does not explain the observations of every camera, run
+generalised PnP over all cameras. If that fails, or a camera disagrees with it, register every camera alone, turn its
+pose into one of the unit through `rig_from_cam`, and average these poses robustly (MRASfM, section 3(a), see
+`per_camera_pnp`); cameras far from the average are voted out by name. All images of the unit get their pose from the
+unit, also those with too few points to be registered alone.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ BLURRED_CAMERA_FINENESS, BLURRED_CAMERA_DETAIL = 0.5, 0.05  # of the other camer
 
 APART_US = 90_000  # images that are compared for movement: at 10 Hz, neighbours
 STILL_PX = 0.25  # less movement of the image than this, at MOVEMENT_SIDE_PX, is none
-MIN_CONTRAST = 3.0  # gray levels from one pixel to the next in the tenth with the most; below, nothing can be told
+MIN_CONTRAST = 3.0  # gray levels from one pixel to the next in the tenth with the most; below, there is no measure
 MIN_STILL_SHARE = 0.2
 MOVED_M = 1.0  # positions that stay within this say that the vehicle stood
 
@@ -265,7 +265,7 @@ def _is_blurred_camera(camera: int, detail: dict[int, float], fineness: dict[int
 
 
 def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss: bool) -> list[Finding]:
-    still: dict[tuple[int, int], list[bool]] = {}  # by the two units: of every camera that can tell
+    still: dict[tuple[int, int], list[bool]] = {}  # by the two units: of every camera with enough contrast
     for a, b in pairs:
         verdict = _is_still(a.small, b.small)
         if verdict is not None:

@@ -11,7 +11,7 @@ from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.types import Bools, Floats, Ints
 
 SAME_LEVEL_M = 1.0  # patches farther apart in height are of different roads, above one another
-NEIGHBOURS = 12  # patches that are asked for at one place
+NEIGHBOURS = 12  # nearest patches that count at one place
 
 
 class RoadSource(StrEnum):

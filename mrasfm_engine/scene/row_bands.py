@@ -1,7 +1,7 @@
-"""The instants at which images were taken: cameras of a unit need not be simultaneous, nor rows of an image.
+"""Row bands: the times at which images were taken. Cameras of a unit need not be simultaneous, nor rows of an image.
 
-A *row band* is a band of rows of one image: so short a time that the vehicle stands still in it. An image without a
-declared readout time is one row band, and then row bands and images have the same numbers.
+A row band is some rows of one image that share one pose: the vehicle hardly moves within its exposure. An image without
+a declared readout time is one row band, and then row bands and images have the same numbers.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ class ImageFeatures:
     scores: Floats32 | None = None  # (n,) a trained network's confidence
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
     classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
-    # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where it was not asked
+    # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where no network ran
     made_mask: Bytes | None = None
     # of an image without keypoints that takes no part, as its pixels are not all there
     left_out: Incomplete | None = None
@@ -81,7 +81,7 @@ class CalibrationObservability:
 
     adjusted: bool  # whether `rig_from_cam` varied at all
     reason: str
-    scale_observed: bool  # whether positions tell the cameras' distances better than their priors
+    scale_observed: bool  # positions determine the cameras' distances better than the priors
     scale_rests_on: str  # the same in words
     sigma_scale: float  # relative, of the cameras' distances; NaN where not known
 

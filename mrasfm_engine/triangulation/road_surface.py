@@ -1,8 +1,8 @@
-"""The road's surface from points on it: local plane patches along the trajectory, each found by LO-RANSAC.
+"""Surface of the road from points on it: local plane patches along the trajectory, each found by LO-RANSAC.
 
-One plane a scene does not survive a hill. Patches of about 12 m do: each is fitted to the points around its centre, the
-nearer ones counting more, with a normal near that of its neighbours and near the vehicle's up. Their weighted mean is
-the surface.
+A single plane does not fit a hill, patches of about 12 m do. Each patch is fitted to the points around its centre, with
+more weight on near ones, and with a normal near that of its neighbours and near the vehicle's up. The weighted mean of
+the patches is the surface.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROUGHNESS_M = (0.008, 0.03)  # how uneven roads are, with what planes leave of t
 FIRST_ROUGHNESS_M = 0.02
 STEP_M = 0.3  # of a patch's height against what its neighbours' planes say, at most
 ROUGHNESS_STEPS = 3
-SURE_SHARE = 0.33  # of the points, those of the smallest uncertainty: they tell the roughness
+SURE_SHARE = 0.33  # of the points, those of the smallest uncertainty, which determine the roughness
 SIGMA_SLOPE_RIG = 0.05  # of the road's slope against the vehicle's
 MAX_SLOPE_RIG = 0.2
 SIGMA_SLOPE_NEIGHBOURS = 0.02  # of a patch's slope against its neighbours'
@@ -326,7 +326,7 @@ def _fit(
 ) -> HeightPlane | None:
     """The plane at a place (3,) where the road is expected; None where less than MIN_SUPPORT of the points agree.
 
-    Points farther than `level_m` from where it is expected are not asked.
+    Points farther than `level_m` from the expected level are left out.
     """
     rows = np.array(points.tree.query_ball_point(at[:2], radius_m), dtype=np.int64)
     if len(rows) < MIN_POINTS:

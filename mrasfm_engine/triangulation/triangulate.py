@@ -1,8 +1,8 @@
-"""Points of tracks, given poses: robust multi-view triangulation as a pure function of poses and tracks.
+"""Robust multi-view triangulation: points as a pure function of poses and tracks.
 
-For every track the pairs of its rays are tried as hypotheses, the best by truncated squared reprojection error over all
-observations is refined with a Cauchy loss, and observations within the threshold are kept. Nothing depends on the order
-in which units were registered, so everything can be triangulated anew whenever poses have changed much.
+For every track the pairs of its rays are hypotheses. The best one, by truncated squared reprojection error over all
+observations, is refined with a Cauchy loss; observations within the threshold are inliers. Nothing depends on the order
+in which units were registered, so all points can be triangulated anew after poses have changed.
 """
 
 from __future__ import annotations

@@ -15,7 +15,8 @@ def point_covariances(
 ) -> Floats:
     """Covariances (p, 3, 3) of points, square metres, for exact poses.
 
-    A ray tells nothing along itself and, across itself, its depth times the angle of the image's noise.
+    A ray does not constrain a point along itself; across itself the standard deviation is depth times the angle of the
+    image's noise.
 
     Parameters
     ----------

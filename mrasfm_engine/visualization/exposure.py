@@ -14,7 +14,7 @@ MAX_GAIN = 4.0
 MAX_CAMERA_GAIN = 1.4
 EVERY_CELL = 3  # of the mosaic, in rows and columns, is compared
 MIN_CELLS = 200
-DARK, SATURATED = 8, 247  # colours beyond tell nothing of the exposure
+DARK, SATURATED = 8, 247  # colours beyond carry no information on the exposure
 
 
 def exposure_gains(scene: Scene) -> Floats:

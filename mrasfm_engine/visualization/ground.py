@@ -65,7 +65,7 @@ class GroundPatches:
 
 
 class GroundTiles:
-    """Heights at the corners of squares of `HEIGHT_STEP_M`, computed where they are first asked for.
+    """Heights at the corners of squares of `HEIGHT_STEP_M`, computed at the first use.
 
     So they cost time and memory by the length of the way, and not by the rectangle that it fits into.
     """
