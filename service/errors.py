@@ -404,6 +404,24 @@ def invalid_document(error: DocumentError, *, what: str) -> InvalidDocument:
     )
 
 
+def require_size(
+    size_bytes: int,
+    max_bytes: int,
+    *,
+    what: str = "body",
+    remedy: str = "Split it, or ask the operator for a larger bound.",
+    headers: Mapping[str, str] | None = None,
+) -> None:
+    """Refuse what is announced or has come, where it is larger than the bound.
+
+    Raises
+    ------
+    TooLarge
+    """
+    if size_bytes > max_bytes:
+        raise TooLarge(f"the {what} has over {max_bytes} bytes, which is the bound", remedy=remedy, headers=headers)
+
+
 def store_unavailable() -> StoreUnavailable:
     """Make the error of an artifact store that does not answer, or misses what it should hold."""
     return StoreUnavailable(

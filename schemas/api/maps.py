@@ -15,9 +15,9 @@ from schemas.api.resource import (
     EXAMPLE_OTHER_DRIVE,
     EXAMPLE_SCENE,
     EXAMPLE_SHA256,
+    ArtifactResource,
     RequestBody,
     Resource,
-    Sha256,
     Times,
 )
 
@@ -93,16 +93,10 @@ class FailedDrive(Resource):
     problem: Problem = Field(description="why it has no scene")
 
 
-class MapFileResource(Resource):
+class MapFileResource(ArtifactResource):
     """One artifact of a map's version."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [_FILE]})
-
-    path: str = Field(description="with its folders")
-    size_bytes: int
-    sha256: Sha256 = Field(description="in hexadecimal")
-    media_type: str = Field(description="what the download says as Content-Type")
-    url: str = Field(description="where to get it, relative to the server")
 
 
 _VERSION: JsonDict = {

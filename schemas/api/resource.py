@@ -26,6 +26,16 @@ class Resource(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
+class ArtifactResource(Resource):
+    """One file of a scene or of a map's version."""
+
+    path: str = Field(description="with its folders")
+    size_bytes: int
+    sha256: Sha256 = Field(description="in hexadecimal")
+    media_type: str = Field(description="what the download says as Content-Type")
+    url: str = Field(description="where to get it, relative to the server")
+
+
 class RequestBody(BaseModel):
     """Root of what the API is asked: unknown fields and not-a-number are refused."""
 

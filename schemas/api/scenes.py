@@ -5,7 +5,15 @@ from __future__ import annotations
 from pydantic import ConfigDict, Field
 from pydantic.config import JsonDict
 
-from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_JOB, EXAMPLE_SCENE, EXAMPLE_SHA256, Resource, Sha256, Times
+from schemas.api.resource import (
+    EXAMPLE_DRIVE,
+    EXAMPLE_JOB,
+    EXAMPLE_SCENE,
+    EXAMPLE_SHA256,
+    ArtifactResource,
+    Resource,
+    Times,
+)
 
 _FILE: JsonDict = {
     "path": "points.ply",
@@ -26,16 +34,10 @@ _SUMMARY: JsonDict = {
 }
 
 
-class SceneFileResource(Resource):
+class SceneFileResource(ArtifactResource):
     """One artifact of a scene."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [_FILE]})
-
-    path: str = Field(description="with its folders")
-    size_bytes: int
-    sha256: Sha256 = Field(description="in hexadecimal")
-    media_type: str = Field(description="what the download says as Content-Type")
-    url: str = Field(description="where to get it, relative to the server")
 
 
 class SceneSummary(Resource):

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
+from sqlalchemy import bindparam, delete, func, insert, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.drives import DriveState, FileDeclaration, PreflightState
@@ -269,11 +269,3 @@ def remove(session: Session, drive: Drive) -> None:
     for job in active:
         jobs.request_cancel(session, job.id)
     session.execute(delete(Drive).where(Drive.id == drive.id))
-
-
-def page(session: Session, project_id: str, *, after: tuple[int, str] | None, limit: int) -> list[Drive]:
-    """Drives of a project, newest first, after the one that (created_us, id) names."""
-    statement = select(Drive).where(Drive.project_id == project_id)
-    if after is not None:
-        statement = statement.where(tuple_(Drive.created_us, Drive.id) < after)
-    return list(session.scalars(statement.order_by(Drive.created_us.desc(), Drive.id.desc()).limit(limit)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, or_, select, tuple_, update
+from sqlalchemy import ColumnElement, delete, or_, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.maps import MapSummary
@@ -204,14 +204,6 @@ def remove_version(session: Session, found: Map, number: str) -> None:
             remedy="Make another version the current one first, or delete the map.",
         )
     session.execute(delete(MapVersion).where(MapVersion.map_id == found.id, MapVersion.number == version.number))
-
-
-def page(session: Session, project_id: str, *, after: tuple[int, str] | None, limit: int) -> list[Map]:
-    """Maps of a project, newest first, after the one that (created_us, id) names."""
-    statement = select(Map).where(Map.project_id == project_id)
-    if after is not None:
-        statement = statement.where(tuple_(Map.created_us, Map.id) < after)
-    return list(session.scalars(statement.order_by(Map.created_us.desc(), Map.id.desc()).limit(limit)))
 
 
 def require_unused(session: Session, *, what: str, drive_id: str | None = None, scene_id: str | None = None) -> None:

@@ -22,9 +22,9 @@ import anyio
 from service.errors import (
     DiskFull,
     ServiceError,
-    TooLarge,
     WrongDigest,
     WrongLength,
+    require_size,
 )
 
 Result = TypeVar("Result")
@@ -194,8 +194,7 @@ async def receive_into(
     ServiceError
         413 `too-large`, 400 `wrong-length`, 422 `wrong-digest` or 507 `disk-full`.
     """
-    if expected_bytes is not None and expected_bytes > max_bytes:
-        raise _too_large(f"{expected_bytes}", max_bytes)
+    require_size(expected_bytes or 0, max_bytes)
     writer = BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
     try:
         if expected_bytes is not None:
@@ -206,8 +205,7 @@ async def receive_into(
             received_bytes += len(chunk)
             if expected_bytes is not None and received_bytes > expected_bytes:
                 raise _wrong_length("more than", expected_bytes)
-            if received_bytes > max_bytes:
-                raise _too_large(f"over {max_bytes}", max_bytes)
+            require_size(received_bytes, max_bytes)
             batch.append(chunk)
             batched_bytes += len(chunk)
             if batched_bytes >= BATCH_BYTES:
@@ -330,10 +328,6 @@ def _checked(spooled: Spooled, expected_sha256: str | None) -> Spooled:
             remedy="Send the file again; if it was changed since the digest was taken, take it anew.",
         )
     return spooled
-
-
-def _too_large(size: str, max_bytes: int) -> ServiceError:
-    return TooLarge(f"the body has {size} bytes, the bound is {max_bytes}", remedy="Send a smaller file, or several.")
 
 
 def _wrong_length(received: str, expected_bytes: int) -> ServiceError:

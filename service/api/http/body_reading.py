@@ -19,9 +19,9 @@ from service.api.http.request_bodies import BODY, Body
 from service.api.manifests.bounded_process import LARGE_BYTES
 from service.errors import (
     ServiceError,
-    TooLarge,
     TooSlow,
     invalid_document,
+    require_size,
 )
 from service.settings import Settings
 
@@ -101,8 +101,7 @@ async def _read(request: Request, bound: int, turns: _Turns) -> bytes:
         413 as soon as it is known to be larger than `bound`, 408 where a large one comes too slowly, 429 or 503 where
         its turn does not come.
     """
-    if int(request.headers.get("content-length", 0)) > bound:
-        raise _too_large(request.headers["content-length"], bound)
+    require_size(int(request.headers.get("content-length", 0)), bound)
     stream = request.stream()
     parts = [part async for part in _until(stream, min(bound, LARGE_BYTES))]
     if sum(map(len, parts)) > LARGE_BYTES:
@@ -110,8 +109,7 @@ async def _read(request: Request, bound: int, turns: _Turns) -> bytes:
         await turns.of_body()
         parts += [part async for part in _until(_at_bearable_rate(stream), bound - sum(map(len, parts)))]
         await turns.of_document()
-    if sum(map(len, parts)) > bound:
-        raise _too_large(f"over {bound}", bound)
+    require_size(sum(map(len, parts)), bound)
     return b"".join(parts)
 
 
@@ -153,11 +151,4 @@ def _slow(size_bytes: int, elapsed_s: float) -> ServiceError:
         f"{_MIN_RATE_BYTES_S // 1000} kB/s on average and within {_WITHIN_S:g} s, as others wait for their place",
         remedy="Repeat it over a faster connection or with fewer uploads beside it, or split the drive.",
         headers={"Connection": "close"},
-    )
-
-
-def _too_large(size: str, max_bytes: int) -> ServiceError:
-    return TooLarge(
-        f"the body has {size} bytes, the bound is {max_bytes}",
-        remedy="Split the drive, or ask the operator for a larger bound.",
     )

@@ -1,20 +1,75 @@
-"""Cursors: where a list goes on."""
+"""Pages of lists, and the cursors by which a list goes on."""
 
 from __future__ import annotations
 
 import base64
 import binascii
 import json
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from sqlalchemy import Row, Select, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from schemas.drive import MAX_PATH_CHARACTERS
+from service.database.tables import Drive, Job, Map, Scene
 from service.errors import (
     BadCursor,
 )
 
+Paged = TypeVar("Paged", Drive, Job, Map, Scene)
+
 MAX_LIMIT = 1000
 # Of the longest position, a path: four bytes a character in UTF-8, and four characters of base64 for three bytes.
 MAX_CURSOR_CHARACTERS = 4 * (4 * MAX_PATH_CHARACTERS + len('[""]') + 2) // 3
+
+
+def page_of(
+    session: Session,
+    statement: Select[*tuple[Any, ...]],
+    *keys: InstrumentedAttribute[Any],
+    cursor: str | None,
+    limit: int,
+    is_rising: bool = False,
+) -> tuple[Sequence[Row[*tuple[Any, ...]]], str | None]:
+    """Read a page of rows.
+
+    Parameters
+    ----------
+    statement
+        Selects the rows, whose first entity has the keys.
+    keys
+        Order the rows, and are unique together.
+    is_rising
+        Whether the smallest comes first.
+
+    Returns
+    -------
+    rows, next
+        The cursor of the next page is None where there is none.
+
+    Raises
+    ------
+    BadCursor
+    """
+    after = position_of(cursor, *(key.type.python_type for key in keys))
+    if after is not None:
+        here = tuple_(*keys)
+        statement = statement.where(here > after if is_rising else here < after)
+    order = (key.asc() if is_rising else key.desc() for key in keys)
+    rows = session.execute(statement.order_by(*order).limit(limit)).all()
+    following = None if len(rows) < limit else cursor_of(*(getattr(rows[-1][0], key.key) for key in keys))
+    return rows, following
+
+
+def newest(
+    session: Session, table: type[Paged], project_id: str, *, cursor: str | None, limit: int, **where: Any
+) -> tuple[list[Paged], str | None]:
+    """Read a page of a project's rows, the newest first, of those that have the values of `where` that are not None."""
+    statement = select(table).where(table.project_id == project_id)
+    statement = statement.filter_by(**{name: value for name, value in where.items() if value is not None})
+    rows, following = page_of(session, statement, table.created_us, table.id, cursor=cursor, limit=limit)
+    return [row for (row,) in rows], following
 
 
 def cursor_of(*position: Any) -> str:

@@ -16,7 +16,7 @@ from schemas.drive import DriveManifest
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us, moment
 from service.api.http.body_reading import parsed_body
-from service.api.http.paging import cursor_of, position_of
+from service.api.http.paging import newest
 from service.api.http.request_bodies import BODY, Body, describe, json_content
 from service.api.http.responses import gives, problems
 from service.api.manifests.manifest_check import checked_manifest, stored_manifest
@@ -92,13 +92,9 @@ def list_drives(
 ) -> Page[DriveResource]:
     """Drives of the project, newest first."""
     with context.database.read() as session:
-        found = drives.page(session, caller.project_id, after=position_of(cursor, int, str), limit=limit)
+        found, following = newest(session, Drive, caller.project_id, cursor=cursor, limit=limit)
         stored = drives.stored_of(session, [drive.id for drive in found])
-    last = found[-1] if len(found) == limit else None
-    return Page(
-        items=[shown(drive, stored[drive.id]) for drive in found],
-        next=None if last is None else cursor_of(last.created_us, last.id),
-    )
+    return Page(items=[shown(drive, stored[drive.id]) for drive in found], next=following)
 
 
 @router.get("/{drive_id}", summary="Show a drive", responses={**gives(200, "The drive"), **problems(401, 404)})

@@ -20,7 +20,7 @@ from schemas.api.resource import Page
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer
 from service.api.http.body_reading import json_body
-from service.api.http.paging import cursor_of, position_of
+from service.api.http.paging import page_of
 from service.api.http.request_bodies import Body, describe, describe_bytes
 from service.api.http.responses import gives, problems
 from service.api.routes.file_ingest import keep_archive, keep_file, require_room, require_wanted
@@ -68,14 +68,10 @@ def list_files(
         drive = drives.get(session, caller.project_id, drive_id)
         statement = select(DriveFile, Blob).outerjoin(Blob, DriveFile.blob_id == Blob.id)
         statement = statement.where(DriveFile.drive_id == drive.id)
-        after = position_of(cursor, str)
-        if after is not None:
-            statement = statement.where(DriveFile.path > after[0])
         if stored is not None:
             statement = statement.where(DriveFile.blob_id.is_not(None) if stored else DriveFile.blob_id.is_(None))
-        rows = session.execute(statement.order_by(DriveFile.path).limit(limit)).all()
-    last = rows[-1][0].path if len(rows) == limit else None
-    return Page(items=[_shown(file, blob) for file, blob in rows], next=None if last is None else cursor_of(last))
+        rows, following = page_of(session, statement, DriveFile.path, cursor=cursor, limit=limit, is_rising=True)
+    return Page(items=[_shown(file, blob) for file, blob in rows], next=following)
 
 
 @router.post(

@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Request, Response
 from fastapi.security.utils import get_authorization_scheme_param
 from fastapi.sse import EventSourceResponse, ServerSentEvent
-from sqlalchemy import select, tuple_
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -17,7 +17,7 @@ from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us
-from service.api.http.paging import cursor_of, position_of
+from service.api.http.paging import newest
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
 from service.api.routes.aggregations import ACCEPTED, accepted
@@ -47,20 +47,9 @@ def list_jobs(
     drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
 ) -> Page[JobResource]:
     """Jobs of the project, newest first."""
-    statement = select(Job).where(Job.project_id == caller.project_id)
-    if drive_id is not None:
-        statement = statement.where(Job.drive_id == drive_id)
-    after = position_of(cursor, int, str)
-    if after is not None:
-        statement = statement.where(tuple_(Job.created_us, Job.id) < after)
     with context.database.read() as session:
-        found = session.scalars(statement.order_by(Job.created_us.desc(), Job.id.desc()).limit(limit)).all()
-        items = views_of(session, found, context.settings)
-    last = found[-1] if len(found) == limit else None
-    return Page(
-        items=items,
-        next=None if last is None else cursor_of(last.created_us, last.id),
-    )
+        found, following = newest(session, Job, caller.project_id, cursor=cursor, limit=limit, drive_id=drive_id)
+        return Page(items=views_of(session, found, context.settings), next=following)
 
 
 @router.get(

@@ -5,29 +5,19 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, BackgroundTasks, Depends, Request, Response
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
-from starlette.concurrency import run_in_threadpool
 
 from schemas.api.maps import CurrentVersion, MapFileResource, MapResource, MapVersionResource
 from schemas.api.resource import Page
-from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, Limit, moment
 from service.api.http.body_reading import json_body
-from service.api.http.paging import cursor_of, position_of
+from service.api.http.paging import newest, page_of
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import gives, problems
-from service.api.routes.downloads import (
-    DOWNLOAD_PARAMETERS,
-    DOWNLOADS,
-    HEAD_PARAMETERS,
-    HEADS,
-    download_name,
-    send_file,
-)
+from service.api.routes.downloads import download_route, files_of, find_file, send_file
 from service.database.tables import Blob, Map, MapFile, MapScene, MapVersion
 from service.domain import maps
-from service.errors import not_found
 from service.storage.garbage_collection import collect_unused
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
@@ -39,10 +29,8 @@ read_current = json_body(CurrentVersion, lambda settings: settings.max_json_byte
 def list_maps(caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor: Cursor = None) -> Page[MapResource]:
     """Maps of the project, newest first, with their current versions."""
     with context.database.read() as session:
-        found = maps.page(session, caller.project_id, after=position_of(cursor, int, str), limit=limit)
-        items = [_shown(session, each) for each in found]
-    last = found[-1] if len(found) == limit else None
-    return Page(items=items, next=None if last is None else cursor_of(last.created_us, last.id))
+        found, following = newest(session, Map, caller.project_id, cursor=cursor, limit=limit)
+        return Page(items=[_shown(session, each) for each in found], next=following)
 
 
 @router.get("/{map_id}", summary="Show a map", responses={**gives(200, "The map"), **problems(401, 404)})
@@ -95,16 +83,11 @@ def list_map_versions(
     map_id: str, caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[MapVersionResource]:
     """Versions of a map, newest first, without their files."""
-    after = position_of(cursor, int)
     with context.database.read() as session:
         found = maps.get(session, caller.project_id, map_id)
         statement = select(MapVersion).where(MapVersion.map_id == map_id)
-        if after is not None:
-            statement = statement.where(MapVersion.number < after[0])
-        versions = session.scalars(statement.order_by(MapVersion.number.desc()).limit(limit)).all()
-        items = [_shown_version(session, found, version) for version in versions]
-    last = versions[-1] if len(versions) == limit else None
-    return Page(items=items, next=None if last is None else cursor_of(last.number))
+        rows, following = page_of(session, statement, MapVersion.number, cursor=cursor, limit=limit)
+        return Page(items=[_shown_version(session, found, version) for (version,) in rows], next=following)
 
 
 @router.get(
@@ -134,40 +117,19 @@ def delete_map_version(
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 
-@router.head(
-    "/{map_id}/versions/{version}/files/{path:path}",
-    response_class=Response,
-    name="head_map_file",
-    summary="Show a download's headers",
-    responses={**HEADS, **problems(401, 404)},
-    openapi_extra=HEAD_PARAMETERS,
-)
-@router.get(
-    "/{map_id}/versions/{version}/files/{path:path}",
-    response_class=Response,
-    summary="Download a file of a map",
-    responses={**DOWNLOADS, **problems(401, 404, 416)},
-    openapi_extra=DOWNLOAD_PARAMETERS,
-)
+@download_route(router, "/{map_id}/versions/{version}/files/{path:path}", summary="Download a file of a map")
 async def download_map_file(
     map_id: str, version: str, path: str, request: Request, caller: CallerDep, context: ContextDep
 ) -> Response:
     """One file of a map's version. `Range` resumes a download; `ETag` and `Repr-Digest` are its SHA-256."""
-    found, file, blob = await run_in_threadpool(_look_up, context, caller.project_id, map_id, version, path)
-    name = download_name(f"{found.name}-{file.number}", path)
-    return await send_file(context, request, blob, media_type=file.media_type, name=name)
 
+    def find(session: Session) -> tuple[str, MapFile, Blob]:
+        found = maps.get(session, caller.project_id, map_id)
+        shown = maps.version_of(session, found, version)
+        owner = f"version {shown.number} of map {map_id}"
+        return f"{found.name}-{shown.number}", *find_file(session, MapFile, _files(shown), path, owner=owner)
 
-def _look_up(context: Context, project_id: str, map_id: str, version: str, path: str) -> tuple[Map, MapFile, Blob]:
-    with context.database.read() as session:
-        found = maps.get(session, project_id, map_id)
-        number = maps.version_of(session, found, version).number
-        mine = (MapFile.map_id == map_id) & (MapFile.number == number) & (MapFile.path == path)
-        statement = select(MapFile, Blob).join(Blob, MapFile.blob_id == Blob.id).where(mine)
-        row = session.execute(statement).first() if path.isprintable() else None
-        if row is None:
-            raise not_found(f"file in version {number} of map {map_id} named", path)
-        return found, row[0], row[1]
+    return await send_file(context, request, path, find)
 
 
 def _shown(session: Session, found: Map) -> MapResource:
@@ -193,6 +155,7 @@ def _shown_version(
     mine = (MapScene.map_id == found.id) & (MapScene.number == version.number)
     scenes = session.scalars(select(MapScene).where(mine).order_by(MapScene.name)).all()
     shown = ("name", "drive_id", "scene_id", "connected")
+    url = f"/v1/maps/{found.id}/versions/{version.number}"
     return MapVersionResource.model_validate(
         {
             "map_id": found.id,
@@ -204,22 +167,11 @@ def _shown_version(
             "scenes": [{name: getattr(scene, name) for name in shown} for scene in scenes],
             "unconnected": [scene.name for scene in scenes if not scene.connected],
             "failed": version.failed,
-            "files": _files(session, version) if with_files else [],
+            "files": files_of(session, MapFile, _files(version), MapFileResource, url) if with_files else [],
             "created_at": moment(version.created_us),
         }
     )
 
 
-def _files(session: Session, version: MapVersion) -> list[MapFileResource]:
-    mine = (MapFile.map_id == version.map_id) & (MapFile.number == version.number)
-    statement = select(MapFile, Blob).join(Blob, MapFile.blob_id == Blob.id).where(mine).order_by(MapFile.path)
-    return [
-        MapFileResource(
-            path=file.path,
-            size_bytes=blob.size_bytes,
-            sha256=blob.sha256,
-            media_type=file.media_type,
-            url=f"/v1/maps/{file.map_id}/versions/{file.number}/files/{file.path}",
-        )
-        for file, blob in session.execute(statement)
-    ]
+def _files(version: MapVersion) -> ColumnElement[bool]:
+    return (MapFile.map_id == version.map_id) & (MapFile.number == version.number)

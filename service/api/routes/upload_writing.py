@@ -19,14 +19,13 @@ from service.domain import uploads
 from service.errors import (
     ChecksumMismatch,
     ServiceError,
-    TooLarge,
     WrongDigest,
     WrongOffset,
 )
 from service.storage.blob_writer import file_sha256
 from service.storage.durability import boot_id
 from service.storage.spool import Spooled, require_space
-from service.storage.uploads.resumable import Appender, Hash, PartialFile, append, new_hash
+from service.storage.uploads.resumable import Appender, Hash, PartialFile, append, new_hash, require_length
 
 # What may pass, or be made room for: the bytes wait. Anything else would be answered the same way again.
 _MAY_PASS = frozenset({408, 413, 423, 429, 500, 503, 507})
@@ -178,11 +177,7 @@ class _Held:
                 headers={"Upload-Offset": str(self.offset)},
             )
         missing_bytes = self.upload.size_bytes - offset
-        if length is not None and length > missing_bytes:
-            raise TooLarge(
-                f"the request has {length} bytes, upload {self.upload.id} misses {missing_bytes}",
-                remedy="Send no more than Upload-Length says.",
-            )
+        require_length(length or 0, missing_bytes)
         settings = self._context.settings
         require_space(
             settings.spool_dir, missing_bytes if length is None else length, min_free_bytes=settings.min_free_disk_bytes

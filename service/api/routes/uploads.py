@@ -21,8 +21,8 @@ from service.domain.idempotency import Answer
 from service.errors import (
     MethodNotAllowed,
     ServiceError,
-    TooLarge,
     WrongMediaType,
+    require_size,
 )
 from service.storage.spool import require_space
 
@@ -112,12 +112,7 @@ def create_upload(
     announced = tus.parse_announced(upload_length, upload_metadata)
     settings = context.settings
     bound = settings.max_archive_bytes if announced.path is None else settings.max_file_bytes
-    if announced.size_bytes > bound:
-        raise TooLarge(
-            f"the upload has {announced.size_bytes} bytes, the bound is {bound}",
-            remedy="Send a smaller file, or several.",
-            headers={"Tus-Max-Size": str(bound)},
-        )
+    require_size(announced.size_bytes, bound, what="upload", headers={"Tus-Max-Size": str(bound)})
     settings.spool_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     require_space(settings.spool_dir, announced.size_bytes, min_free_bytes=settings.min_free_disk_bytes)
 

@@ -22,8 +22,8 @@ import anyio
 
 from service.errors import (
     ServiceError,
-    TooLarge,
     UploadLocked,
+    require_size,
 )
 from service.storage.spool import BATCH_BYTES, BatchWriter, DiskLimiter, Part, full_disk_is_507, require_space
 
@@ -183,7 +183,7 @@ async def append(stream: AsyncIterator[bytes], appender: Appender, *, max_bytes:
             received_bytes += len(chunk)
             if received_bytes > max_bytes:
                 batch = []
-                raise _too_long(max_bytes)
+            require_length(received_bytes, max_bytes)
             batch.append(chunk)
             batched_bytes += len(chunk)
             if batched_bytes >= BATCH_BYTES:
@@ -246,8 +246,6 @@ def _locked(upload_id: str) -> ServiceError:
     )
 
 
-def _too_long(max_bytes: int) -> ServiceError:
-    return TooLarge(
-        f"the request has more than the {max_bytes} bytes that are missing",
-        remedy="Send no more than Upload-Length says.",
-    )
+def require_length(size_bytes: int, missing_bytes: int) -> None:
+    """Refuse a request with more bytes than the upload misses."""
+    require_size(size_bytes, missing_bytes, what="request", remedy="Send no more than Upload-Length says.")
