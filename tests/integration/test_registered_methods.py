@@ -37,12 +37,11 @@ def test_a_name_without_a_line_is_refused() -> None:
 
 
 @pytest.mark.usefixtures("registered")
-@pytest.mark.parametrize("matcher", ["nearest", "cross-check"])
 def test_a_drive_is_reconstructed_with_it(
-    mrasfm: Callable[..., CommandResult], surround_drive: Path, tmp_path: Path, matcher: str
+    mrasfm: Callable[..., CommandResult], surround_drive: Path, tmp_path: Path
 ) -> None:
     config = tmp_path / "config.toml"
-    config.write_text(f'[features]\nextractor = "orb"\n[matching]\nmatcher = "{matcher}"\n')
+    config.write_text('[features]\nextractor = "orb"\n[matching]\nmatcher = "cross-check"\n')
     scene = tmp_path / "scene"
     ran = mrasfm("reconstruct", surround_drive, "--out", scene, "--config", config)
     assert ran.code == 0, ran.err
