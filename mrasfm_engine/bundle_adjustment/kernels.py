@@ -226,7 +226,7 @@ def invert3(v: Any, out: Any) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, obs_image: Any,
-    slots: Slots, groups: Groups, sigma: float, loss2: float, damping: float, lo: int, hi: int, sums: Sums,
+    free_slots: Slots, groups: Groups, sigma: float, loss2: float, damping: float, lo: int, hi: int, sums: Sums,
 ) -> None:  # fmt: skip
     """Eliminate points order[lo:hi].
 
@@ -237,7 +237,7 @@ def accumulate(
     """
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
-    unit_slot, camera_slot, num_units = slots
+    unit_slot, camera_slot, num_units = free_slots
     order, first_point, blocks, first_block, places, first_place = groups
     images, s_units, s_border, s_cameras, g, v_inverse, v_gradient = sums
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
@@ -444,8 +444,8 @@ def _subtract_products(
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def add_images(
     views: Views, bands: Bands | None, motion: Motion | None, image_unit: Any, image_camera: Any, image_band: Any,
-    slots: Slots, first_row: Any, rows: Any, images: Any, s_units: Any, s_border: Any, s_cameras: Any, diagonal: Any,
-    g: Any,
+    free_slots: Slots, first_row: Any, rows: Any, images: Any, s_units: Any, s_border: Any, s_cameras: Any,
+    diagonal: Any, g: Any,
 ) -> None:  # fmt: skip
     """Add the sums of every image to the matrix, to the undamped diagonal (n,) and to the gradient (n,).
 
@@ -456,7 +456,7 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
-    unit_slot, camera_slot, num_units = slots
+    unit_slot, camera_slot, num_units = free_slots
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
         u, c, band = image_unit[image], image_camera[image], image_band[image]
@@ -564,7 +564,7 @@ def _camera_from_unit(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
-    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, slots: Slots,
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
     sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
@@ -572,7 +572,7 @@ def substitute(
     jx, jc, e = np.empty((2, 3)), np.empty((2, 7)), np.empty(3)
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, _ = observed
-    unit_slot, camera_slot, num_units = slots
+    unit_slot, camera_slot, num_units = free_slots
     for p in range(lo, hi):
         for i in range(3):
             e[i] = v_gradient[p, i]

@@ -210,20 +210,20 @@ class Problem:
         )
         gradient = np.zeros((parts, layout.size))
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))
-        views, motion, observed, slots, groups = (
+        views, motion, observed, free_slots, groups = (
             self._views(state), self._motion, self._observed, self._slots, structure.groups
         )  # fmt: skip
         in_parts(
             structure.shares(parts),
             lambda lo, hi, t: accumulate(
-                *views, motion, state.points_m, observed, structure.image, slots, groups, options.sigma_px,
+                *views, motion, state.points_m, observed, structure.image, free_slots, groups, options.sigma_px,
                 options.loss_scale**2, damping, lo, hi,
                 Sums(images[t], blocks[0][t], blocks[1][t], blocks[2][t], gradient[t], v_inverse, v_gradient),
             ),
         )  # fmt: skip
         sums = tuple(part[0] if parts == 1 else part.sum(0) for part in (*blocks, np.zeros_like(gradient), gradient))
         add_images(
-            *views, motion, structure.image_unit, structure.image_camera, structure.image_band, slots,
+            *views, motion, structure.image_unit, structure.image_camera, structure.image_band, free_slots,
             structure.pattern.first, structure.pattern.row,
             images.sum(0), *sums,
         )  # fmt: skip
@@ -243,13 +243,13 @@ class Problem:
 
     def points_after(self, state: State, system: ReducedCameraSystem, step: Floats) -> Floats:
         """Points (p, 3) that go with a step of the reduced vector."""
-        views, motion, observed, slots = self._views(state), self._motion, self._observed, self._slots
+        views, motion, observed, free_slots = self._views(state), self._motion, self._observed, self._slots
         options, out = self.options, np.empty_like(state.points_m)
         in_ranges(
             options.threads,
             len(out),
             lambda lo, hi, _: substitute(
-                *views, motion, state.points_m, observed, slots, options.sigma_px, options.loss_scale**2,
+                *views, motion, state.points_m, observed, free_slots, options.sigma_px, options.loss_scale**2,
                 step, system.v_inverse, system.v_gradient, lo, hi, out,
             ),
         )  # fmt: skip
