@@ -245,7 +245,7 @@ def _unpack_features(arrays: Arrays, left_out: Sequence[Incomplete | None]) -> l
 
 
 def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> list[PairMatches]:
-    """Candidate pairs by the prior (or by window and likeness), matched and verified."""
+    """Candidate pairs by the prior (or by window and similarity), matched and verified."""
 
     def work() -> tuple[Arrays, dict[str, Any]]:
         if not run.config.pairs.selection:

@@ -34,7 +34,7 @@ class Probe:
 
 
 def thinned(scene: SourceScene, spacing_m: float) -> Ints:
-    """Registered units at least so far apart along the way."""
+    """Registered units at least so far apart along the trajectory."""
     chosen: list[int] = []
     last = None
     for unit in np.flatnonzero(scene.unit_registered):
@@ -46,13 +46,13 @@ def thinned(scene: SourceScene, spacing_m: float) -> Ints:
 
 
 def _length_m(scene: SourceScene) -> float:
-    return float(np.linalg.norm(np.diff(scene.way_m, axis=0), axis=1).sum())
+    return float(np.linalg.norm(np.diff(scene.travelled_m, axis=0), axis=1).sum())
 
 
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
     """Smallest horizontal distance between the trajectories of two scenes."""
-    way = b.way_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-    return float(np.min(cKDTree(a.way_m[:, :2]).query(way[:, :2])[0]))
+    way = b.travelled_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    return float(np.min(cKDTree(a.travelled_m[:, :2]).query(way[:, :2])[0]))
 
 
 def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> list[Probe]:

@@ -1,7 +1,7 @@
 """Verified matches of a simulated long route, as the matching stage would leave them.
 
 Pairs are those of the ordinary window, and revisits. Revisits are not found by descriptors here but taken from the
-truth, with what a search by likeness does wrong: it misses some, and takes some other place for the same. Descriptors
+truth, with what a search by similarity does wrong: it misses some, and takes some other place for the same. Descriptors
 would have to be simulated, compared and clustered for millions of keypoints. That takes long and much memory, is not
 what is to be measured, and random descriptors say nothing of how well a search tells real places apart.
 
@@ -112,9 +112,9 @@ def revisits(views: list[_View], route: LongRoute, per_unit: int, rng: np.random
     """
     cameras, units = len(route.cameras), len(route.world_from_rig)
     near: dict[int, list[int]] = defaultdict(list)
-    way_m = route.way_m
+    travelled_m = route.travelled_m
     for u, v in cKDTree(route.world_from_rig[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray").tolist():
-        if v - u >= MIN_GAP_UNITS and way_m[v] - way_m[u] > REVISIT_WAY_M:
+        if v - u >= MIN_GAP_UNITS and travelled_m[v] - travelled_m[u] > REVISIT_WAY_M:
             near[u].append(v)
             near[v].append(u)
     true: set[tuple[int, int]] = set()

@@ -164,7 +164,7 @@ def mean_rotation(rotations: ArrayLike, weights: ArrayLike | None = None) -> Flo
 
 
 def slerp(rotation_a: ArrayLike, rotation_b: ArrayLike, fraction: ArrayLike) -> Floats:
-    """Rotation(s) at `fraction` (0..1) of the way from a to b, along the shortest arc."""
+    """Rotation(s) at `fraction` (0..1) of the trajectory from a to b, along the shortest arc."""
     a, b = np.asarray(rotation_a, dtype=np.float64), np.asarray(rotation_b, dtype=np.float64)
     step = log_so3(np.swapaxes(a, -1, -2) @ b) * np.asarray(fraction, dtype=np.float64)[..., None]
     result: Floats = a @ exp_so3(step)

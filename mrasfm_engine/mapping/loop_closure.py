@@ -96,11 +96,11 @@ def _try(mapper: Mapper, earlier: int, later: int, pairs: Sequence[PairMatches])
     )
 
 
-def _plausible(revisit: Revisit, mapper: Mapper, way_m: float) -> bool:
+def _plausible(revisit: Revisit, mapper: Mapper, travelled_m: float) -> bool:
     at = mapper.state.unit_position_m[revisit.later]
     shift = np.linalg.norm(revisit.drift[:3, :3] @ at + revisit.drift[:3, 3] - at)
     turn = float(se3.rotation_angle_deg(revisit.drift[:3, :3]))
-    return bool(shift <= MAX_DRIFT_M + MAX_DRIFT_PER_M * way_m and turn <= MAX_DRIFT_DEG)
+    return bool(shift <= MAX_DRIFT_M + MAX_DRIFT_PER_M * travelled_m and turn <= MAX_DRIFT_DEG)
 
 
 def _supported(revisits: Sequence[Revisit], mapper: Mapper) -> list[Revisit]:

@@ -14,7 +14,7 @@ import numpy as np
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
-from mrasfm_engine.triangulation.road_prior import points_below_the_way, standing_is_impossible
+from mrasfm_engine.triangulation.road_prior import points_below_trajectory, standing_is_impossible
 from mrasfm_engine.triangulation.road_surface import FittedRoad, fit_road
 from mrasfm_engine.triangulation.triangulate import cam_from_world
 from mrasfm_engine.triangulation.uncertainty import point_covariances
@@ -67,7 +67,7 @@ def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
             return "without masks, the road is judged in the finished scene only: too unsure to bear on poses"
         source = RoadSource.GEOMETRY
         tracks = np.flatnonzero(mapper.triangulated & (mapper.track_class == UNKNOWN))
-        below = points_below_the_way(mapper.state.points_m[tracks], world_from_rig, _lowest_camera_m(mapper))
+        below = points_below_trajectory(mapper.state.points_m[tracks], world_from_rig, _lowest_camera_m(mapper))
         if below is None:
             return "without masks, no points lie on one level below the vehicle's way"
         tracks = tracks[below]

@@ -16,7 +16,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 ASSUMED_STEP_M = 1.5  # how far a car may have gone from one unit to the next, where nothing else is known
 REVISIT_PATH_M = 20.0  # units farther apart along the route than this, but near one another, are a revisit;
-REVISIT_DIRECT = 0.5  # near: by less than this share of the way between them
+REVISIT_DIRECT = 0.5  # near: by less than this share of the trajectory between them
 SMOOTHED_UNITS = 9
 REVISIT_SHARE = 0.4  # of an image's pairs that revisits may take
 
@@ -117,7 +117,7 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     tree = cKDTree(centres)
     pairs = tree.query_pairs(config.max_depth_m, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     pairs.sort(axis=1)
-    way = _way_m(world_from_rig[:, :3, 3])
+    way = _travelled_m(world_from_rig[:, :3, 3])
     gap = np.abs(views.unit[pairs[:, 0]] - views.unit[pairs[:, 1]])
     way_between = np.abs(way[views.unit[pairs[:, 0]]] - way[views.unit[pairs[:, 1]]])
     position = world_from_rig[views.unit, :3, 3]
@@ -157,7 +157,7 @@ def _pairs_where_known(drive: Drive, world_from_rig: Floats, known: Bools, confi
     return np.unique(np.concatenate([by_overlap[both], by_window[one]]), axis=0)
 
 
-def _way_m(position_m: Floats) -> Floats:
+def _travelled_m(position_m: Floats) -> Floats:
     """Way driven up to each unit (units,); smoothed, as a receiver's noise from unit to unit is no way."""
     smooth = np.stack([uniform_filter1d(position_m[:, k], SMOOTHED_UNITS, mode="nearest") for k in range(3)], axis=1)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])

@@ -1,4 +1,4 @@
-"""Units that may show the same place again, found by the likeness of images alone."""
+"""Units that may show the same place again, found by the similarity of images alone."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ class RoadSource(StrEnum):
     """Source of the decision that a point is on the road."""
 
     MASKS = "masks"
-    GEOMETRY = "geometry"  # below the vehicle's way, where no mask says what is road: less sure
+    GEOMETRY = "geometry"  # below the vehicle's trajectory, where no mask says what is road: less sure
 
 
 @dataclass(frozen=True, kw_only=True)

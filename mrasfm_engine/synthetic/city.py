@@ -67,16 +67,16 @@ def walk(streets: int, rng: np.random.Generator) -> list[Junction]:
     return route
 
 
-def city_route(way_m: float, rng: np.random.Generator) -> CityRoute:
-    """A route of at least `way_m` through a city that is small enough for it to come back."""
-    junctions = walk(math.ceil(way_m / 90.0) + 2, rng)  # a street less what corners cut off is longer than 90 m
+def city_route(travelled_m: float, rng: np.random.Generator) -> CityRoute:
+    """A route of at least `travelled_m` through a city that is small enough for it to come back."""
+    junctions = walk(math.ceil(travelled_m / 90.0) + 2, rng)  # a street less what corners cut off is longer than 90 m
     middle = _middle_of_street(np.array(junctions, dtype=np.float64) * BLOCK_M)
     along = _lengths(middle)
     right = -LANE_M + SWAY_M * np.sin(along / 17.0 + rng.uniform(0, 2 * np.pi))
     forward = np.gradient(middle, axis=0)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     xy = middle + right[:, None] * np.stack([-forward[:, 1], forward[:, 0]], -1)
-    return CityRoute(xy_m=xy, way_m=_lengths(xy))
+    return CityRoute(xy_m=xy, travelled_m=_lengths(xy))
 
 
 def _lengths(xy_m: Floats) -> Floats:
@@ -109,14 +109,14 @@ class CityRoute:
     """The way of a vehicle's rear axle through the city, as a fine polyline."""
 
     xy_m: Floats  # (n, 2)
-    way_m: Floats  # (n,) driven until there
+    travelled_m: Floats  # (n,) driven until there
 
-    def world_from_rig(self, way_m: ArrayLike) -> Floats:
+    def world_from_rig(self, travelled_m: ArrayLike) -> Floats:
         """Poses (..., 4, 4) after a way (...) driven: x forward, y left, z up, origin on the ground.
 
         The body follows the ground, and pitches and rolls on its springs by 0.3 degrees.
         """
-        way = np.asarray(way_m, dtype=np.float64)
+        way = np.asarray(travelled_m, dtype=np.float64)
         at = self._at(way)
         forward = self._at(way + 0.4) - self._at(way - 0.4)
         forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
@@ -131,8 +131,8 @@ class CityRoute:
         )
         return se3.transform(rotation, np.concatenate([at, ground_m(at)[..., None]], -1))
 
-    def _at(self, way_m: Floats) -> Floats:
-        return np.stack([np.interp(way_m, self.way_m, self.xy_m[:, k]) for k in range(2)], -1)
+    def _at(self, travelled_m: Floats) -> Floats:
+        return np.stack([np.interp(travelled_m, self.travelled_m, self.xy_m[:, k]) for k in range(2)], -1)
 
 
 def points_beside(route_xy_m: Floats, rng: np.random.Generator) -> Floats:

@@ -43,7 +43,7 @@ class LongRoute:
     point: list[Ints]  # by image (n,): index into points_m of every keypoint
 
     @property
-    def way_m(self) -> Floats:
+    def travelled_m(self) -> Floats:
         """Way driven up to each unit (units,)."""
         steps = np.linalg.norm(np.diff(self.world_from_rig[:, :3, 3], axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
@@ -105,8 +105,8 @@ def simulate_long_route(rig: str, units: int, *, seed: int = 0, progress: CountP
     count, (width, height) = RIGS[rig]
     rng = np.random.default_rng(seed)
     cameras = true_cameras(count, width=width, height=height, rng=rng)
-    way_m = SPACING_M * np.arange(units)
-    world_from_rig = city_route(float(way_m[-1]), rng).world_from_rig(way_m)
+    travelled_m = SPACING_M * np.arange(units)
+    world_from_rig = city_route(float(travelled_m[-1]), rng).world_from_rig(travelled_m)
     return observe_route(cameras, world_from_rig, seed=seed, progress=progress)
 
 

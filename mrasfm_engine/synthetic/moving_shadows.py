@@ -18,7 +18,7 @@ from mrasfm_engine.synthetic.streets import Layout, Route
 from mrasfm_engine.types import Floats
 
 OWN_CENTRE_M = 1.3  # of the body ahead of the rear axle
-REACH_M = (-10.0, 14.0)  # where along the way a companion meets the vehicle, from behind to ahead
+REACH_M = (-10.0, 14.0)  # where along the trajectory a companion meets the vehicle, from behind to ahead
 LATERAL_M = (-4.2, 4.2)  # of companions to the street's axis
 HEIGHT_M = (1.2, 2.8)  # of what they carry above the ground
 SPEED_SHARE = ((-0.9, -0.25), (0.2, 0.75))  # of the vehicle's speed: oncoming, and slower ones of the same direction
@@ -56,7 +56,7 @@ class ShadowCaster:
 def moving_shadows(
     options: SynthOptions, layout: Layout, drive: int, own: Motion, rng: np.random.Generator
 ) -> list[ShadowCaster]:
-    """The recording vehicle's own shadow and `options.moving_shadows` companions along its way; none for zero."""
+    """The recording vehicle's own shadow and `options.moving_shadows` companions along its path; none for zero."""
     if not options.moving_shadows:
         return []
     length, width, height = objects.CAR_SIZE_M

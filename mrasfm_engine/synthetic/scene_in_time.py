@@ -81,7 +81,7 @@ class SceneInTime:
 def parked_cars(
     options: SynthOptions, world: StaticWorld, drive: int, rng: np.random.Generator
 ) -> list[tuple[Mesh, Floats]]:
-    """Cars in the parking lanes along a drive's way, none in another street: in the world, and where they stand."""
+    """Cars in the parking lanes along a drive's path, none in another street: in the world, and where they stand."""
     layout: Layout = world.layout
     route = layout.routes[drive]
     street = layout.streets[route.street]

@@ -44,11 +44,11 @@ def simulate_trajectory(units: int, *, spacing_m: float = 1.1, straight: bool = 
 
     Over 40 units of 1.1 m the heading of the winding street varies by 29 degrees.
     """
-    way_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
-    return poses_along(way_m, spacing_m=spacing_m, straight=straight)
+    travelled_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
+    return poses_along(travelled_m, spacing_m=spacing_m, straight=straight)
 
 
-def poses_along(way_m: Floats, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
+def poses_along(travelled_m: Floats, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
     """Poses (n, 4, 4) of the car of `simulate_trajectory` after any way (n,) driven, also before its first unit."""
 
     def heading(s: Floats) -> Floats:
@@ -60,8 +60,8 @@ def poses_along(way_m: Floats, *, spacing_m: float = 1.1, straight: bool = False
 
     # Fine steps forward and back from the start: the poses belong to one smooth curve.
     step_m = spacing_m / _FINE
-    ahead = np.arange(max(0, math.ceil(way_m.max(initial=0.0) / step_m)) + 2) * step_m
-    back = -np.arange(max(0, math.ceil(-way_m.min(initial=0.0) / step_m)) + 2) * step_m
+    ahead = np.arange(max(0, math.ceil(travelled_m.max(initial=0.0) / step_m)) + 2) * step_m
+    back = -np.arange(max(0, math.ceil(-travelled_m.min(initial=0.0) / step_m)) + 2) * step_m
     grids, places = [], []
     for grid in (back, ahead):
         along = np.stack([np.cos(heading(grid)), np.sin(heading(grid)), np.zeros_like(grid)], -1) * (grid[1] - grid[0])
@@ -69,10 +69,10 @@ def poses_along(way_m: Floats, *, spacing_m: float = 1.1, straight: bool = False
         places.append(np.concatenate([np.zeros((1, 3)), np.cumsum(along, 0)[:-1]]))
     grid = np.concatenate([grids[0][:0:-1], grids[1]])
     place = np.concatenate([places[0][:0:-1], places[1]])
-    position = np.stack([np.interp(way_m, grid, place[:, k]) for k in range(3)], -1)
-    pitch_roll = np.radians(0.4) * np.stack([np.sin(way_m / 1.3), np.sin(way_m / 2.1 + 1.0)], -1)
+    position = np.stack([np.interp(travelled_m, grid, place[:, k]) for k in range(3)], -1)
+    pitch_roll = np.radians(0.4) * np.stack([np.sin(travelled_m / 1.3), np.sin(travelled_m / 2.1 + 1.0)], -1)
     rotation = (
-        se3.exp_so3(heading(way_m)[:, None] * np.array([0.0, 0.0, 1.0]))
+        se3.exp_so3(heading(travelled_m)[:, None] * np.array([0.0, 0.0, 1.0]))
         @ se3.exp_so3(pitch_roll[:, :1] * np.array([0.0, 1.0, 0.0]))
         @ se3.exp_so3(pitch_roll[:, 1:] * np.array([1.0, 0.0, 0.0]))
     )
@@ -114,7 +114,7 @@ def simulate_observations(
     image_size_px: tuple[int, int] = (960, 540),
     time_offset_s: ArrayLike = 0.0,
     readout_s: float = 0.0,
-    way_m: Floats | None = None,
+    travelled_m: Floats | None = None,
     rng: np.random.Generator,
 ) -> SimulatedObservations:
     """Random points around a trajectory and what the cameras see of them.
@@ -161,10 +161,12 @@ def simulate_observations(
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
     params = np.array([camera.params for camera in rig])
     steady_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
-    way = steady_m if way_m is None else np.asarray(way_m, dtype=np.float64)
+    way = steady_m if travelled_m is None else np.asarray(travelled_m, dtype=np.float64)
     world_from_rig = poses_along(way, spacing_m=spacing_m, straight=straight)
     steps = max(2, round(float(np.ptp(way)) / spacing_m) + 1)
-    along = world_from_rig if way_m is None else simulate_trajectory(steps, spacing_m=spacing_m, straight=straight)
+    along = (
+        world_from_rig if travelled_m is None else simulate_trajectory(steps, spacing_m=spacing_m, straight=straight)
+    )
     world = _points_along(along, points, rng)
 
     cam_from_world = se3.inverse(world_from_rig[:, None] @ rig_from_cam[None])
@@ -181,7 +183,7 @@ def simulate_observations(
             # The row tells the time, and the time the row.
             at_s = time_s + (xy[which][:, 1] / height - 0.5) * readout_s
             way_then = at_s * RATE_HZ * spacing_m
-            if way_m is not None:
+            if travelled_m is not None:
                 way_then = np.interp(at_s * RATE_HZ, np.arange(units), way)
             then = poses_along(way_then, spacing_m=spacing_m, straight=straight)
             local = se3.apply(se3.inverse(then @ rig_from_cam[which[1]]), world[which[2], None])[:, 0]

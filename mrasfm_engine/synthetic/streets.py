@@ -90,7 +90,7 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True)
 class Route:
-    """A drive's way along one street."""
+    """A drive's trajectory along one street."""
 
     street: int
     start_m: float  # arc length of the first unit
@@ -162,7 +162,7 @@ def _hill(heading: float, percent: float, length_m: float) -> Ground:
     if percent == 0:
         return Ground(direction, np.zeros(2), 0.0)
     q = np.arange(-400.0, 800.0, GROUND_GRID_M)
-    # Flat, up from 10 m on for 60 % of the way, flat; slopes change over 12 m.
+    # Flat, up from 10 m on for 60 % of the trajectory, flat; slopes change over 12 m.
     begin, end = 10.0, 10.0 + max(20.0, 0.6 * length_m)
     fine = np.arange(-400.0, 804.0, 0.5)
     slope = percent / 100 * np.clip((fine - begin) / 12.0, 0, 1) * np.clip((end - fine) / 12.0, 0, 1)

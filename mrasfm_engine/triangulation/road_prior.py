@@ -8,17 +8,17 @@ from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.triangulation.road_surface import MIN_POINTS, horizontal_axes, most_frequent
 from mrasfm_engine.types import Bools, Floats
 
-CORRIDOR_M = 3.0  # to both sides of the way: a lane
-DRIVEN_M = 0.8  # to both sides of the way: where the vehicle itself was
+CORRIDOR_M = 3.0  # to both sides of the trajectory: a lane
+DRIVEN_M = 0.8  # to both sides of the trajectory: where the vehicle itself was
 VEHICLE_HEIGHT_M = 1.2  # above the road, in which nothing was where the vehicle drove
-AHEAD_M = 12.0  # how far beyond the ends of the way the road is believed to go on
+AHEAD_M = 12.0  # how far beyond the ends of the trajectory the road is believed to go on
 BELOW_CAMERAS_M = 0.3  # the road is at least that far below the lowest camera
 LEVEL_M = 0.5  # half the thickness of the layer that holds the road and what is wrong about it
 LEVEL_PER_M = 0.08  # what slopes add to it a metre of distance from the vehicle
 MIN_SHARE = 0.2  # of the points below the cameras on the way that must be on one level
 
 
-def points_below_the_way(points_m: Floats, world_from_rig: Floats, lowest_camera_m: float) -> Bools | None:
+def points_below_trajectory(points_m: Floats, world_from_rig: Floats, lowest_camera_m: float) -> Bools | None:
     """Return which points (n, 3) are near the road's level in the lane that the vehicle drove.
 
     Parameters
@@ -34,7 +34,7 @@ def points_below_the_way(points_m: Floats, world_from_rig: Floats, lowest_camera
     """
     if not len(points_m):
         return None
-    lateral, away, height = _beside_the_way(points_m, world_from_rig)
+    lateral, away, height = _beside_trajectory(points_m, world_from_rig)
     lane = (np.abs(lateral) < CORRIDOR_M) & (height < lowest_camera_m - BELOW_CAMERAS_M)
     if lane.sum() < MIN_POINTS:
         return None
@@ -49,18 +49,18 @@ def points_below_the_way(points_m: Floats, world_from_rig: Floats, lowest_camera
 def standing_is_impossible(points_m: Floats, distance_m: Floats, world_from_rig: Floats) -> Bools:
     """Return where (n,) nothing that stands can be: below the road, or above it in the lane that the vehicle drove.
 
-    `distance_m` (n,) is signed, to the road's surface. Kerbs, bollards and parked cars beside the way may be there.
+    `distance_m` (n,) is signed, to the road's surface. Kerbs, bollards and parked cars beside it may be there.
     """
-    lateral, _, _ = _beside_the_way(points_m, world_from_rig)
+    lateral, _, _ = _beside_trajectory(points_m, world_from_rig)
     driven = (np.abs(lateral) < DRIVEN_M) & (distance_m < VEHICLE_HEIGHT_M)
     result: Bools = (distance_m < 0) | driven
     return result
 
 
-def _beside_the_way(points_m: Floats, world_from_rig: Floats) -> tuple[Floats, Floats, Floats]:
-    """For points (n, 3): lateral offset from the way, distance from its nearest pose, and height in that pose's rig.
+def _beside_trajectory(points_m: Floats, world_from_rig: Floats) -> tuple[Floats, Floats, Floats]:
+    """Lateral offset of points (n, 3) from the trajectory, distance from its nearest pose, and height in that pose's rig.
 
-    Points farther than AHEAD_M beyond the ends of the way have an infinite offset.
+    Points farther than AHEAD_M beyond the ends of the trajectory have an infinite offset.
     """
     axes = horizontal_axes(world_from_rig)
     way, xyz = world_from_rig[:, :3, 3] @ axes.T, points_m @ axes.T

@@ -64,7 +64,7 @@ def horizontal_axes(world_from_rig: Floats) -> Floats:
 
 
 def rig_height_above(points_m: Floats, world_from_rig: Floats, *, reach_m: float) -> float | None:
-    """Height of the rig's origin above the road: the most frequent one over points (n, 3) near the vehicle's way.
+    """Height of the rig's origin above the road: the most frequent one over points (n, 3) near the trajectory.
 
     None where fewer than MIN_POINTS points are near it.
     """
@@ -119,7 +119,7 @@ def fit_road(
 
     Returns
     -------
-    The surface, or None where there are too few points near the vehicle's way, or no plane agrees with them.
+    The surface, or None where there are too few points near the vehicle's trajectory, or no plane agrees with them.
     """
     if len(points_m) < MIN_POINTS or not len(world_from_rig):
         return None
@@ -205,7 +205,7 @@ def _grow(
     roughness_m: float,
     rng: np.random.Generator,
 ) -> RoadSurface | None:
-    """Patches below the vehicle's way first, best supported first, then outwards over the rest of the points."""
+    """Patches below the vehicle's trajectory first, best supported first, then outwards over the rest of the points."""
     centres = _cover(below, SPACING * radius_m)
     candidates = []
     for n in centres:
@@ -275,7 +275,7 @@ def _cover(xyz: Floats, spacing_m: float) -> Sequence[int]:
 def _spread(
     points: _Points, patches: _Patches, radius_m: float, *, roughness_m: float, rng: np.random.Generator
 ) -> None:
-    """Patches over points that none reaches yet, each next to one that is known: ahead of the way, in side streets."""
+    """Add patches over points that none reaches yet, each next to a known one: ahead of the trajectory, in side streets."""
     reach = nearest(np.stack(patches.centre), points.xy)[0][:, 0]
     tried = np.zeros(len(reach), dtype=np.bool_)
     while True:

@@ -14,10 +14,10 @@ from mrasfm_engine.types import Floats, Floats32
 from mrasfm_engine.visualization.mosaic import GIVEN, REFINED, Grid, Mosaic
 
 FINE_CELL_M = 0.05  # with larger cells, displacements of a few centimetres are not seen
-PLOT_SIDE_M = 9.6  # the roadside on both sides of the way, and where it is searched
+PLOT_SIDE_M = 9.6  # the roadside on both sides of the trajectory, and where it is searched
 MAX_PLOTS = 40
 BLOCK_M = 0.8  # side of the pieces of ground that are compared
-ROADSIDE_M = 4.0  # farther from the way there are kerbs
+ROADSIDE_M = 4.0  # farther from the trajectory there are kerbs
 SEARCH_M = 0.4  # displacements up to this are found
 MIN_COVER = 0.96  # of the cells of a piece and of where it is searched
 MIN_CONTRAST = 3.0  # standard deviation of grey values: plain asphalt says nothing
@@ -49,23 +49,23 @@ class Agreement:
     displacement_m: float
 
 
-def plots_along(way_m: Floats) -> list[Grid]:
+def plots_along(travelled_m: Floats) -> list[Grid]:
     """Squares of ground in the finest cells, spread evenly over a way (n, 2) that the cells of one picture are too
     coarse for; at most `MAX_PLOTS`, and none where another one is."""
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way_m, axis=0), axis=1))])
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(travelled_m, axis=0), axis=1))])
     even = np.linspace(0.0, travelled[-1], 2 * MAX_PLOTS + 1)[1::2]
     chosen: list[Floats] = []
-    for place in way_m[np.searchsorted(travelled, even)]:
+    for place in travelled_m[np.searchsorted(travelled, even)]:
         if all(np.abs(place - other).max() >= PLOT_SIDE_M for other in chosen):
             chosen.append(place)
     return [Grid.square(place, side_m=PLOT_SIDE_M) for place in chosen]
 
 
-def measure_agreement(mosaics: Sequence[Mosaic], way_m: Floats) -> tuple[Agreement, Agreement] | None:
+def measure_agreement(mosaics: Sequence[Mosaic], travelled_m: Floats) -> tuple[Agreement, Agreement] | None:
     """Agreement of the best with the second best camera under the given and under the refined calibration.
 
-    Both are measured on the same pieces within `ROADSIDE_M` of the way (n, 2), chosen by contrast alone; None where
-    there are too few. All mosaics, of different ground, have cells of one size, no larger than `FINE_CELL_M`.
+    Both are measured on the same pieces within `ROADSIDE_M` of the trajectory (n, 2), chosen by contrast alone; None
+    where there are too few. All mosaics, of different ground, have cells of one size, no larger than `FINE_CELL_M`.
     """
     if not mosaics:
         return None
@@ -73,7 +73,7 @@ def measure_agreement(mosaics: Sequence[Mosaic], way_m: Floats) -> tuple[Agreeme
     if any(mosaic.grid.cell_m != cell for mosaic in mosaics) or cell > FINE_CELL_M:
         raise ValueError("the mosaics' cells differ, or are too coarse")
     size, margin = round(BLOCK_M / cell), round(SEARCH_M / cell)
-    tree = cKDTree(way_m)
+    tree = cKDTree(travelled_m)
     blocks: list[_Block] = []
     for mosaic in mosaics:
         blocks += _textured_blocks(mosaic, tree, size, margin)

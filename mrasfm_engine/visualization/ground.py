@@ -1,4 +1,4 @@
-"""The height of the ground along the way, from the scene's own points."""
+"""The height of the ground along the trajectory, from the scene's own points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats, Ints
 
-REACH_M = 12.0  # points farther from the way than this say nothing of the ground beside it,
+REACH_M = 12.0  # points farther from the trajectory than this say nothing of the ground beside it,
 LANE_SIGMA_M = 2.0  # and the farther to its side they are the less: there are kerbs
 BELOW_CAMERAS_M = (0.3, 6.0)  # the ground is that far below the lowest camera
 MAX_SLOPE = 0.12  # of the ground against the rig
@@ -44,7 +44,7 @@ class GroundHeights(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class GroundPatches:
-    """Planes `z = p0 + p1 (x - x_centre) + p2 (y - y_centre)` along the way, the nearest ones blended by distance."""
+    """Planes `z = p0 + p1 (x - x_centre) + p2 (y - y_centre)` along the path, the nearest ones blended by distance."""
 
     centre_m: Floats  # (k, 2)
     plane: Floats  # (k, 3) height at the centre in metres, and two slopes
@@ -67,7 +67,7 @@ class GroundPatches:
 class GroundTiles:
     """Heights at the corners of squares of `HEIGHT_STEP_M`, computed at the first use.
 
-    So they cost time and memory by the length of the way, and not by the rectangle that it fits into.
+    So they cost time and memory by the length of the trajectory, and not by the rectangle that it fits into.
     """
 
     def __init__(self, ground: GroundHeights) -> None:
@@ -98,7 +98,7 @@ class GroundTiles:
 def estimate_ground(
     points_m: Floats, world_from_rig: Floats, camera_position_m: Floats, *, rng: np.random.Generator
 ) -> GroundPatches | None:
-    """The ground's height along the way; None where too few points lie on a plane below the cameras.
+    """The ground's height along the trajectory; None where too few points lie on a plane below the cameras.
 
     First the plane that the ground is on average in the rig's frame, by RANSAC over the points near every unit: that
     is the rig's height and its pitch against the road. Then a patch every `STATION_M`, fitted robustly to the points
@@ -167,7 +167,7 @@ def _fitted(rows: Floats, height_m: Floats, weight: Floats, *, start: Floats, si
 
 
 def _stations(position_m: Floats) -> Ints:
-    """Units (k,) at least `STATION_M` apart along the way."""
+    """Units (k,) at least `STATION_M` apart along the trajectory."""
     chosen = [0]
     for u in range(1, len(position_m)):
         if np.linalg.norm(position_m[u] - position_m[chosen[-1]]) >= STATION_M:

@@ -23,7 +23,7 @@ from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundHeights, GroundTiles
 
 GIVEN, REFINED = 0, 1
-RADIUS_M = 12.0  # beside the way
+RADIUS_M = 12.0  # beside the trajectory
 VIEW_M = 15.0  # how far from a camera its image is used
 MIN_CELL_M = 0.025
 MAX_CELLS = 12_000_000  # bounds the picture, and what a mosaic holds to 22 bytes times that

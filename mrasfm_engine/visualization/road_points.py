@@ -77,9 +77,9 @@ class _Views:
 
     side: _Panel
     top: _Panel
-    side_xy: Floats  # (n, 2): along the way, height
+    side_xy: Floats  # (n, 2): along the trajectory, height
     top_xy: Floats  # (n, 2)
-    surface: Floats  # (m, 2) the surface below the way in the side view
+    surface: Floats  # (m, 2) the surface below the trajectory in the side view
     way: Floats  # (m, 2) the way in the view from above
     exaggeration: float
     outside: int  # points that the side view does not reach

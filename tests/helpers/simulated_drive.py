@@ -94,7 +94,7 @@ def make_simulated_drive(
     hidden: Callable[[int, int], bool] = lambda unit, camera: False,
     time_offset_ms: Sequence[int] | None = None,
     readout_ms: int = 0,
-    way_m: np.ndarray | None = None,
+    travelled_m: np.ndarray | None = None,
     seed: int = 0,
 ) -> SimulatedDrive:
     """Images of (unit, camera) for which `hidden` says True have no keypoints; `given` is what the manifest says."""
@@ -108,7 +108,7 @@ def make_simulated_drive(
         spacing_m=spacing_m,
         time_offset_s=0.0 if time_offset_ms is None else np.array(time_offset_ms) / 1e3,
         readout_s=readout_ms / 1e3,
-        way_m=way_m,
+        travelled_m=travelled_m,
         rng=rng,
     )
     drive = make_drive(

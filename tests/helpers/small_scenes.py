@@ -68,7 +68,7 @@ class Driven:
 def drive_along(
     street: Street,
     folder: Path,
-    way_m: np.ndarray,
+    travelled_m: np.ndarray,
     *,
     cameras: int = 4,
     lateral_m: float = 0.0,
@@ -95,11 +95,11 @@ def drive_along(
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
     params = np.array([camera.params for camera in rig])
     aside = (TURNED if back else np.eye(4)) @ se3.transform(np.eye(3), [0.0, lateral_m, 0.0])
-    street_from_rig = poses_along(way_m) @ aside
-    units = len(way_m)
-    speed = np.gradient(way_m)  # a unit's time
+    street_from_rig = poses_along(travelled_m) @ aside
+    units = len(travelled_m)
+    speed = np.gradient(travelled_m)  # a unit's time
     offsets = np.zeros(cameras) if offset_ms is None else np.array(offset_ms) * 1e3 / STEP_US
-    then = (way_m[:, None] + speed[:, None] * offsets).ravel()
+    then = (travelled_m[:, None] + speed[:, None] * offsets).ravel()
     street_from_band = (poses_along(then) @ aside).reshape(units, cameras, 4, 4)
 
     middle = street_from_rig[units // 2, :3, 3] + bias_m

@@ -24,8 +24,8 @@ WIDTH, HEIGHT = 1240, 376
 def route() -> LongRoute:
     """A street that is driven twice: the second time it begins anew 0.4 m farther on."""
     rng = np.random.default_rng(0)
-    way_m = np.concatenate([np.arange(UNITS_ONCE), np.arange(UNITS_ONCE) + 0.4])
-    poses = city_route(30.0, rng).world_from_rig(way_m)
+    travelled_m = np.concatenate([np.arange(UNITS_ONCE), np.arange(UNITS_ONCE) + 0.4])
+    poses = city_route(30.0, rng).world_from_rig(travelled_m)
     return observe_route(true_cameras(2, width=WIDTH, height=HEIGHT, rng=rng), poses)
 
 

@@ -41,8 +41,8 @@ def test_walks_return_to_streets_they_know() -> None:
 
 
 def test_routes_stay_on_streets_and_come_back() -> None:
-    way_m = np.arange(900.0)
-    poses = city_route(900.0, np.random.default_rng(1)).world_from_rig(way_m)
+    travelled_m = np.arange(900.0)
+    poses = city_route(900.0, np.random.default_rng(1)).world_from_rig(travelled_m)
     place = poses[:, :3, 3]
     step_m = np.linalg.norm(np.diff(place, axis=0), axis=1)
     assert 0.98 < step_m.min() <= step_m.max() < 1.02
@@ -100,7 +100,7 @@ def test_neighbours_share_most_points_and_far_units_few(route: LongRoute) -> Non
     shared = [len(np.intersect1d(route.point[0], route.point[2 * unit])) for unit in (1, 8, 29)]
     assert 0.6 * KEYPOINTS < shared[0] < 0.9 * KEYPOINTS
     assert shared[0] > shared[1] > shared[2]
-    np.testing.assert_allclose(route.way_m, np.arange(30), atol=0.2)
+    np.testing.assert_allclose(route.travelled_m, np.arange(30), atol=0.2)
 
 
 def test_all_six_cameras_see_enough() -> None:

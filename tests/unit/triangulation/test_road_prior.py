@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.triangulation.road_prior import points_below_the_way, standing_is_impossible
+from mrasfm_engine.triangulation.road_prior import points_below_trajectory, standing_is_impossible
 
 CAMERA_M = 0.3  # of the lowest camera over the rig's origin
 
@@ -27,7 +27,7 @@ def street(count: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def test_the_lane_is_found_at_any_height_of_the_rigs_origin(rig_height_m: float) -> None:
     points, on_road = street()
     camera_m = CAMERA_M + (1.6 - rig_height_m)
-    found = points_below_the_way(points, way(rig_height_m), camera_m)
+    found = points_below_trajectory(points, way(rig_height_m), camera_m)
     assert found is not None
     assert (found == on_road).all()
 
@@ -35,7 +35,7 @@ def test_the_lane_is_found_at_any_height_of_the_rigs_origin(rig_height_m: float)
 def test_wrong_points_near_the_level_are_taken_too() -> None:
     points, on_road = street()
     points[:40, 2] += np.linspace(-0.4, 0.4, 40)
-    found = points_below_the_way(points, way(1.6), CAMERA_M)
+    found = points_below_trajectory(points, way(1.6), CAMERA_M)
     assert found is not None
     assert found[:40].all()
     assert not found[~on_road].any()
@@ -43,12 +43,12 @@ def test_wrong_points_near_the_level_are_taken_too() -> None:
 
 def test_cameras_that_do_not_see_the_road() -> None:
     points, on_road = street()
-    assert points_below_the_way(points[~on_road], way(1.6), CAMERA_M) is None
-    assert points_below_the_way(points[:0], way(1.6), CAMERA_M) is None
+    assert points_below_trajectory(points[~on_road], way(1.6), CAMERA_M) is None
+    assert points_below_trajectory(points[:0], way(1.6), CAMERA_M) is None
     # What hangs in the lane at all heights is no road.
     rng = np.random.default_rng(1)
     cloud = np.column_stack([rng.uniform(0, 30, 300), rng.uniform(-2, 2, 300), rng.uniform(-40, 1, 300)])
-    assert points_below_the_way(cloud, way(1.6), CAMERA_M) is None
+    assert points_below_trajectory(cloud, way(1.6), CAMERA_M) is None
 
 
 def test_only_what_cannot_stand_is_judged() -> None:
