@@ -223,7 +223,7 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
         [f"{seam.a} (orange) and {seam.b} (blue), as their positions put them", "before aggregation: "
          f"{quality['positions_off_m']:.2f} m off, residual {quality['residual_before_px']:.1f} px"],
         (points_a, se3.apply(coarse, scene_b.points_m)),
-        (way_a, se3.apply(coarse, scene_b.travelled_m)),
+        (way_a, se3.apply(coarse, scene_b.trajectory_m)),
         centre,
         side,
     )  # fmt: skip

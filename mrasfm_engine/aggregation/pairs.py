@@ -46,13 +46,13 @@ def thinned(scene: SourceScene, spacing_m: float) -> Ints:
 
 
 def _length_m(scene: SourceScene) -> float:
-    return float(np.linalg.norm(np.diff(scene.travelled_m, axis=0), axis=1).sum())
+    return float(np.linalg.norm(np.diff(scene.trajectory_m, axis=0), axis=1).sum())
 
 
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
     """Smallest horizontal distance between the trajectories of two scenes."""
-    way = b.travelled_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-    return float(np.min(cKDTree(a.travelled_m[:, :2]).query(way[:, :2])[0]))
+    way = b.trajectory_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    return float(np.min(cKDTree(a.trajectory_m[:, :2]).query(way[:, :2])[0]))
 
 
 def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> list[Probe]:

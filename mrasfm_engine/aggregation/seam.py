@@ -263,7 +263,7 @@ def _units_at(assembly: Assembly, shared: Shared, side: int) -> Ints:
 
 def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -> Floats:
     """The covariance of a step about b's mean place as one about another place of b."""
-    pivot = se3.apply(a_from_b, b.travelled_m.mean(0)[None])[0]
+    pivot = se3.apply(a_from_b, b.trajectory_m.mean(0)[None])[0]
     arm = se3.apply(a_from_b, at_b[None])[0] - pivot
     change = np.eye(6)
     change[3:, :3] = -se3.skew(arm)

@@ -95,7 +95,7 @@ class SourceScene:
         return np.where(known, np.cumsum(known) - 1, -1)
 
     @cached_property
-    def travelled_m(self) -> Floats:
+    def trajectory_m(self) -> Floats:
         """Positions (r, 3) of the registered units in the scene's frame."""
         return self.world_from_rig[self.unit_registered, :3, 3]
 
@@ -118,7 +118,7 @@ class SourceScene:
     @property
     def midpoint_m(self) -> Floats:
         """The middle of the trajectory (3,): half of the trajectory along it."""
-        way = self.travelled_m
+        way = self.trajectory_m
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
         half = 0.5 * length[-1]
         return np.array([np.interp(half, length, way[:, k]) for k in range(3)])

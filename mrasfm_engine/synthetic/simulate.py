@@ -140,7 +140,7 @@ def simulate_observations(
         When each camera (cameras,) takes its image, from its unit's timestamp on; for a rolling shutter its middle row.
     readout_s
         Time from the first row of an image to the last.
-    way_m
+    travelled_m
         Way driven until every unit (units,), instead of equal steps of `spacing_m`: a car that stands or creeps.
     rng
         Source of everything random.

@@ -58,7 +58,7 @@ def standing_is_impossible(points_m: Floats, distance_m: Floats, world_from_rig:
 
 
 def _beside_trajectory(points_m: Floats, world_from_rig: Floats) -> tuple[Floats, Floats, Floats]:
-    """Lateral offset of points (n, 3) from the trajectory, distance from its nearest pose, and height in that pose's rig.
+    """Lateral offset of points (n, 3) from the trajectory, distance from its nearest pose, height in that pose's rig.
 
     Points farther than AHEAD_M beyond the ends of the trajectory have an infinite offset.
     """

@@ -275,7 +275,7 @@ def _cover(xyz: Floats, spacing_m: float) -> Sequence[int]:
 def _spread(
     points: _Points, patches: _Patches, radius_m: float, *, roughness_m: float, rng: np.random.Generator
 ) -> None:
-    """Add patches over points that none reaches yet, each next to a known one: ahead of the trajectory, in side streets."""
+    """Add patches over points that none reaches yet, each next to a known one: ahead of it, in side streets."""
     reach = nearest(np.stack(patches.centre), points.xy)[0][:, 0]
     tried = np.zeros(len(reach), dtype=np.bool_)
     while True:

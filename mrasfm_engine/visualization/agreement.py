@@ -49,19 +49,19 @@ class Agreement:
     displacement_m: float
 
 
-def plots_along(travelled_m: Floats) -> list[Grid]:
+def plots_along(trajectory_m: Floats) -> list[Grid]:
     """Squares of ground in the finest cells, spread evenly over a way (n, 2) that the cells of one picture are too
     coarse for; at most `MAX_PLOTS`, and none where another one is."""
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(travelled_m, axis=0), axis=1))])
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(trajectory_m, axis=0), axis=1))])
     even = np.linspace(0.0, travelled[-1], 2 * MAX_PLOTS + 1)[1::2]
     chosen: list[Floats] = []
-    for place in travelled_m[np.searchsorted(travelled, even)]:
+    for place in trajectory_m[np.searchsorted(travelled, even)]:
         if all(np.abs(place - other).max() >= PLOT_SIDE_M for other in chosen):
             chosen.append(place)
     return [Grid.square(place, side_m=PLOT_SIDE_M) for place in chosen]
 
 
-def measure_agreement(mosaics: Sequence[Mosaic], travelled_m: Floats) -> tuple[Agreement, Agreement] | None:
+def measure_agreement(mosaics: Sequence[Mosaic], trajectory_m: Floats) -> tuple[Agreement, Agreement] | None:
     """Agreement of the best with the second best camera under the given and under the refined calibration.
 
     Both are measured on the same pieces within `ROADSIDE_M` of the trajectory (n, 2), chosen by contrast alone; None
@@ -73,7 +73,7 @@ def measure_agreement(mosaics: Sequence[Mosaic], travelled_m: Floats) -> tuple[A
     if any(mosaic.grid.cell_m != cell for mosaic in mosaics) or cell > FINE_CELL_M:
         raise ValueError("the mosaics' cells differ, or are too coarse")
     size, margin = round(BLOCK_M / cell), round(SEARCH_M / cell)
-    tree = cKDTree(travelled_m)
+    tree = cKDTree(trajectory_m)
     blocks: list[_Block] = []
     for mosaic in mosaics:
         blocks += _textured_blocks(mosaic, tree, size, margin)

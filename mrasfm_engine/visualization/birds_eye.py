@@ -67,13 +67,13 @@ def birds_eye(scene: Scene, *, seed: int = 0, progress: CountProgress | None = N
     )
     if ground is None:
         return BirdsEye(report={"not_drawn": "too few points of the scene lie on the ground along the way"})
-    travelled_m = plan_from_rig[:, :2, 3]
-    mosaic, *plots = _mosaics_of(scene, plan_from_world, ground, travelled_m, progress)
+    trajectory_m = plan_from_rig[:, :2, 3]
+    mosaic, *plots = _mosaics_of(scene, plan_from_world, ground, trajectory_m, progress)
     if not mosaic.images_used:
         return BirdsEye(report={"not_drawn": "no camera sees the road"})
-    agreement = measure_agreement(plots or [mosaic], travelled_m)
+    agreement = measure_agreement(plots or [mosaic], trajectory_m)
     before, after = (_picture(scene, mosaic, which, agreement, plan_from_world) for which in (GIVEN, REFINED))
-    level_m = float(np.median(ground.height_m(travelled_m)))
+    level_m = float(np.median(ground.height_m(trajectory_m)))
     report = _report(scene, mosaic, agreement)
     report["world_from_pixel"] = _world_from_pixel(mosaic, se3.inverse(plan_from_world), after.top_px, level_m).tolist()
     return BirdsEye(pictures={BEFORE: before.picture, AFTER: after.picture}, report=report)
@@ -104,10 +104,10 @@ def _mosaics_of(
     scene: Scene,
     plan_from_world: Floats,
     ground: GroundHeights,
-    travelled_m: Floats,
+    trajectory_m: Floats,
     progress: CountProgress | None,
 ) -> list[Mosaic]:
-    """Mosaic of the picture; where its cells are too coarse to compare cameras, those of fine plots along the trajectory."""
+    """Mosaic of the picture; where its cells are too coarse to compare cameras, those of fine plots along the path."""
     images = _nearest_first(scene)
     refined = scene.world_from_cam
     gains = exposure_gains(scene)
@@ -136,7 +136,7 @@ def _mosaics_of(
 
     return make_mosaics(
         views,
-        grids_along(travelled_m),
+        grids_along(trajectory_m),
         ground,
         lambda index: read_view(scene, int(images[index])),
         own_car_m=_own_car_m(scene),
@@ -144,11 +144,11 @@ def _mosaics_of(
     )
 
 
-def grids_along(travelled_m: Floats) -> list[Grid]:
+def grids_along(trajectory_m: Floats) -> list[Grid]:
     """The grid of the picture around a way (n, 2), and where its cells are too coarse to compare cameras, fine plots
     along the trajectory."""
-    grid = Grid.around(travelled_m)
-    return [grid, *(plots_along(travelled_m) if grid.cell_m > FINE_CELL_M else [])]
+    grid = Grid.around(trajectory_m)
+    return [grid, *(plots_along(trajectory_m) if grid.cell_m > FINE_CELL_M else [])]
 
 
 def _own_car_m(scene: Scene) -> Floats | None:

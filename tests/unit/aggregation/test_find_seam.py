@@ -173,7 +173,7 @@ def test_what_the_adjustment_says_of_its_own_error_is_honest(street: Street, fol
     rng = np.random.default_rng(0)
     a = drive_along(street, folder / "exact-a", WAY_A, noise_px=0.0, seed=7)
     b = drive_along(street, folder / "exact-b", WAY_B, noise_px=0.0, lateral_m=0.7, seed=8)
-    truth, at = true_a_from_b(a, b), b.source.travelled_m.mean(0)
+    truth, at = true_a_from_b(a, b), b.source.trajectory_m.mean(0)
     shared = Shared(pairs=in_assembly(shared_points(a, b), a))
     errors, sigmas = [], []
     for _ in range(20):
@@ -199,7 +199,7 @@ def test_the_adjustment_finds_back_and_drops_what_is_not_one_point(a: Driven, b:
     assembly = Assembly(scenes=[a.source, b.source])
     start = noisy(truth, rng, m=0.15, deg=0.3)
     fine = adjust_transform(assembly, start, Shared(pairs=in_assembly(mixed, a)), CONFIG, cancel=lambda: False)
-    at = b.source.travelled_m.mean(0)
+    at = b.source.trajectory_m.mean(0)
     assert off(start, truth, at)[0] > 0.1
     assert 0 < off(fine.a_from_b, truth, at)[0] < 0.02
     kept = {tuple(p) for p in (fine.shared.pairs - in_assembly(np.zeros(2, dtype=np.int64), a)).tolist()}

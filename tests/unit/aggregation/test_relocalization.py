@@ -65,7 +65,7 @@ def asked(two: tuple[Driven, Driven], seen: Sightings, **aggregation: object) ->
 
 
 def place(b: Driven) -> np.ndarray:
-    return b.source.travelled_m.mean(0)
+    return b.source.trajectory_m.mean(0)
 
 
 def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, Driven], seen: Sightings) -> None:

@@ -29,7 +29,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Driven]:
 
 def ahead(a: Driven, b: Driven, metres: float) -> np.ndarray:
     """How b would lie if it were so far along the street."""
-    along = a.source.travelled_m[-1] - a.source.travelled_m[0]
+    along = a.source.trajectory_m[-1] - a.source.trajectory_m[0]
     return se3.transform(np.eye(3), metres * along / np.linalg.norm(along)) @ true_a_from_b(a, b)
 
 

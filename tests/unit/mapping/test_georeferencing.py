@@ -89,7 +89,7 @@ def test_the_transform_is_rigid_and_scale_only_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sigma_m", "way_m", "scale"), [(0.02, 300.0, 1.005), (0.05, 300.0, 1.007), (0.3, 1000.0, 1.01)]
+    ("sigma_m", "travelled_m", "scale"), [(0.02, 300.0, 1.005), (0.05, 300.0, 1.007), (0.3, 1000.0, 1.01)]
 )
 def test_a_rig_that_is_off_in_scale_is_aligned_all_the_same(sigma_m: float, travelled_m: float, scale: float) -> None:
     t = track(units=200, spacing_m=travelled_m / 200, sigma_m=sigma_m)

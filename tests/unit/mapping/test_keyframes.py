@@ -30,7 +30,7 @@ STOPS = {
 
 def drive(steps_m: list[float], **options: object) -> SimulatedDrive:
     way = np.cumsum(steps_m)
-    values = {"units": len(way), "cameras": 4, "points": 900, "way_m": way, "noise_px": 0.3}
+    values = {"units": len(way), "cameras": 4, "points": 900, "travelled_m": way, "noise_px": 0.3}
     return make_simulated_drive(**{**values, **options})  # type: ignore[arg-type]
 
 
