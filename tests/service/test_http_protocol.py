@@ -188,7 +188,7 @@ def test_a_failure_of_the_service_has_them_too(start_api: StartApi, monkeypatch:
     def fails(*given: object, **more: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(drives, "page", fails)
+    monkeypatch.setattr(drives, "stored_of", fails)
     answer = start_api().client().get("/v1/drives")
     problem_of(answer, 500, "internal-error")
     assert answer.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
