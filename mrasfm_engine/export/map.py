@@ -7,27 +7,25 @@ A map's folder holds what a scene's does (`model/`, `points.ply`, `poses.tum`, `
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.export import check, check_colmap, colmap, coordinate_frame, picture_files, ply, pose_files
-from mrasfm_engine.export.check import checking, require, require_close
+from mrasfm_engine.export import comparisons, coordinate_frame, picture_files, pose_files, readers
+from mrasfm_engine.export.check import Check, ReadBack, common_checks
+from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
-from mrasfm_engine.export.scene import check_scene, summary, write_json
+from mrasfm_engine.export.scene import check_scene, write_common, write_json
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
-from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.types import Floats, Ints
-from schemas import Pose
-from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER
+from mrasfm_engine.types import Ints
+from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
 
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
@@ -71,21 +69,8 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
 
 
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:
-    scene = content.scene
-    picture_files.write_pictures(content.pictures, work / PICTURES_FOLDER)
-    model, text = work / "model", work / "model" / "text"
-    text.mkdir(parents=True)
-    colmap.write_model(scene, model)
-    check_colmap.check_binary_model(scene, model)
-    figures = summary(scene)
-    if colmap.text_model_fits(scene):
-        colmap.write_text_model(model, text)
-        check_colmap.check_text_model(scene, text)
-    else:
-        shutil.rmtree(text)
-        figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
-    ply.write_ply(scene, work / "points.ply")
-    check.check_ply(scene, work / "points.ply")
+    scene, read_back = content.scene, ReadBack(work)
+    figures = write_common(scene, work, content.pictures, read_back)
     (work / "poses.tum").write_text(_poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", _poses_document(content))
     write_json(work / "frame.json", _frame_document(scene))
@@ -97,11 +82,45 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
         store = StageStore(work / folder)
         for name, (key, arrays, documents) in kept.items():
             store.save(name, key, arrays, documents)
-            require(store.has(name, key), work / folder / f"{name}.npz", "it cannot be read")
     written = {**report, "summary": figures}
     write_json(work / COMPLETE_MARK, written)
-    _check_documents(content, work)
+    read_back.check(_checks(content))
+    read_back.require_all()
     return written
+
+
+def _checks(content: MapContent) -> list[Check]:
+    scene = content.scene
+    calibrations = [
+        Check(
+            f"{CALIBRATION_FOLDER}/{name}.json",
+            readers.json_object,
+            partial(comparisons.calibration, scene, prefix=f"{name}/"),
+        )
+        for name in content.calibrations
+    ]
+    kept = [
+        Check(f"{folder}/{checkpoint_file(name)}", partial(_is_kept, key), partial(comparisons.content, True))
+        for folder, parts in ((SCENES_FOLDER, content.scenes), (SEAMS_FOLDER, content.seams))
+        for name, (key, _, _) in parts.items()
+    ]
+    return [
+        *common_checks(scene, content.pictures),
+        Check("poses.tum", readers.tum, partial(comparisons.tum, scene, _order(scene))),
+        Check(MAP_FILE, readers.json_object, partial(_pictures_exist, content.pictures)),
+        *calibrations,
+        *kept,
+    ]
+
+
+def _is_kept(key: str, path: Path) -> bool:
+    return StageStore(path.parent).has(path.stem, key)
+
+
+def _pictures_exist(pictures: Mapping[str, bytes], document: Mapping[str, Any]) -> Rows:
+    named = {path for seam in document["seams"] for path in seam.get("pictures", {}).values()}
+    missing = named - {f"{PICTURES_FOLDER}/{name}" for name in pictures}
+    yield Row("what it lacks of the seams' pictures", sorted(missing), [])
 
 
 def _order(scene: Scene) -> Ints:
@@ -128,35 +147,3 @@ def _frame_document(scene: Scene) -> dict[str, Any]:
     document = coordinate_frame.frame_document(scene)
     files = {name: text for name, text in document["files"].items() if name != "calibration.json"}
     return document | {"files": files | {"calibration/NAME.json": "rig_from_cam of the drive NAME"}}
-
-
-def _check_documents(content: MapContent, folder: Path) -> None:
-    """Re-read the documents and compare them with the map and with one another."""
-    scene = content.scene
-    frame_path, poses_path, tum_path = folder / "frame.json", folder / "poses.json", folder / "poses.tum"
-    with checking(frame_path):
-        frame = check.read_json(frame_path)
-        check.check_frame(scene, frame, frame_path)
-    rig_from_cam: dict[str, Floats] = {}
-    for name in content.calibrations:
-        path = folder / CALIBRATION_FOLDER / f"{name}.json"
-        with checking(path):
-            for camera, found in check.read_json(path)["cameras"].items():
-                rig_from_cam[f"{name}/{camera}"] = matrix_from_pose(Pose(**found["refined"]["rig_from_cam"]))
-    with checking(poses_path):
-        check.check_poses(scene, check.read_json(poses_path), frame, rig_from_cam, path=poses_path)
-    with checking(tum_path):
-        lines = [line.split() for line in tum_path.read_text(encoding="ascii").splitlines() if line[0] != "#"]
-        order = _order(scene)
-        times_us = [int(line[0].replace(".", "")) for line in lines]
-        require(times_us == scene.drive.timestamps_us[order].tolist(), tum_path, "a timestamp is wrong")
-        rows = np.array([line[1:] for line in lines], dtype=np.float64).reshape(-1, 7)
-        poses = check.matrices(rows[:, 3:], rows[:, :3])
-        require_close(poses, scene.world_from_rig[order], path=tum_path, what="a pose", tolerance=1e-6)
-    for name in (MAP_FILE, COMPLETE_MARK):
-        with checking(folder / name):
-            document = json.loads((folder / name).read_text(encoding="utf-8"))
-            require(isinstance(document, dict), folder / name, "it is no JSON object")
-    for seam in content.document["seams"]:
-        for path in seam.get("pictures", {}).values():
-            require((folder / path).is_file(), folder / MAP_FILE, f"it names {path}, which is not there")

@@ -9,8 +9,8 @@ scene can be aggregated without the drive), `pictures/` where any were drawn, `r
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,16 +20,17 @@ import numpy as np
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import (
     calibration,
-    check,
-    check_colmap,
     colmap,
+    comparisons,
     coordinate_frame,
     feature_database,
     picture_files,
     ply,
     pose_files,
+    readers,
     road,
 )
+from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
@@ -66,8 +67,7 @@ def write_scene(
     check_scene(scene)
     needed = _size_bytes(scene) + picture_files.size_bytes(pictures)
     with publishing(out, needed, replaced=(PICTURES_FOLDER, ROAD_FILE)) as work:
-        picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
-        _write(scene, work, report)
+        _write(scene, work, report, pictures)
 
 
 def summary(scene: Scene) -> dict[str, Any]:
@@ -88,34 +88,50 @@ def summary(scene: Scene) -> dict[str, Any]:
     return figures
 
 
-def _write(scene: Scene, work: Path, report: Mapping[str, Any]) -> None:
-    model, text = work / "model", work / "model" / "text"
-    text.mkdir(parents=True)
-    colmap.write_model(scene, model)
-    check_colmap.check_binary_model(scene, model)
-    colmap.write_text_model(model, text)
-    readable = colmap.text_model_fits(scene)
-    check_colmap.check_text_model(scene, text, through_colmap=readable)
-    figures = summary(scene)
-    if not readable:
-        shutil.rmtree(text)
-        figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
-    ply.write_ply(scene, work / "points.ply")
-    check.check_ply(scene, work / "points.ply")
+def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes]) -> None:
+    read_back = ReadBack(work)
+    figures = write_common(scene, work, pictures, read_back)
     feature_database.write_features(scene, work / "features.db")
-    check.check_features(scene, work / "features.db")
     if scene.road is not None:
         write_json(work / ROAD_FILE, road.road_document(scene))
-        check.check_road(scene, work / ROAD_FILE)
     (work / "poses.tum").write_text(pose_files.poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", pose_files.poses_document(scene))
     write_json(work / "calibration.json", calibration.calibration_document(scene))
     write_json(work / "frame.json", coordinate_frame.frame_document(scene))
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
-    check.check_manifest(scene, work / MANIFEST_FILE)
     write_json(work / COMPLETE_MARK, {**report, "summary": figures})
-    check.check_documents(scene, work)
+    read_back.check(_checks(scene, pictures))
+    read_back.require_all()
+
+
+def write_common(scene: Scene, work: Path, pictures: Mapping[str, bytes], read_back: ReadBack) -> dict[str, Any]:
+    """Write what scenes and maps have alike: pictures, model and points; the figures of `report.json`'s `summary`."""
+    picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
+    model, figures = work / "model", summary(scene)
+    model.mkdir()
+    colmap.write_model(scene, model)
+    read_back.check(binary_model_checks(scene))
+    if colmap.text_model_fits(scene):
+        (model / "text").mkdir()
+        colmap.write_text_model(model, model / "text")
+    else:
+        figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
+    ply.write_ply(scene, work / "points.ply")
+    return figures
+
+
+def _checks(scene: Scene, pictures: Mapping[str, bytes]) -> list[Check]:
+    road_check = Check(ROAD_FILE, readers.json_object, partial(comparisons.road, scene))
+    registered = np.flatnonzero(scene.unit_registered)
+    return [
+        *common_checks(scene, pictures),
+        *([] if scene.road is None else [road_check]),
+        Check("features.db", readers.database, partial(comparisons.features, scene)),
+        Check("poses.tum", readers.tum, partial(comparisons.tum, scene, registered)),
+        Check("calibration.json", readers.json_object, partial(comparisons.calibration, scene)),
+        Check(MANIFEST_FILE, readers.manifest, partial(comparisons.manifest, scene)),
+    ]
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

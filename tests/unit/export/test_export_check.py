@@ -96,13 +96,18 @@ def tum_with_gap(original: Any, scene: Scene) -> str:
 @pytest.mark.parametrize(
     ("module", "function", "change", "file"),
     [
-        (colmap, "_frames", with_moved_rig, "images.bin"),
+        (colmap, "_frames", with_moved_rig, "model .*composed pose"),
         (colmap, "_images", with_moved_rig, "images.bin"),  # the stale pose that COLMAP overlooks
         (colmap, "_images", with_wrong_keypoint, "images"),
-        (colmap, "_rigs", with_moved_camera, "rigs.bin"),
-        (colmap, "_cameras", lambda original, scene: original(scene)[:-8] + bytes(8), "cameras.bin"),
-        (colmap, "_points", with_swapped_points, "points3D.bin"),
-        (colmap, "_points", lambda original, scene: b"", "points3D.bin"),
+        (colmap, "_rigs", with_moved_camera, "model .*rigs: left's pose"),
+        (
+            colmap,
+            "_cameras",
+            lambda original, scene: original(scene)[:-8] + bytes(8),
+            "model .*cameras: right's params",
+        ),
+        (colmap, "_points", with_swapped_points, "model .*points3D: a point"),
+        (colmap, "_points", lambda original, scene: b"", "model .*points3D.bin is empty"),
         (colmap, "write_text_model", text_without_end, "images.txt"),
         (ply, "write_ply", ply_without_end, "points.ply"),
         (ply, "write_ply", with_swapped_points, "points.ply"),
@@ -134,4 +139,15 @@ def test_a_file_that_says_something_else_is_refused(
     with pytest.raises(MrasfmError, match=file) as raised:
         write_scene(scene, tmp_path / "scene", {})
     assert raised.value.code == "export-check-failed"
+    assert_nothing_published(tmp_path / "scene")
+
+
+def test_a_file_that_no_check_covers_is_refused(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def with_another_file(original: Any, scene: Scene, path: Path) -> None:
+        original(scene, path)
+        path.with_name("added.json").write_text("{}")
+
+    corrupt(monkeypatch, ply, "write_ply", with_another_file)
+    with pytest.raises(MrasfmError, match=r"added.json .*no check covers it"):
+        write_scene(scene, tmp_path / "scene", {})
     assert_nothing_published(tmp_path / "scene")

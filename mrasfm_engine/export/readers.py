@@ -1,0 +1,182 @@
+"""Readers of a result's files, for the check before it is put in place.
+
+They share no code with the writers: rotations are composed with scipy, the database is read with SQLite, COLMAP reads
+its model. What COLMAP overlooks (the poses that the image files hold one by one, and the points that they name) is
+parsed here.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+import pycolmap
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from mrasfm_engine.export.colmap import BINARY_FILES, TEXT_FILES
+from mrasfm_engine.types import Floats, Ints
+from schemas import DriveManifest
+
+_PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
+
+
+class ModelImage(NamedTuple):
+    """Content of an image in a COLMAP model."""
+
+    image_id: int
+    name: str
+    cam_from_world: Floats  # (4, 4)
+    xy_px: Floats  # (n, 2)
+    point_ids: Ints  # (n,) -1 where a keypoint observes none
+
+
+class ModelPoints(NamedTuple):
+    """Points of a COLMAP model with their tracks."""
+
+    ids: Ints  # (p,)
+    xyz: Floats  # (p, 3)
+    colors: Floats  # (p, 3)
+    observations: Ints  # (n, 3) point id, image id, keypoint
+
+
+def transforms(quaternions_xyzw: ArrayLike, translations: ArrayLike) -> Floats:
+    """Transforms (n, 4, 4) as scipy composes them."""
+    translations = np.asarray(translations, dtype=np.float64).reshape(-1, 3)
+    out = np.tile(np.eye(4), (len(translations), 1, 1))
+    if len(translations):
+        out[:, :3, :3] = Rotation.from_quat(np.asarray(quaternions_xyzw, dtype=np.float64).reshape(-1, 4)).as_matrix()
+    out[:, :3, 3] = translations
+    return out
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """A JSON object; NaN and infinities are refused."""
+
+    def refuse_constant(name: str) -> NoReturn:
+        raise ValueError(f"it holds {name}")
+
+    document = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse_constant)
+    if not isinstance(document, dict):
+        raise ValueError("it is no JSON object")
+    return document
+
+
+def manifest(path: Path) -> DriveManifest:
+    """A drive's manifest."""
+    return DriveManifest.model_validate(json_object(path))
+
+
+def tum(path: Path) -> tuple[Ints, Floats]:
+    """Timestamps (n,) in whole microseconds, which a float of seconds would round, and poses (n, 4, 4)."""
+    lines = [line.split() for line in path.read_text(encoding="ascii").splitlines() if not line.startswith("#")]
+    rows = np.array([line[1:] for line in lines], dtype=np.float64).reshape(-1, 7)
+    times_us = np.array([int(line[0].replace(".", "")) for line in lines], dtype=np.int64)
+    return times_us, transforms(rows[:, 3:], rows[:, :3])
+
+
+def ply(path: Path) -> NDArray[Any]:
+    """The vertices as rows of named properties."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii").splitlines()]
+    count = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
+    rows = np.frombuffer(body, dtype=[(line[2], _PLY_TYPES[line[1]]) for line in lines if line[0] == "property"])
+    if len(rows) != count:
+        raise ValueError(f"{count} vertices announced, {len(rows)} found")
+    return rows
+
+
+def database(path: Path) -> Callable[[str], list[Any]]:
+    """The rows of a query, by its SQL."""
+    return partial(_selected, path)
+
+
+def _selected(path: Path, sql: str) -> list[Any]:
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
+        return db.execute(sql).fetchall()
+
+
+def model_binary(folder: Path) -> pycolmap.Reconstruction:
+    """A binary model as COLMAP reads it."""
+    _require_files(folder, BINARY_FILES)
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.read_binary(str(folder))
+    return reconstruction
+
+
+def model_text(folder: Path) -> pycolmap.Reconstruction:
+    """A text model as COLMAP reads it."""
+    _require_files(folder, TEXT_FILES)
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.read_text(str(folder))
+    return reconstruction
+
+
+def _require_files(folder: Path, names: tuple[str, ...]) -> None:
+    # Without its file of rigs, COLMAP makes some up.
+    for name in names:
+        if not (folder / name).stat().st_size:
+            raise ValueError(f"{name} is empty")
+
+
+def images_binary(path: Path) -> Iterator[ModelImage]:
+    """All images of a binary model."""
+    data, at = path.read_bytes(), 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        image_id, *numbers = struct.unpack_from("<I7d", data, at)
+        name_end = data.index(b"\0", at + 64)
+        (count,) = struct.unpack_from("<Q", data, name_end + 1)
+        rows = np.frombuffer(data, dtype=[("xy", "<f8", 2), ("point", "<i8")], count=count, offset=name_end + 9)
+        name = data[at + 64 : name_end].decode("utf-8")
+        yield ModelImage(image_id, name, _pose(numbers), rows["xy"], rows["point"])
+        at = name_end + 9 + rows.nbytes
+    if at != len(data):
+        raise ValueError(f"{len(data) - at} bytes are left over")
+
+
+def images_text(path: Path) -> Iterator[ModelImage]:
+    """All images of a text model."""
+    lines = [line for line in path.read_text(encoding="utf-8").split("\n") if not line.startswith("#")]
+    if len(lines) % 2 != 1 or lines[-1]:
+        raise ValueError(f"{len(lines)} lines")
+    for head, keypoints in zip(lines[:-1:2], lines[1::2], strict=True):
+        image_id, *numbers, _, name = head.split(" ", maxsplit=9)
+        rows = _numbers(keypoints).reshape(-1, 3)
+        yield ModelImage(
+            int(image_id), name, _pose([float(v) for v in numbers]), rows[:, :2], rows[:, 2].astype(np.int64)
+        )
+
+
+def points_text(path: Path) -> ModelPoints:
+    """All points of a text model."""
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    counts = np.array([line.rstrip().count(" ") + 1 for line in lines], dtype=np.int64)
+    numbers, ends = _numbers(" ".join(lines)), np.cumsum(counts)
+    if len(numbers) != counts.sum():
+        raise ValueError("it holds something that is no number")
+    at_heads = (ends - counts)[:, None] + np.arange(8)
+    in_tracks = np.ones(len(numbers), dtype=bool)
+    in_tracks[at_heads] = False
+    heads = numbers[at_heads]
+    ids = heads[:, 0].astype(np.int64)
+    tracks = numbers[in_tracks].astype(np.int64).reshape(-1, 2)
+    observations = np.column_stack([np.repeat(ids, (counts - 8) // 2), tracks])
+    return ModelPoints(ids, heads[:, 1:4], heads[:, 4:7], observations)
+
+
+def _pose(numbers: list[float]) -> Floats:
+    w, x, y, z, *translation = numbers
+    pose: Floats = transforms([x, y, z, w], translation)[0]
+    return pose
+
+
+def _numbers(text: str) -> Floats:
+    # Stops at the first word that is no number; the callers compare counts.
+    return np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.zeros(0)
