@@ -91,10 +91,6 @@ class MeshBuilder:
     def __init__(self) -> None:
         self._parts: list[Mesh] = []
 
-    def add_mesh(self, mesh: Mesh) -> None:
-        """Take a ready mesh."""
-        self._parts.append(mesh)
-
     def add(
         self,
         surface: Surface,
