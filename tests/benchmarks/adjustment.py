@@ -104,7 +104,7 @@ def long_problem() -> Problem:
         ),
     )
     # Points are where the poses of the start see them.
-    return replace(problem, state=problem.with_points_settled(problem.state))
+    return replace(problem, state=problem.with_points_refined(problem.state))
 
 
 def _has_angle(sim: SimulatedObservations, kept: np.ndarray) -> np.ndarray:

@@ -64,7 +64,7 @@ def add_terms(handed: CeresProblem, problem: pyceres.Problem) -> list[object]:
     return kept
 
 
-class _Cost(pyceres.CostFunction):  # type: ignore[misc]
+class _Cost(pyceres.CostFunction):
     """Residuals in units of a pixel."""
 
     def __init__(self, residuals: Residuals, scale: float) -> None:

@@ -72,7 +72,7 @@ class World:
         self.settings = Settings(
             data_dir=folder / "data",
             redis_url=self.broker.url,
-            **{**SHORT_TIMES, **changed},  # type: ignore[arg-type]
+            **{**SHORT_TIMES, **changed},
         )
         migrate(self.settings)
         self.database = Database.from_settings(self.settings)

@@ -42,7 +42,7 @@ def test_kills(service: Standalone, drive: Path) -> None:
     victims: list[tuple[Callable[[], psutil.Process], int]] = [
         (lambda: service.process_of("worker", "reconstructions"), 2),
         (lambda: service.process_of("service", "api"), 1),
-        (lambda: service.standalone.broker(), 1),
+        (lambda: service.broker(), 1),
     ]
     job_ids = []
     for victim, attempts in victims:

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
-from mrasfm_engine.export.feature_database import pycolmap
+from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.visualization import birds_eye
 from tests.helpers.damaged_images import cut
 from tests.integration.conftest import CommandResult, Document, Variant, read_report
@@ -41,7 +42,7 @@ def test_some_truncated(variant: Variant, mrasfm: Run, monkeypatch: pytest.Monke
     shown: list[str] = []
     read_view = birds_eye.read_view
 
-    def noted(scene: birds_eye.Scene, index: int) -> object:
+    def noted(scene: Scene, index: int) -> object:
         shown.append(scene.drive.images[index].file)
         return read_view(scene, index)
 

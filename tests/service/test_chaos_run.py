@@ -156,7 +156,7 @@ def test_exactly_the_chosen_process_is_killed(sleeper: subprocess.Popen[bytes]) 
 
 
 def process(role: Role, *command: str) -> Process:
-    return Process(identity=identity_of(1), parent=0, command=command, role=role)  # type: ignore[arg-type]
+    return Process(identity=identity_of(1), parent=0, command=command, role=role)
 
 
 WORKER = ("python", "-P", "-m", "worker", "worker", "--queues", "reconstructions", "--concurrency", "2")

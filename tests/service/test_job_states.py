@@ -602,7 +602,7 @@ def test_no_order_of_events_breaks_a_job(tmp_path: Path) -> None:
         project = create_project(session, "test", chosen)
         project.max_active_jobs = 10**6
     machine = type("Machine", (Transitions,), {"database": database, "project_id": project.id})
-    run_state_machine_as_test(  # type: ignore[no-untyped-call]
+    run_state_machine_as_test(
         machine,
         settings=settings(
             max_examples=30,

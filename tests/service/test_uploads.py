@@ -18,7 +18,7 @@ import pytest
 from sqlalchemy import update
 
 from service.api.app import sweep_uploads
-from service.api.routes import upload_writing
+from service.api.routes import file_ingest, upload_writing
 from service.database.tables import Drive, Upload, now_us
 from service.domain import uploads as upload_records
 from service.storage import durability
@@ -283,7 +283,7 @@ def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
     client: Client, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unpacking, go_on = api.context.unpacking, threading.Event()
-    unpack_now = upload_writing.keep_archive
+    unpack_now = file_ingest.keep_archive
 
     def unpack_later(*given: Any) -> Any:
         assert go_on.wait(30)

@@ -15,8 +15,8 @@ from tests.benchmarks.table import Figure, exactly, failed, save
 def test_figures_are_saved_as_they_were_measured(tmp_path: Path) -> None:
     figures = [
         Figure(line="1", what="error", value=np.float64(0.5), most=np.float64(0.4)),
-        exactly("1", "images", np.int64(3), 3),  # type: ignore[arg-type]
-        Figure(line="1", what="time", value=np.float32(2.5)),  # type: ignore[arg-type]
+        exactly("1", "images", np.int64(3), 3),
+        Figure(line="1", what="time", value=np.float32(2.5)),
         failed("1", "map", "there is none"),
     ]
     save(figures, tmp_path / "deep" / "figures.json", {"cores": 2})

@@ -85,7 +85,7 @@ def settings(tmp_path: Path) -> Settings:
 def settings_with(data_dir: Path, **fields: float) -> Settings:
     """Settings of a test, with some of them changed."""
     values = {"terminate_after_seconds": 20.0, "kill_after_seconds": 40.0, "engine_threads": 1, **fields}
-    return Settings(data_dir=data_dir, **values)  # type: ignore[arg-type]
+    return Settings(data_dir=data_dir, **values)
 
 
 def meter_of(work: Work = Work.RECONSTRUCTION) -> ProgressMeter:

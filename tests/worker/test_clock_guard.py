@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import service.database.connections
-import worker.clock_guard
 from service.database.tables import now_us
 from service.domain import jobs
 from tests.helpers.service_world import World
@@ -34,7 +33,7 @@ class Clocks:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.wall_s, self.monotonic_s = 1e9, 100.0
-        monkeypatch.setattr(worker.clock_guard.time, "monotonic", lambda: self.monotonic_s)
+        monkeypatch.setattr("worker.clock_guard.time.monotonic", lambda: self.monotonic_s)
 
     def go_on(self, seconds: float) -> None:
         self.wall_s += seconds

@@ -361,7 +361,7 @@ def on_another_machine(world: World, data_dir: Path) -> Settings:
         database_url=SecretStr(shared["MRASFM_DATABASE_URL"]),
         artifacts_url=shared["MRASFM_ARTIFACTS_URL"],
         redis_url=world.settings.redis_url,
-        **SHORT_TIMES,  # type: ignore[arg-type]
+        **SHORT_TIMES,
     )
 
 

@@ -37,7 +37,7 @@ def ending(**fields: object) -> Ending:
         memory_kills=0,
         out=Path("scene"),
     )
-    return dataclasses.replace(plain, **fields)  # type: ignore[arg-type]
+    return dataclasses.replace(plain, **fields)
 
 
 def failed(**fields: object) -> Failed:

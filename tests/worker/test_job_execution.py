@@ -217,11 +217,11 @@ def break_endings(
         (state,) = cursor.execute("SELECT state FROM jobs WHERE id = ?", (job_id,)).fetchone()
         cursor.close()
         if state == "RUNNING" or len(broken) == times:
-            commit(connection)  # type: ignore[arg-type]
+            commit(connection)
             return
         broken.append(state)
         if answer_lost:
-            commit(connection)  # type: ignore[arg-type]
+            commit(connection)
         raise sqlite3.OperationalError("the connection is lost")
 
     monkeypatch.setattr(dialect, "do_commit", do_commit)
@@ -298,7 +298,7 @@ def test_database_that_is_away_when_an_attempt_ends(
 ) -> None:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     asked: list[bool] = []
-    runner = Runner(world.settings, shutting_down=lambda: stops and (asked.append(True) or len(asked) > 2))  # type: ignore[func-returns-value]
+    runner = Runner(world.settings, shutting_down=lambda: stops and (asked.append(True) or len(asked) > 2))
     broken = break_endings(runner, job_id, monkeypatch, times=2)
     end(world, job_id)
     runner.run(job_id)

@@ -269,7 +269,7 @@ def keeper(world: World, shelf: Shelf, folder: Path, *, drive_id: str | None = N
 def test_pauses_grow(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock: list[float] = [0.0]
     tries: list[float] = []
-    monkeypatch.setattr(worker.checkpoints.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr("worker.checkpoints.time.monotonic", lambda: clock[0])
     made = keeper(world, DriveShelf("drv_0", SHELF), tmp_path)
     fails: Callable[..., None] = lambda *_: (tries.append(clock[0]), raise_(REFUSED))[1]  # noqa: E731
     monkeypatch.setattr(made, "_keep", fails)

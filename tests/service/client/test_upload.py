@@ -9,7 +9,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -247,7 +247,7 @@ def test_a_client_that_is_stopped_waits_for_nothing(client: Client, connect: Con
     silent = [Cut(part, answer_bytes=0, times=9, silent=True) for part in (b"/status", b"/jobs/")]
     with bad_network(client.api.url, *silent) as network, ThreadPoolExecutor() as pool:
         library = connect(client, url=network.url)
-        waiting = [pool.submit(library.status), pool.submit(lambda: list(library.events("job_0")))]
+        waiting: list[Future[Any]] = [pool.submit(library.status), pool.submit(lambda: list(library.events("job_0")))]
         wait_until(lambda: all(cut.seen for cut in silent), "the requests")
         began_s = time.monotonic()
         library.stop()

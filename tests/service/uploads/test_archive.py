@@ -86,7 +86,7 @@ def streamed_zip_of(members: Members) -> bytes:
             return len(data)
 
     pipe = Pipe()
-    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:  # type: ignore[arg-type]
+    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members:
             with archive.open(name, "w", force_zip64=True) as entry:
                 entry.write(data)

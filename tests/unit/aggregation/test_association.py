@@ -47,7 +47,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SourceScene:
 
 
 def at(scene: SourceScene, name: str, place: list[float], **changes: object) -> SourceScene:
-    return replace(scene, name=name, ecef_from_local=geodesy.ecef_from_local(place), **changes)  # type: ignore[arg-type]
+    return replace(scene, name=name, ecef_from_local=geodesy.ecef_from_local(place), **changes)
 
 
 def by_proj(points: np.ndarray, place: list[float], other: list[float]) -> np.ndarray:

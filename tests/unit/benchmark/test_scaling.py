@@ -29,4 +29,4 @@ def test_routes_that_make_no_sense_are_refused(tmp_path: Path) -> None:
 )
 def test_settings_that_make_no_sense_are_refused(options: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Settings(config=EngineConfig(), **options)  # type: ignore[arg-type]
+        Settings(config=EngineConfig(), **options)

@@ -329,7 +329,7 @@ def test_a_term_that_ceres_cannot_have_is_refused() -> None:
         pass
 
     with pytest.raises(ValueError, match="Another"):
-        solve_with_ceres(replace(problem, terms=[Another()]))  # type: ignore[list-item]
+        solve_with_ceres(replace(problem, terms=[Another()]))
     o = problem.observations
     with pytest.raises(ValueError, match="no image observes"):
         solve_with_ceres(replace(problem, observations=replace(o, unit=np.minimum(o.unit, UNITS - 2))))

@@ -181,7 +181,7 @@ def following(case: Case) -> tuple[Problem, State]:
 
 def test_derivatives_follow_the_trajectory_that_moves_the_bands() -> None:
     free = {"free_units": [False] + [True] * 4, "free_cameras": [True] * 3}
-    problem, state = following(make_case(units=5, cameras=3, points=120, **free))  # type: ignore[arg-type]
+    problem, state = following(make_case(units=5, cameras=3, points=120, **free))
     n = problem.layout.size
     system = problem.normal_equations(state, 0.0)
     h, g = dense_normal_equations(problem, state)

@@ -29,7 +29,7 @@ def calibration_prior(state: State, *, rotation_deg: float = 2.0, translation_m:
 
 
 def drive(**kwargs: object) -> Case:
-    return make_case(**{"units": 8, "cameras": 6, "points": 800, "free_units": FIRST_FIXED, **kwargs})  # type: ignore[arg-type]
+    return make_case(**{"units": 8, "cameras": 6, "points": 800, "free_units": FIRST_FIXED, **kwargs})
 
 
 def test_exact_observations_are_recovered_exactly() -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from mrasfm_engine.cli import main
 from mrasfm_engine.config import EngineConfig
@@ -36,10 +37,10 @@ def test_described_settings_are_the_defaults(capsys: pytest.CaptureFixture[str])
     assert EngineConfig.model_validate(tomllib.loads(text)) == EngineConfig()
     for name, section in (*EngineConfig.model_fields.items(), *_fields_of_sections()):
         if not isinstance(section.default, BaseModel):
-            assert re.search(rf"^# {re.escape(section.description)}\n(# )?{name} =", text, re.MULTILINE), name
+            assert re.search(rf"^# {re.escape(str(section.description))}\n(# )?{name} =", text, re.MULTILINE), name
 
 
-def _fields_of_sections() -> Iterator[tuple[str, object]]:
+def _fields_of_sections() -> Iterator[tuple[str, FieldInfo]]:
     for field in EngineConfig.model_fields.values():
         if isinstance(field.default, BaseModel):
             yield from type(field.default).model_fields.items()

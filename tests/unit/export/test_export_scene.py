@@ -381,7 +381,7 @@ def test_too_little_disk_is_said_before_anything_is_written(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(publishing.shutil, "disk_usage", lambda _: usage(1, 1, 1000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(1, 1, 1000))
     with pytest.raises(StorageError, match=r"scene needs about .* MB free\n  Free space"):
         write_scene(scene, tmp_path / "scene", {})
     assert_nothing_published(tmp_path / "scene")

@@ -155,7 +155,7 @@ def test_the_shrinkage_inside_of_xfeat_is_taken_back() -> None:
                 "scores": np.ones(3, np.float32),
             }
 
-    detector.network = Shrinking()  # type: ignore[assignment]
+    detector.network = Shrinking()
     found = detector.detect(np.zeros((640, 360, 3), np.uint8), 10, None)
     expected = [[0.5 * 360 / 352, 0.5], [100.5 * 360 / 352, 50.5], [360 - 0.5 * 360 / 352, 639.5]]
     np.testing.assert_allclose(found.xy_px, expected, atol=1e-4)

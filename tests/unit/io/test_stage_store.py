@@ -14,7 +14,7 @@ from mrasfm_engine.errors import StorageError
 from mrasfm_engine.io.stage_store import StageStore, drive_fingerprint, fingerprint
 from mrasfm_engine.preflight.drive_reader import read_drive
 
-ARRAYS = {
+ARRAYS: dict[str, np.ndarray] = {
     "descriptors": np.random.default_rng(0).integers(0, 256, (40, 128), dtype=np.uint8),
     "poses": np.random.default_rng(1).normal(size=(5, 4, 4)),
     "empty": np.zeros((0, 2), np.int32),

@@ -21,7 +21,7 @@ ONE_BY_ONE = EngineConfig(threads=1, mapping=MappingConfig(camera_set_registrati
 
 
 def scene(**kwargs: object) -> tuple[SimulatedDrive, Mapper]:
-    simulated = make_simulated_drive(units=UNITS, points=1200, **kwargs)  # type: ignore[arg-type]
+    simulated = make_simulated_drive(units=UNITS, points=1200, **kwargs)
     mapper = make_model(simulated, config=ONE_BY_ONE)
     return simulated, with_true_poses(mapper, simulated, [u for u in range(UNITS) if u != UNIT])
 

@@ -35,7 +35,7 @@ def found_in(simulated: SimulatedDrive) -> tuple[MovingAlong, Mapper, list[PairM
 
 
 def drive(*, straight: bool = False, **kwargs: object) -> SimulatedDrive:
-    return make_simulated_drive(units=UNITS, points=1000, straight=straight, **kwargs)  # type: ignore[arg-type]
+    return make_simulated_drive(units=UNITS, points=1000, straight=straight, **kwargs)
 
 
 @pytest.mark.parametrize("straight", [False, True])

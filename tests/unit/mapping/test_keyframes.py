@@ -31,7 +31,7 @@ STOPS = {
 def drive(steps_m: list[float], **options: object) -> SimulatedDrive:
     way = np.cumsum(steps_m)
     values = {"units": len(way), "cameras": 4, "points": 900, "travelled_m": way, "noise_px": 0.3}
-    return make_simulated_drive(**{**values, **options})  # type: ignore[arg-type]
+    return make_simulated_drive(**{**values, **options})
 
 
 def model_of(simulated: SimulatedDrive) -> Mapper:

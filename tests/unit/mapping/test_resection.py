@@ -15,7 +15,7 @@ UNIT = 5
 
 def scene(**kwargs: object) -> tuple[np.ndarray, Mapper]:
     """The true poses, and a model with all units but one at them."""
-    simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})  # type: ignore[arg-type]
+    simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})
     mapper = with_true_poses(make_model(simulated), simulated, [u for u in range(9) if u != UNIT])
     return simulated.world_from_rig, mapper
 

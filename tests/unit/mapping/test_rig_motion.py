@@ -41,7 +41,7 @@ def settings(**mapping: object) -> EngineConfig:
 
 def skewed(**options: object) -> SimulatedDrive:
     drive = {"units": 10, "cameras": 6, "points": 1500, "time_offset_ms": SKEW_MS, "noise_px": 0.2}
-    return make_simulated_drive(**{**drive, **options})  # type: ignore[arg-type]
+    return make_simulated_drive(**{**drive, **options})
 
 
 def true_unit_from_image(simulated: SimulatedDrive, mapper: Mapper) -> np.ndarray:

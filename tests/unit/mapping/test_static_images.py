@@ -26,7 +26,7 @@ def on(*cameras: int) -> Callable[[int, int], bool]:
 
 
 def drive(**kwargs: object) -> SimulatedDrive:
-    return make_simulated_drive(**{"units": UNITS, "points": 1500, **kwargs})  # type: ignore[arg-type]
+    return make_simulated_drive(**{"units": UNITS, "points": 1500, **kwargs})
 
 
 @pytest.mark.parametrize("straight", [False, True])

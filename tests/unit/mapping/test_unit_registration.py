@@ -21,7 +21,7 @@ def errors(pose: np.ndarray, simulated: SimulatedDrive, unit: int = UNIT) -> tup
 
 def scene(**kwargs: object) -> tuple[SimulatedDrive, Mapper]:
     """All units but one at their true poses, with points."""
-    simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})  # type: ignore[arg-type]
+    simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})
     mapper = make_model(simulated)
     return simulated, with_true_poses(mapper, simulated, [u for u in range(9) if u != UNIT])
 

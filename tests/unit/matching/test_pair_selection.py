@@ -18,7 +18,7 @@ def drive_of(cameras: int, units: int, **kwargs: object) -> Drive:
         np.array([c.params for c in rig]),
         units=units,
         names=[c.name for c in rig],
-        **kwargs,  # type: ignore[arg-type]
+        **kwargs,
     )
 
 

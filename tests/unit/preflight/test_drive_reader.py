@@ -12,11 +12,11 @@ import pytest
 
 from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.io import documents
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, read_drive, write_manifest
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import BodyAxes
+from schemas.parsing import MAX_MANIFEST_BYTES
 
 WriteDrive = Callable[[dict[str, Any]], Path]
 
@@ -100,7 +100,7 @@ def test_size_is_bounded_before_reading(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is empty"):
         read_drive(tmp_path)
     with file.open("wb") as stream:
-        stream.truncate(documents.MAX_MANIFEST_BYTES + 1)  # a sparse file
+        stream.truncate(MAX_MANIFEST_BYTES + 1)  # a sparse file
     with pytest.raises(InputError, match="200 MB, over the bound of 200 MB"):
         read_drive(tmp_path)
 

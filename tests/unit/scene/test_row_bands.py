@@ -12,7 +12,7 @@ HEIGHT = 540
 
 def drive(*, units: int = 3, **fields: object) -> Drive:
     poses, params = np.tile(np.eye(4), (2, 1, 1)), np.tile([600.0, 600, 480, 270], (2, 1))
-    return make_drive(poses, params, units=units, **fields)  # type: ignore[arg-type]
+    return make_drive(poses, params, units=units, **fields)
 
 
 def test_without_readout_and_skew_bands_are_images() -> None:

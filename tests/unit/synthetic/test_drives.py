@@ -129,7 +129,7 @@ def test_images_obey_the_true_epipolar_geometry(drive: Path) -> None:
     a_from, b_from = (matrix_from_pose(Pose(**images[file]["world_from_cam"])) for file in files)
     found = []
     for file in files:
-        keypoints, descriptors = cv2.SIFT_create().detectAndCompute(cv2.imread(str(drive / file), 0), None)
+        keypoints, descriptors = cv2.SIFT.create().detectAndCompute(cv2.imread(str(drive / file), 0), None)
         mask = cv2.imread(str(drive / file.replace("images", "masks").replace("jpg", "png")), 0)
         # SIFT puts the centre of the top left pixel at (0, 0).
         xy = np.array([keypoint.pt for keypoint in keypoints]) + 0.5
@@ -343,7 +343,7 @@ def test_several_drives_share_one_world(tmp_path: Path) -> None:
 )
 def test_nonsense_is_refused_with_a_remedy(changes: dict[str, object]) -> None:
     with pytest.raises(InputError) as caught:
-        SynthOptions(**changes)  # type: ignore[arg-type]
+        SynthOptions(**changes)
     assert caught.value.remedy
 
 

@@ -28,7 +28,7 @@ def mosaic_of(
         Level(),
         lambda i: (images[i], usable),
         own_car_m=None,
-        **options,  # type: ignore[arg-type]
+        **options,
     )
     return mosaic
 
