@@ -13,9 +13,9 @@ def register(subparsers: Any) -> None:
     """Add the command to the `mrasfm` parser."""
     parser = subparsers.add_parser(
         "import",
-        help="turn a recording (rig folder, KITTI odometry, nuScenes) into a drive",
+        help="turn a recording (rig folder, KITTI, nuScenes, PandaSet) into a drive",
         description="Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of "
-        "KITTI odometry, or nuScenes.",
+        "KITTI odometry, a drive of KITTI raw, nuScenes, or PandaSet.",
     )
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="the recording")
     parser.add_argument("--out", type=Path, required=True, metavar="DRIVE", help="folder of the drive")
@@ -26,6 +26,11 @@ def register(subparsers: Any) -> None:
     )
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in FOLDER or the working directory")
     parser.add_argument("--scene", metavar="NAME", help="name of the scene, if the recording holds several")
+    parser.add_argument(
+        "--truth",
+        action="store_true",
+        help="write truth.tum also where the true poses and the GNSS come from one system (KITTI raw)",
+    )
     files = parser.add_mutually_exclusive_group()
     files.add_argument("--link", action="store_true", help="hard-link images where possible (the default)")
     files.add_argument("--copy", action="store_true", help="copy images")
@@ -41,6 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         frames=arguments.frames,
         gnss_file=arguments.gnss,
         scene=arguments.scene,
+        truth=arguments.truth,
         copy=arguments.copy,
         force=arguments.force,
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.recording import PIXEL_CENTER_PX, Recording, SourceImage, SourceUnit
+from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, pinhole_params
 from mrasfm_engine.importers.rig_folder import checked_camera, frame_times, numbered_images, read_upright_poses
 from mrasfm_engine.importers.tables import read_lines
 from mrasfm_engine.io.axes import flu_from_body
@@ -22,6 +22,7 @@ from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera
 
 DESCRIPTION = "calib.txt and image_0 to image_3 (KITTI odometry)"
+HAS_SCENES = False
 CAMERAS = ("image_0", "image_1", "image_2", "image_3")
 
 
@@ -117,7 +118,7 @@ def _camera(
         name,
         model="PINHOLE",
         size=(header.width, header.height),
-        params=[float(v) for v in (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER_PX, k[1, 2] + PIXEL_CENTER_PX)],
+        params=pinhole_params(k),
         rig_from_cam=flu_body @ se3.inverse(cam_from_body),
         source=f"{file}: P{name[-1]}",
     )

@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.importers import kitti, nuscenes, rig_folder
+from mrasfm_engine.importers import kitti, kitti_raw, nuscenes, pandaset, rig_folder
 from mrasfm_engine.importers.drive_writer import ImportSummary, write_recording
 from mrasfm_engine.importers.recording import Recording, SourceUnit, select_cameras, select_units
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
@@ -18,7 +18,7 @@ from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
 from schemas.drive import MAX_RIG_EXTENT_M
 
-LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, nuscenes)
+LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, kitti_raw, nuscenes, pandaset)
 
 # GNSS samples this long before the first and after the last image are kept: they smooth the ends of the track.
 GNSS_MARGIN_US = 2_000_000
@@ -32,6 +32,7 @@ def import_recording(
     cameras: Sequence[str] | None = None,
     gnss_file: Path | None = None,
     scene: str | None = None,
+    truth: bool = False,
     copy: bool = False,
     force: bool = False,
 ) -> ImportSummary:
@@ -52,6 +53,8 @@ def import_recording(
         directory.
     scene
         Name of the scene, for layouts that hold several.
+    truth
+        Whether the units' poses become the truth where they are outputs of the system that the GNSS is of, too.
     copy, force
         See `write_recording`.
 
@@ -71,6 +74,8 @@ def import_recording(
             f"the drive {out} would replace the recording {folder}", remedy="Give another folder.", code="output-in-use"
         )
     recording = select_units(select_cameras(_read(folder, scene), cameras), frames)
+    if recording.truth_is_gnss and not truth:
+        recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
     return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
 
 
@@ -78,11 +83,9 @@ def _read(folder: Path, scene: str | None) -> Recording:
     for layout in LAYOUTS:
         if not layout.recognises(folder):
             continue
-        if layout is nuscenes:
-            return nuscenes.read(folder, scene)
-        if scene is not None:
+        if scene is not None and not layout.HAS_SCENES:
             raise InputError(f"recording {folder} has only one scene", remedy="Leave --scene out.", code="no-scenes")
-        recording: Recording = layout.read(folder)
+        recording: Recording = layout.read(folder, scene) if layout.HAS_SCENES else layout.read(folder)
         return recording
     looked_for = "; ".join(layout.DESCRIPTION for layout in LAYOUTS)
     raise InputError(
@@ -95,7 +98,10 @@ def _read(folder: Path, scene: str | None) -> Recording:
 def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Recording:
     file = recording.default_gnss if gnss_file is None else _find(gnss_file, folder)
     if file is None:
-        return recording
+        if recording.gnss is None:
+            return recording
+        own = recording.gnss.model_copy(update={"samples": samples_around(recording.gnss.samples, recording.units)})
+        return replace(recording, gnss=own)
     antenna_file = file.parent / ANTENNA_FILE
     if not antenna_file.exists():
         antenna_file = folder / ANTENNA_FILE

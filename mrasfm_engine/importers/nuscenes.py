@@ -15,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.recording import PIXEL_CENTER_PX, Recording, SourceImage, SourceUnit
+from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, choose_scene, pinhole_params
 from mrasfm_engine.importers.rig_folder import checked_camera
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.types import Floats
@@ -23,6 +23,7 @@ from schemas import Camera
 from schemas.drive import Finite, RelativePath, Vector3
 
 DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
+HAS_SCENES = True
 LIDAR = "LIDAR_TOP"
 FLAT_NOTE = "The truth is nuScenes' ego poses: they are plane (z = 0) and good to about 0.1 m; compare x and y apart."
 MAX_TABLE_BYTES = 4_000_000_000  # sample_data.json of the full set has over 1 GB
@@ -110,7 +111,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     """
     tables = _tables(folder)
     data = tables.resolve().parent
-    chosen = _choose(_table(tables, "scene", _Scene), scene, tables)
+    chosen = choose_scene({s.name: s for s in _table(tables, "scene", _Scene)}, scene, tables)
     samples = _samples_of(chosen, _by_token(_table(tables, "sample", _Sample)), tables)
     sensors = _by_token(_table(tables, "sensor", _Sensor))
     calibrated = _by_token(_table(tables, "calibrated_sensor", _Calibrated))
@@ -175,22 +176,6 @@ def _by_token(rows: Iterable[Row]) -> dict[str, Row]:
     return {row.token: row for row in rows}
 
 
-def _choose(scenes: list[_Scene], name: str | None, tables: Path) -> _Scene:
-    known = ", ".join(sorted(scene.name for scene in scenes)[:20]) or "none"
-    if name is None and len(scenes) == 1:
-        return scenes[0]
-    if name is None:
-        raise InputError(
-            f"{tables} holds {len(scenes)} scenes: {known}",
-            remedy="Name one of them with --scene.",
-            code="several-scenes",
-        )
-    for scene in scenes:
-        if scene.name == name:
-            return scene
-    raise InputError(f"{tables} has no scene {name!r}", remedy=f"Name one of: {known}.", code="unknown-scene")
-
-
 def _missing(kind: str, token: str, tables: Path) -> InputError:
     return InputError(
         f"nuScenes tables {tables} refer to {kind} {token!r}, which is not there",
@@ -251,7 +236,7 @@ def _camera(name: str, data: _SampleData, calibration: _Calibrated, tables: Path
         name,
         model="PINHOLE",
         size=(data.width, data.height),
-        params=[float(v) for v in (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER_PX, k[1, 2] + PIXEL_CENTER_PX)],
+        params=pinhole_params(k),
         rig_from_cam=calibration.matrix(),
         source=source,
     )

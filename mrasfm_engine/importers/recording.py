@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from pydantic import ValidationError
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.axes import flu_from_body
-from mrasfm_engine.types import Floats
-from schemas import BodyAxes, Camera, Gnss, LabelMap
+from mrasfm_engine.types import Floats, Ints
+from schemas import BodyAxes, Camera, Gnss, GnssSample, LabelMap
 
 # Calibrations made with OpenCV's tools put the origin at the centre of the top left pixel; manifests, as COLMAP, at its
 # corner. The principal point moves by this, focal length and distortion are the same in both.
 PIXEL_CENTER_PX = 0.5
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +54,90 @@ class Recording:
     body_axes: BodyAxes = BodyAxes.FLU  # of files that belong to the recording, as the antenna's position
     default_gnss: Path | None = None
     gnss: Gnss | None = None
+    truth_is_gnss: bool = False  # the units' poses are of the system that the GNSS is of: truth only where asked for
     label_map: LabelMap | None = None
     notes: list[str] = field(default_factory=list)
+
+
+def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T:
+    """The scene of the wanted name, or the only one.
+
+    Raises
+    ------
+    InputError
+        If there is none of this name, or none is named and there are several.
+    """
+    known = ", ".join(sorted(scenes)[:20]) or "none"
+    if wanted is None and len(scenes) > 1:
+        raise InputError(
+            f"{folder} holds {len(scenes)} scenes: {known}",
+            remedy="Name one of them with --scene.",
+            code="several-scenes",
+        )
+    name = next(iter(scenes)) if wanted is None else wanted
+    if name not in scenes:
+        raise InputError(f"{folder} has no scene {name!r}", remedy=f"Name one of: {known}.", code="unknown-scene")
+    return scenes[name]
+
+
+def pinhole_params(k: Floats) -> list[float]:
+    """COLMAP's PINHOLE parameters of a calibration matrix (3, 3) that puts the origin at the first pixel's centre."""
+    return [float(v) for v in (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER_PX, k[1, 2] + PIXEL_CENTER_PX)]
+
+
+def interpolated_poses(times_us: Ints, world_from_any: Floats, at_us: Ints) -> list[Floats | None]:
+    """Poses (4, 4) at the given times between rising ones, None beyond their first and last.
+
+    Parameters
+    ----------
+    times_us
+        Rising times (n,) of the poses (n, 4, 4), n >= 1.
+    """
+    found: list[Floats | None] = []
+    for time_us in at_us.tolist():
+        if not times_us[0] <= time_us <= times_us[-1]:
+            found.append(None)
+            continue
+        b = int(np.searchsorted(times_us, time_us))
+        a = b if times_us[b] == time_us else b - 1
+        fraction = (time_us - times_us[a]) / max(int(times_us[b] - times_us[a]), 1)
+        rotation = se3.slerp(world_from_any[a, :3, :3], world_from_any[b, :3, :3], fraction)
+        position = (1 - fraction) * world_from_any[a, :3, 3] + fraction * world_from_any[b, :3, 3]
+        found.append(se3.transform(rotation, position))
+    return found
+
+
+def gnss_of_vehicle(
+    times_us: Ints, geodetic: Floats, sigma_horizontal_m: Floats, sigma_vertical_m: Floats, *, source: str
+) -> Gnss:
+    """Positions of the vehicle's origin as samples of a receiver whose antenna is there.
+
+    Parameters
+    ----------
+    geodetic
+        Latitude and longitude in degrees and height in metres (n, 3).
+    source
+        What messages call their file.
+
+    Raises
+    ------
+    InputError
+        If a value is out of its bounds.
+    """
+    columns = np.column_stack([geodetic, sigma_horizontal_m, sigma_vertical_m]).tolist()
+    names = ("latitude_deg", "longitude_deg", "height_m", "sigma_horizontal_m", "sigma_vertical_m")
+    samples = []
+    for number, (time_us, row) in enumerate(zip(times_us.tolist(), columns, strict=True)):
+        try:
+            samples.append(GnssSample(timestamp_us=time_us, **dict(zip(names, row, strict=True))))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            raise InputError(
+                f"{source}, sample {number}: {first['loc'][0]} {first['input']}: {first['msg']}",
+                remedy="Correct it at its source.",
+                code="bad-gnss-file",
+            ) from None
+    return Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[0.0, 0.0, 0.0], samples=samples)
 
 
 def parse_slice(text: str) -> slice:

@@ -11,11 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.recording import (
-    PIXEL_CENTER_PX,
     Recording,
     SourceImage,
     SourceUnit,
     flu_world,
+    pinhole_params,
     proper_transform,
 )
 from mrasfm_engine.importers.tables import read_poses, read_times
@@ -27,6 +27,7 @@ from schemas import BodyAxes, Camera, LabelMap
 from schemas.drive import MAX_CAMERAS, Finite, Name
 
 DESCRIPTION = "rig.json and a folder of numbered images for every camera"
+HAS_SCENES = False
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_FRAME_INTERVAL_US = 100_000  # where times.txt is missing
 
@@ -117,16 +118,12 @@ def read(folder: Path) -> Recording:
 
 def _camera(name: str, camera: _RigCamera, flu_body: Floats, rig_file: Path) -> Camera:
     body_cam = proper_transform(np.array(camera.T_body_cam), what=f"{rig_file}: cameras.{name}.T_body_cam")
-    if camera.params is not None:  # COLMAP's parameters in COLMAP's convention
-        params = camera.params
-    else:
-        k = np.array(camera.K)
-        params = [float(v) for v in (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER_PX, k[1, 2] + PIXEL_CENTER_PX)]
     return checked_camera(
         name,
         model=camera.model,
         size=(camera.width, camera.height),
-        params=params,
+        # Those that are given are COLMAP's, in COLMAP's convention.
+        params=pinhole_params(np.array(camera.K)) if camera.params is None else camera.params,
         rig_from_cam=flu_body @ body_cam,
         source=f"{rig_file}: cameras.{name}",
     )
@@ -182,7 +179,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
     for file in sorted(folder.iterdir()):
         if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
             continue
-        if not re.fullmatch(r"[0-9]{1,9}", file.stem):
+        if not re.fullmatch(r"[0-9]{1,12}", file.stem):
             raise InputError(
                 f"image {file} is not named by its frame number", remedy="Name images as 000000.png.", code="bad-name"
             )

@@ -101,3 +101,24 @@ def test_masks_come_along(shared_data: Path, tmp_path: Path) -> None:
         drive, _ = imported(shared_data / name, tmp_path / name)
         assert all(image.mask is not None for image in drive.images)
         assert drive.manifest.label_map is not None
+
+
+def test_pandaset_is_read_as_distributed(shared_data: Path, tmp_path: Path) -> None:
+    drive, truth = imported(shared_data / "pandaset_002", tmp_path / "drive")
+    assert (len(drive.manifest.frames), len(drive.images), len(drive.cameras)) == (52, 312, 6)
+    assert {f.code for f in check_drive(drive) if f.severity is Severity.ERROR} == set()
+    moving = truth[30:]  # it stands at first
+    assert headings_deg(moving).max() < 3.0
+    forward = drive.rig_from_cam[[camera.name == "front_camera" for camera in drive.cameras]][0, :3, 2]
+    assert forward[0] > 0.99
+
+
+def test_kitti_raw_is_read_as_distributed(shared_data: Path, tmp_path: Path) -> None:
+    import_recording(shared_data / "kitti_raw_0001", tmp_path / "drive", truth=True)
+    drive = read_drive(tmp_path / "drive")
+    assert (len(drive.manifest.frames), len(drive.images), len(drive.cameras)) == (24, 96, 4)
+    assert {f.code for f in check_drive(drive) if f.severity is Severity.ERROR} == set()
+    rows = np.loadtxt(tmp_path / "drive" / "truth.tum")
+    truth = se3.transform(se3.rotation_from_quaternion(rows[:, 4:]), rows[:, 1:4])
+    assert headings_deg(truth).max() < 3.0
+    np.testing.assert_allclose(drive.rig_from_cam[1, :3, 3] - drive.rig_from_cam[0, :3, 3], [0, -0.537, 0], atol=0.02)
