@@ -62,5 +62,5 @@ def calibration_priors(
                 held=~observed,
             )
         )
-    settling = sum(len(prior.camera) for prior in priors)
-    return priors if settling * (int(free_units.sum()) + settling) <= MAX_COUPLINGS else []
+    refined = sum(len(prior.camera) for prior in priors)
+    return priors if refined * (int(free_units.sum()) + refined) <= MAX_COUPLINGS else []

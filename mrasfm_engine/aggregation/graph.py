@@ -149,7 +149,7 @@ class SeamGraph:
         at = seam.place_b_m[None]
         shift = np.linalg.norm(se3.apply(by_others, at) - se3.apply(seam.a_from_b, at))
         turn = se3.rotation_angle_deg(by_others[:3, :3] @ seam.a_from_b[:3, :3].T)
-        return Closing(seam=k, shift_m=float(shift), turn_deg=float(turn), length=1 + _way(a, b, parent))
+        return Closing(seam=k, shift_m=float(shift), turn_deg=float(turn), length=1 + _path_length(a, b, parent))
 
     def _without(self, k: int, reason: str) -> SeamGraph:
         result = SeamGraph.__new__(SeamGraph)
@@ -158,15 +158,15 @@ class SeamGraph:
         return result
 
 
-def _way(a: int, b: int, parent: dict[int, int]) -> int:
+def _path_length(a: int, b: int, parent: dict[int, int]) -> int:
     """Seams between two scenes along the chain."""
 
     def up(scene: int) -> list[int]:
-        way = [scene]
+        path = [scene]
         while scene in parent:
             scene = parent[scene]
-            way.append(scene)
-        return way
+            path.append(scene)
+        return path
 
     above_a, above_b = up(a), up(b)
     common = next(s for s in above_a if s in set(above_b))

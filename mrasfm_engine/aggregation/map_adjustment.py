@@ -72,7 +72,7 @@ def adjust_map(
     *,
     cancel: Callable[[], bool],
 ) -> AdjustedMap:
-    """Let units at the seams (or all, or none, as the settings say) settle; then filter what does not fit.
+    """Adjust the units at the seams (or all, or none, as the settings say); then filter what does not fit.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
             warning(
                 "nothing-connected",
                 "no two of the scenes see the same: all are placed by positions only",
-                "Give drives whose ways meet, in similar light, or check their positions.",
+                "Give drives whose trajectories meet, in similar light, or check their positions.",
             )
         )
     elif names:
@@ -82,7 +82,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
             warning(
                 "unconnected",
                 f"placed by positions only, which may be off by metres: {', '.join(names)}",
-                "Give drives whose ways meet theirs.",
+                "Give drives whose trajectories meet theirs.",
             )
         )
 
@@ -212,7 +212,7 @@ def _picture_name(seam: Seam, when: str) -> str:
 
 def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
     a, b = result.ends_of(seam)
-    way_a, way_b = (result.units_of(k)[result.scenes[k].unit_registered, :3, 3] for k in (a, b))
+    trajectory_a, trajectory_b = (result.units_of(k)[result.scenes[k].unit_registered, :3, 3] for k in (a, b))
     at_seam = np.concatenate([result.units_of(a)[seam.units_a, :3, 3], result.units_of(b)[seam.units_b, :3, 3]])
     centre, side = shown_square(at_seam)
     points_a, points_b = (_points_of(result, k) for k in (a, b))
@@ -223,7 +223,7 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
         [f"{seam.a} (orange) and {seam.b} (blue), as their positions put them", "before aggregation: "
          f"{quality['positions_off_m']:.2f} m off, residual {quality['residual_before_px']:.1f} px"],
         (points_a, se3.apply(coarse, scene_b.points_m)),
-        (way_a, se3.apply(coarse, scene_b.trajectory_m)),
+        (trajectory_a, se3.apply(coarse, scene_b.trajectory_m)),
         centre,
         side,
     )  # fmt: skip
@@ -231,7 +231,7 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
         [f"{seam.a} (orange) and {seam.b} (blue), in the map", f"after: {quality['inliers']} shared points, residual "
          f"{quality['residual_after_px']:.2f} px"],
         (points_a, points_b),
-        (way_a, way_b),
+        (trajectory_a, trajectory_b),
         centre,
         side,
     )  # fmt: skip

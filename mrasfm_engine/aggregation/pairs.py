@@ -20,7 +20,7 @@ from mrasfm_engine.types import Floats, Ints
 
 SIGHT_SHIFT_M = 12.0  # cameras this far apart along their views still match
 MIN_OVERLAP = 0.15
-LEAST_PROBES = 10  # units of a short way that are looked for, or looked at
+LEAST_PROBES = 10  # units of a short trajectory that are looked for, or looked at
 PROBE_PAIRS = 14  # of an image, while it is not known how the scenes lie
 SIMILAR_DISTANCE_M = 10.0  # cameras this far apart count half
 
@@ -51,8 +51,8 @@ def _length_m(scene: SourceScene) -> float:
 
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
     """Smallest horizontal distance between the trajectories of two scenes."""
-    way = b.trajectory_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-    return float(np.min(cKDTree(a.trajectory_m[:, :2]).query(way[:, :2])[0]))
+    trajectory = b.trajectory_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    return float(np.min(cKDTree(a.trajectory_m[:, :2]).query(trajectory[:, :2])[0]))
 
 
 def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> list[Probe]:

@@ -19,7 +19,7 @@ COLOR_A, COLOR_B = (214, 96, 0), (0, 92, 190)
 def seam_picture(
     title: Sequence[str],
     points_m: tuple[Floats, Floats],
-    ways_m: tuple[Floats, Floats],
+    trajectories_m: tuple[Floats, Floats],
     centre_m: Floats,
     side_m: float,
 ) -> Bytes:
@@ -51,8 +51,8 @@ def seam_picture(
         strength = (1.0 - 0.45 ** np.minimum(cover, 4.0))[..., None]
         picture *= 1.0 - strength * (1.0 - np.array(color) / 255.0)
     drawn = np.ascontiguousarray(picture.round().astype(np.uint8))
-    for way, color in zip(ways_m, (COLOR_A, COLOR_B), strict=True):
-        for u, v in pixels(way).tolist():
+    for trajectory, color in zip(trajectories_m, (COLOR_A, COLOR_B), strict=True):
+        for u, v in pixels(trajectory).tolist():
             cv2.circle(drawn, (int(u), int(v)), 4, color, -1, cv2.LINE_AA)
             cv2.circle(drawn, (int(u), int(v)), 4, (30, 30, 30), 1, cv2.LINE_AA)
     return framed(drawn, title, cell_m=cell_m, arrows=[("N", (0.0, 1.0))]).picture

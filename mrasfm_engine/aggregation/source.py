@@ -118,10 +118,10 @@ class SourceScene:
     @property
     def midpoint_m(self) -> Floats:
         """The middle of the trajectory (3,): half of the trajectory along it."""
-        way = self.trajectory_m
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        trajectory = self.trajectory_m
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(trajectory, axis=0), axis=1))])
         half = 0.5 * length[-1]
-        return np.array([np.interp(half, length, way[:, k]) for k in range(3)])
+        return np.array([np.interp(half, length, trajectory[:, k]) for k in range(3)])
 
     def keypoints_with_points(self, image: int) -> Ints:
         """Keypoints (rows of the whole scene) of an image that observe a point."""

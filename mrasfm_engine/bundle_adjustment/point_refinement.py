@@ -27,7 +27,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
 )
 from mrasfm_engine.geometry.camera_model import project
 
-SETTLED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
+CONVERGED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
 WORTH = 3e-2  # gain an observation, after which a point is still far enough from its minimum for one more step
 
 
@@ -119,7 +119,7 @@ def refine_points(
                 cost = back
                 for i in range(3):
                     x[i] = trial[i]
-        gained, enough = abs(cost - costs_before[p]), SETTLED
+        gained, enough = abs(cost - costs_before[p]), CONVERGED
         for _ in range(steps):
             if gained <= enough * (end - begin):
                 break

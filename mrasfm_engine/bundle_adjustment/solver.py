@@ -53,7 +53,7 @@ class SolverOptions:
     max_iterations: int = 50
     function_tolerance: float = 1e-6  # relative decrease of the cost below which it has converged
     # Newton decrement below which poses and calibration have converged, in squared standard deviations: no combination
-    # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that settle
+    # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that move
     # between their robust weights, which moves no pose.
     decrement_tolerance: float = 5e-3
     initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most

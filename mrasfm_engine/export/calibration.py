@@ -51,7 +51,7 @@ def _common(observability: CalibrationObservability) -> dict[str, Any]:
 
 
 def document_in_map(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
-    """A scene's `calibration.json` after its cameras have settled in a map: `refined` and `difference` are the map's.
+    """A scene's `calibration.json` after its cameras were adjusted in a map: `refined` and `difference` are the map's.
 
     `since_scene` is by how much that is another pose than the scene found, and absent where nothing moved; everything
     else is as the scene found it.

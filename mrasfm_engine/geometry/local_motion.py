@@ -23,8 +23,8 @@ class LocalMotion:
         turned by exp(velocity t + bend t^2),        moved by velocity t + bend t^2
 
     Places are interpolated apart from rotations: so the place at t is a weighted sum of the units' places, and follows
-    any motion and scaling of the whole way exactly. In a turn it cuts the arc by |t (t - a) (t - b)| v w^2 / 6 with the
-    others at times a and b: 1 mm at 10 m/s, half a radian a second, 0.2 s between units and 50 ms off.
+    any motion and scaling of the whole trajectory exactly. In a turn it cuts the arc by |t (t - a) (t - b)| v w^2 / 6
+    with the others at times a and b: 1 mm at 10 m/s, half a radian a second, 0.2 s between units and 50 ms off.
     """
 
     velocity: Floats  # (u, 6) rotation (rad/s), translation (m/s)

@@ -18,7 +18,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
 SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
 HYPOTHESES = 300
-SCALE_RANGE = (0.8, 1.25)  # of the receiver's way against the rig's; farther off, something is wrong
+SCALE_RANGE = (0.8, 1.25)  # of the receiver's trajectory against the rig's; farther off, something is wrong
 MIN_CONSENSUS = 0.3  # of the positions
 LOSS_SCALE = 2.0
 MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
@@ -109,8 +109,8 @@ def align_with_gnss(
 
 def _scale_is_off(scale: float) -> str:
     return (
-        f"the receiver's way is {scale:.3g} times as long as the rig's (are latitude and longitude swapped, or are the "
-        "baselines not in metres?)"
+        f"the receiver's trajectory is {scale:.3g} times as long as the rig's (are latitude and longitude swapped, or "
+        "are the baselines not in metres?)"
     )
 
 
@@ -122,8 +122,8 @@ def _why_not(
     if fitting.mean() >= 2 * MIN_CONSENSUS:
         return _scale_is_off(float(np.cbrt(np.linalg.det(wide[:3, :3]))))
     return (
-        f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the way (are latitude and longitude "
-        "swapped, or the receiver's clock off?)"
+        f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the trajectory (are latitude and "
+        "longitude swapped, or the receiver's clock off?)"
     )
 
 
@@ -176,10 +176,10 @@ def _best_yaw(
         i, j = rng.choice(len(a), 2, replace=False)
         da, dm = a[j] - a[i], measured[j] - measured[i]
         length, slack = float(np.hypot(da[0], da[1])), 4.0 * float(sigma[i, 0] + sigma[j, 0])
-        way = float(np.hypot(dm[0], dm[1]))
-        if length < 1e-3 or not scale_range[0] * length - slack <= way <= scale_range[1] * length + slack:
+        moved_m = float(np.hypot(dm[0], dm[1]))
+        if length < 1e-3 or not scale_range[0] * length - slack <= moved_m <= scale_range[1] * length + slack:
             continue
-        scale = float(np.clip(way / length, *scale_range))
+        scale = float(np.clip(moved_m / length, *scale_range))
         yaw = np.arctan2(dm[1], dm[0]) - np.arctan2(da[1], da[0])
         rotation = scale * se3.exp_so3([0.0, 0.0, yaw])
         shift = np.median(measured - a @ rotation.T, axis=0)

@@ -103,7 +103,7 @@ def refine(
         raise ReconstructionError(
             "one camera tells no scale, and neither GNSS nor rough poses could: "
             + (result.placement.reason if result.placement is not None else "the drive has none that are usable"),
-            remedy="Give a second camera with its baseline, or positions that follow the car's way.",
+            remedy="Give a second camera with its baseline, or positions along the vehicle's trajectory.",
             code="no-metric-scale",
         )
     free_units = _free_units(mapper, georeferenced=positions is not None and mapper.config.bundle_adjustment.priors)
@@ -119,7 +119,7 @@ def refine(
     if not result.calibration.free:
         result.recalibrated = _wrong_although_held(mapper, free_units, positions, result, cancel)
     result.focal_free = mapper.config.bundle_adjustment.refine_focal and result.calibration.free
-    _settle(mapper, result, _terms(mapper, positions, result))
+    _rescale(mapper, result, _terms(mapper, positions, result))
     for done in range(ROUNDS):
         is_last = done == ROUNDS - 1
         result.sigma_px = _observation_sigma(mapper)
@@ -135,7 +135,7 @@ def refine(
                 cancel=cancel,
             )
         )
-        _settle(mapper, result, terms)
+        _rescale(mapper, result, terms)
         if is_last:
             mapper.readmit()
         else:
@@ -237,10 +237,10 @@ def _hold_unobserved(
             cancel=cancel,
         )
     )
-    _settle(mapper, result, terms)
+    _rescale(mapper, result, terms)
 
 
-def _settle(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:
+def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:
     """Let the priors and the positions say the scale, where the calibration and with it the scale may vary."""
     several = not mapper.drive.has_single_camera
     if result.calibration.free and several and terms and mapper.config.bundle_adjustment.camera_set_adjustment:

@@ -69,7 +69,7 @@ def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
         tracks = np.flatnonzero(mapper.triangulated & (mapper.track_class == UNKNOWN))
         below = points_below_trajectory(mapper.state.points_m[tracks], world_from_rig, _lowest_camera_m(mapper))
         if below is None:
-            return "without masks, no points lie on one level below the vehicle's way"
+            return "without masks, no points lie on one level below the vehicle's trajectory"
         tracks = tracks[below]
     points = mapper.state.points_m[tracks]
     sigma = height_sigmas_m(mapper, tracks, world_from_rig)

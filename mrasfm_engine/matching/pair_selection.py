@@ -117,12 +117,12 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     tree = cKDTree(centres)
     pairs = tree.query_pairs(config.max_depth_m, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     pairs.sort(axis=1)
-    way = _travelled_m(world_from_rig[:, :3, 3])
+    travelled_m = _travelled_m(world_from_rig[:, :3, 3])
     gap = np.abs(views.unit[pairs[:, 0]] - views.unit[pairs[:, 1]])
-    way_between = np.abs(way[views.unit[pairs[:, 0]]] - way[views.unit[pairs[:, 1]]])
+    between_m = np.abs(travelled_m[views.unit[pairs[:, 0]]] - travelled_m[views.unit[pairs[:, 1]]])
     position = world_from_rig[views.unit, :3, 3]
     apart = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
-    revisit = (gap > config.window_units) & (way_between > REVISIT_PATH_M) & (apart < REVISIT_DIRECT * way_between)
+    revisit = (gap > config.window_units) & (between_m > REVISIT_PATH_M) & (apart < REVISIT_DIRECT * between_m)
     keep = (gap <= config.window_units) | revisit
     keep &= _axis_angle_ok(pairs, world_from_cam, config.max_view_angle_deg)
     pairs, gap, revisit = pairs[keep], gap[keep], revisit[keep]

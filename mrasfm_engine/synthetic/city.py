@@ -106,23 +106,23 @@ def _line(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class CityRoute:
-    """The way of a vehicle's rear axle through the city, as a fine polyline."""
+    """The path of a vehicle's rear axle through the city, as a fine polyline."""
 
     xy_m: Floats  # (n, 2)
     travelled_m: Floats  # (n,) driven until there
 
     def world_from_rig(self, travelled_m: ArrayLike) -> Floats:
-        """Poses (..., 4, 4) after a way (...) driven: x forward, y left, z up, origin on the ground.
+        """Poses (..., 4, 4) after a distance (...) travelled: x forward, y left, z up, origin on the ground.
 
         The body follows the ground, and pitches and rolls on its springs by 0.3 degrees.
         """
-        way = np.asarray(travelled_m, dtype=np.float64)
-        at = self._at(way)
-        forward = self._at(way + 0.4) - self._at(way - 0.4)
+        along_m = np.asarray(travelled_m, dtype=np.float64)
+        at = self._at(along_m)
+        forward = self._at(along_m + 0.4) - self._at(along_m - 0.4)
         forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
         left = np.stack([-forward[..., 1], forward[..., 0]], -1)
-        pitch = -np.arctan2(ground_m(at + forward) - ground_m(at - forward), 2.0) + 0.005 * np.sin(way / 1.9)
-        roll = np.arctan2(ground_m(at + left) - ground_m(at - left), 2.0) + 0.005 * np.sin(way / 2.7)
+        pitch = -np.arctan2(ground_m(at + forward) - ground_m(at - forward), 2.0) + 0.005 * np.sin(along_m / 1.9)
+        roll = np.arctan2(ground_m(at + left) - ground_m(at - left), 2.0) + 0.005 * np.sin(along_m / 2.7)
         yaw = np.arctan2(forward[..., 1], forward[..., 0])
         rotation = (
             se3.exp_so3(yaw[..., None] * np.array([0.0, 0.0, 1.0]))

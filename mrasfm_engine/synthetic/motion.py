@@ -49,7 +49,7 @@ class Motion:
         pitch = -np.arctan2(self.ground.height(at + _WHEELBASE_M * forward) - z, _WHEELBASE_M)
         half = _TRACK_M / 2
         roll = np.arctan2(self.ground.height(at + half * left) - self.ground.height(at - half * left), _TRACK_M)
-        # Springs follow the way, so that a standing car stands still.
+        # Springs follow the distance travelled, so that a standing car stands still.
         pitch = pitch + np.radians(0.3) * np.sin(s / 1.9 + 2 * self.sway_phase)
         roll = roll + np.radians(0.3) * np.sin(s / 2.7 + 3 * self.sway_phase)
         yaw = np.arctan2(forward[..., 1], forward[..., 0])

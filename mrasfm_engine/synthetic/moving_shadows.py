@@ -69,10 +69,10 @@ def moving_shadows(
 def street_heading(own: Motion, options: SynthOptions) -> float:
     """The vehicle's mean heading over a drive, radians."""
     ends = own.world_from_rig(np.array([0.0, (options.units - 1) / RATE_HZ]))
-    way = ends[1, :2, 3] - ends[0, :2, 3]
-    if np.linalg.norm(way) < 1.0:
-        way = ends[0, :2, 0]
-    return float(np.arctan2(way[1], way[0]))
+    moved = ends[1, :2, 3] - ends[0, :2, 3]
+    if np.linalg.norm(moved) < 1.0:
+        moved = ends[0, :2, 0]
+    return float(np.arctan2(moved[1], moved[0]))
 
 
 def _companion(

@@ -163,7 +163,7 @@ class SynthOptions:
 
     @property
     def loop_length_m(self) -> float:
-        """Way around the block: every drive ends 10 m into the next one's way."""
+        """Path around the block: every drive ends 10 m into the next one's path."""
         return self.drives * (self.drive_length_m - LOOP_OVERLAP_M)
 
 

@@ -49,7 +49,7 @@ def simulate_trajectory(units: int, *, spacing_m: float = 1.1, straight: bool = 
 
 
 def poses_along(travelled_m: Floats, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
-    """Poses (n, 4, 4) of the car of `simulate_trajectory` after any way (n,) driven, also before its first unit."""
+    """Poses (n, 4, 4) of the car of `simulate_trajectory` after any distance (n,), also before its first unit."""
 
     def heading(s: Floats) -> Floats:
         swing = (
@@ -161,9 +161,9 @@ def simulate_observations(
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
     params = np.array([camera.params for camera in rig])
     steady_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
-    way = steady_m if travelled_m is None else np.asarray(travelled_m, dtype=np.float64)
-    world_from_rig = poses_along(way, spacing_m=spacing_m, straight=straight)
-    steps = max(2, round(float(np.ptp(way)) / spacing_m) + 1)
+    along_m = steady_m if travelled_m is None else np.asarray(travelled_m, dtype=np.float64)
+    world_from_rig = poses_along(along_m, spacing_m=spacing_m, straight=straight)
+    steps = max(2, round(float(np.ptp(along_m)) / spacing_m) + 1)
     along = (
         world_from_rig if travelled_m is None else simulate_trajectory(steps, spacing_m=spacing_m, straight=straight)
     )
@@ -182,10 +182,10 @@ def simulate_observations(
         for _ in range(_ROW_ROUNDS):
             # The row tells the time, and the time the row.
             at_s = time_s + (xy[which][:, 1] / height - 0.5) * readout_s
-            way_then = at_s * RATE_HZ * spacing_m
+            then_m = at_s * RATE_HZ * spacing_m
             if travelled_m is not None:
-                way_then = np.interp(at_s * RATE_HZ, np.arange(units), way)
-            then = poses_along(way_then, spacing_m=spacing_m, straight=straight)
+                then_m = np.interp(at_s * RATE_HZ, np.arange(units), along_m)
+            then = poses_along(then_m, spacing_m=spacing_m, straight=straight)
             local = se3.apply(se3.inverse(then @ rig_from_cam[which[1]]), world[which[2], None])[:, 0]
             xy[which] = local[:, :2] / local[:, 2:].clip(0.3) * params[which[1], :2] + params[which[1], 2:]
         seen[which] = (local[:, 2] > 0.3) & np.all((xy[which] > 0) & (xy[which] < np.array([width, height])), -1)

@@ -211,7 +211,7 @@ def _crossing(options: SynthOptions, first: Street, heading: float, ground: Grou
     unit = np.array([np.cos(across), np.sin(across)])
     second = _line(middle - unit * (MARGIN_M + 0.5 * length), across, length + 2 * MARGIN_M)
     streets = [first, second]
-    ways = [
+    paths = [
         Route(street=0, start_m=MARGIN_M, direction=1),
         Route(street=0, start_m=MARGIN_M + 0.1 * length, direction=1, lane_m=LANE_M - 0.3),
         Route(street=0, start_m=MARGIN_M + 1.05 * length, direction=-1),
@@ -219,7 +219,7 @@ def _crossing(options: SynthOptions, first: Street, heading: float, ground: Grou
         Route(street=0, start_m=MARGIN_M + 0.55 * length, direction=1),
         Route(street=1, start_m=MARGIN_M + length, direction=-1),
     ]
-    routes = [ways[k % len(ways)] for k in range(options.drives)]
+    routes = [paths[k % len(paths)] for k in range(options.drives)]
     if options.drives >= 7:
         away = first.points[0] - 300.0 * np.array([np.cos(heading), np.sin(heading)])
         far = _line(away - unit * (MARGIN_M + length / 2), across, length + 2 * MARGIN_M)

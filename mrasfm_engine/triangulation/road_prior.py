@@ -63,8 +63,8 @@ def _beside_trajectory(points_m: Floats, world_from_rig: Floats) -> tuple[Floats
     Points farther than AHEAD_M beyond the ends of the trajectory have an infinite offset.
     """
     axes = horizontal_axes(world_from_rig)
-    way, xyz = world_from_rig[:, :3, 3] @ axes.T, points_m @ axes.T
-    unit = nearest(way[:, :2], xyz[:, :2])[1][:, 0]
+    trajectory, xyz = world_from_rig[:, :3, 3] @ axes.T, points_m @ axes.T
+    unit = nearest(trajectory[:, :2], xyz[:, :2])[1][:, 0]
     local = np.einsum("nji,nj->ni", world_from_rig[unit, :3, :3], points_m - world_from_rig[unit, :3, 3])
     lateral = np.where(np.abs(local[:, 0]) <= AHEAD_M, local[:, 1], np.inf)
     return lateral, np.hypot(local[:, 0], local[:, 1]), local[:, 2]

@@ -71,9 +71,9 @@ def rig_height_above(points_m: Floats, world_from_rig: Floats, *, reach_m: float
     if not len(points_m):
         return None
     axes = horizontal_axes(world_from_rig)
-    way = world_from_rig[:, :3, 3] @ axes.T
+    trajectory = world_from_rig[:, :3, 3] @ axes.T
     xyz = points_m @ axes.T
-    reach, unit = nearest(way[:, :2], xyz[:, :2], within_m=reach_m)
+    reach, unit = nearest(trajectory[:, :2], xyz[:, :2], within_m=reach_m)
     near = np.isfinite(reach[:, 0])
     if near.sum() < MIN_POINTS:
         return None
@@ -136,7 +136,7 @@ def fit_road(
         fitted = _grow(points, below, slopes, axes, radius_m=radius_m, roughness_m=roughness, rng=rng)
         if fitted is None:
             return None
-        fitted = _settle(points, points_m, fitted, roughness_m=roughness)
+        fitted = _moved_by_residuals(points, points_m, fitted, roughness_m=roughness)
         roughness = _roughness(points_m, sigma_m, fitted, roughness)
     assert fitted is not None
     return FittedRoad(surface=fitted, roughness_m=roughness, rig_height_m=rig_height)
@@ -233,7 +233,7 @@ def _grow(
     return RoadSurface(axes=axes, centre_m=centre @ axes, normal=normal @ axes, radius_m=radius_m)
 
 
-def _settle(points: _Points, points_m: Floats, surface: RoadSurface, *, roughness_m: float) -> RoadSurface:
+def _moved_by_residuals(points: _Points, points_m: Floats, surface: RoadSurface, *, roughness_m: float) -> RoadSurface:
     """The surface with every patch moved by the mean residual of its points, along its normal.
 
     Planes cut through crests and span dips. What they leave of a road's curvature is the same all over a patch, so that

@@ -106,7 +106,7 @@ def _gray(mosaic: Mosaic) -> list[list[Floats32]]:
     ]
 
 
-def _textured_blocks(mosaic: Mosaic, way: cKDTree, size: int, margin: int) -> list[_Block]:
+def _textured_blocks(mosaic: Mosaic, trajectory: cKDTree, size: int, margin: int) -> list[_Block]:
     """Pieces that both layers cover with their surroundings, of most contrast in both under the refined calibration."""
     seen = (mosaic.owner > 0).all(axis=0).astype(np.uint8)
     covered = cv2.integral(seen)
@@ -119,8 +119,8 @@ def _textured_blocks(mosaic: Mosaic, way: cKDTree, size: int, margin: int) -> li
     cover = covered[r1, c1] - covered[r0, c1] - covered[r1, c0] + covered[r0, c0]
     grid = mosaic.grid
     x, y = grid.left_m + (c + size / 2) * grid.cell_m, grid.top_m - (r + size / 2) * grid.cell_m
-    from_way_m, _ = way.query(np.column_stack([x, y]))
-    whole = (cover >= MIN_COVER * (size + 2 * margin) ** 2) & (from_way_m < ROADSIDE_M)
+    from_trajectory_m, _ = trajectory.query(np.column_stack([x, y]))
+    whole = (cover >= MIN_COVER * (size + 2 * margin) ** 2) & (from_trajectory_m < ROADSIDE_M)
     r, c = r[whole], c[whole]
     gray = _gray(mosaic)
     contrast = np.array(

@@ -66,7 +66,7 @@ def birds_eye(scene: Scene, *, seed: int = 0, progress: CountProgress | None = N
         se3.apply(plan_from_world, scene.points_m), plan_from_rig, cameras, rng=np.random.default_rng(seed)
     )
     if ground is None:
-        return BirdsEye(report={"not_drawn": "too few points of the scene lie on the ground along the way"})
+        return BirdsEye(report={"not_drawn": "too few points of the scene lie on the ground along the trajectory"})
     trajectory_m = plan_from_rig[:, :2, 3]
     mosaic, *plots = _mosaics_of(scene, plan_from_world, ground, trajectory_m, progress)
     if not mosaic.images_used:
@@ -80,7 +80,7 @@ def birds_eye(scene: Scene, *, seed: int = 0, progress: CountProgress | None = N
 
 
 def _plan_from_world(scene: Scene) -> Floats:
-    """The plan frame: z is up, x the direction in which the way extends most.
+    """The plan frame: z is up, x the direction in which the trajectory extends most.
 
     Where the scene's frame does not know what is up, it is the vehicle's mean up axis.
     """
@@ -91,11 +91,11 @@ def _plan_from_world(scene: Scene) -> Floats:
     position = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
     flat = position - np.outer(position @ up, up)
     _, _, axes = np.linalg.svd(flat, full_matrices=False)
-    along, way = axes[0], flat[-1] - flat[0]
+    along, trajectory = axes[0], flat[-1] - flat[0]
     if np.ptp(flat @ along) < MIN_WAY_M:
-        along = way = poses[:, :3, 0].mean(0)
+        along = trajectory = poses[:, :3, 0].mean(0)
     along = along - (along @ up) * up
-    along *= (1.0 if along @ way >= 0 else -1.0) / np.linalg.norm(along)
+    along *= (1.0 if along @ trajectory >= 0 else -1.0) / np.linalg.norm(along)
     rotation = np.stack([along, np.cross(up, along), up])
     return se3.transform(rotation, -rotation @ poses[:, :3, 3].mean(0))
 
@@ -265,7 +265,7 @@ def _report(scene: Scene, mosaic: Mosaic, agreement: tuple[Agreement, Agreement]
         "calibration_changed": calibration_changed(scene),
     }
     if agreement is None:
-        return result | {"not_compared": "too little textured ground near the way is seen by two cameras"}
+        return result | {"not_compared": "too little textured ground near the trajectory is seen by two cameras"}
     for name, of in zip(("before", "after"), agreement, strict=True):
         result[name] = {"blocks": of.blocks, "correlation": of.correlation, "displaced_blocks": of.displaced_blocks}
         if np.isfinite(of.displacement_m):

@@ -54,7 +54,7 @@ class GroundPatches:
         return cKDTree(self.centre_m)
 
     def height_m(self, xy_m: Floats) -> Floats:
-        """See `GroundHeights`; takes as long for a long way as for a short one."""
+        """See `GroundHeights`; takes as long for a long trajectory as for a short one."""
         count = min(BLENDED_PATCHES, len(self.centre_m))
         distance, nearest = (np.reshape(a, (len(xy_m), count)) for a in self._kd_tree.query(xy_m, k=count))
         offset, plane = xy_m[:, None] - self.centre_m[nearest], self.plane[nearest]

@@ -25,7 +25,13 @@ TOP_VIEW = (90, 610, 1570, 900)
 ON_SURFACE_M = 0.05  # farther points are coloured as above or below the surface
 MARGIN_M = 1.0  # of height above and below the surface in the side view
 GREY, PALE = (110, 110, 110), (228, 228, 228)
-ON, ABOVE, BELOW, SURFACE, WAY = (120, 120, 120), (30, 60, 220), (200, 90, 20), (60, 150, 40), (0, 140, 230)  # BGR
+ON, ABOVE, BELOW, SURFACE, TRAJECTORY = (
+    (120, 120, 120),
+    (30, 60, 220),
+    (200, 90, 20),
+    (60, 150, 40),
+    (0, 140, 230),
+)  # BGR
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +86,7 @@ class _Views:
     side_xy: Floats  # (n, 2): along the trajectory, height
     top_xy: Floats  # (n, 2)
     surface: Floats  # (m, 2) the surface below the trajectory in the side view
-    way: Floats  # (m, 2) the way in the view from above
+    trajectory: Floats  # (m, 2) the trajectory in the view from above
     exaggeration: float
     outside: int  # points that the side view does not reach
 
@@ -89,8 +95,8 @@ def road_points(scene: Scene) -> dict[str, Bytes]:
     """Both pictures (h, w, 3) of the scene's road by file name; none where no road was found."""
     if scene.road is None:
         return {}
-    road, way = scene.road, scene.world_from_rig[scene.unit_registered]
-    views = _views(road, way)
+    road, trajectory = scene.road, scene.world_from_rig[scene.unit_registered]
+    views = _views(road, trajectory)
     everything = np.ones(len(road.before.is_inlier), dtype=np.bool_)
     shown = zip(NAMES, (everything, road.before.is_inlier), ("before", "after"), strict=True)
     return {name: np.ascontiguousarray(_draw(road, views, points, what)[..., ::-1]) for name, points, what in shown}
@@ -98,15 +104,15 @@ def road_points(scene: Scene) -> dict[str, Bytes]:
 
 def _views(road: Road, world_from_rig: Floats) -> _Views:
     axes, before = road.surface.axes, road.before
-    way = world_from_rig[:, :3, 3] @ axes.T
+    trajectory = world_from_rig[:, :3, 3] @ axes.T
     points = before.points_m @ axes.T
-    steps = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(trajectory[:, :2], axis=0), axis=1)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
-    along = _along(way, travelled, world_from_rig[:, :3, 0] @ axes.T, points)
-    ground = way[:, 2] - road.rig_height_m * (world_from_rig[:, :3, 2] @ axes.T)[:, 2]
+    along = _along(trajectory, travelled, world_from_rig[:, :3, 0] @ axes.T, points)
+    ground = trajectory[:, 2] - road.rig_height_m * (world_from_rig[:, :3, 2] @ axes.T)[:, 2]
     zero = ground[0]
-    # The way's own height: where a patch is, the surface's.
-    offset, _ = road.surface.locate(np.column_stack([way[:, :2], ground]) @ axes)
+    # The trajectory's own height: where a patch is, the surface's.
+    offset, _ = road.surface.locate(np.column_stack([trajectory[:, :2], ground]) @ axes)
     surface = np.column_stack([travelled, np.where(np.isfinite(offset), ground - offset, ground) - zero])
     kept = before.is_inlier & np.isfinite(before.distance_m)
     shown = np.concatenate([points[kept, 2] - zero, surface[:, 1]])
@@ -114,35 +120,35 @@ def _views(road: Road, world_from_rig: Floats) -> _Views:
     low = (float(min(reach[0], 0.0)) - 1.0, float(np.percentile(shown, 0.5)) - MARGIN_M)
     high = (float(max(reach[1], travelled[-1])) + 1.0, float(np.percentile(shown, 99.5)) + MARGIN_M)
     side = _Panel(box=SIDE_VIEW, low=low, high=high)
-    top_axes = _along_the_picture(way[:, :2])
-    middle = way[:, :2].mean(0)
-    top_xy, top_way = (points[:, :2] - middle) @ top_axes.T, (way[:, :2] - middle) @ top_axes.T
+    top_axes = _along_the_picture(trajectory[:, :2])
+    middle = trajectory[:, :2].mean(0)
+    top_xy, top_trajectory = (points[:, :2] - middle) @ top_axes.T, (trajectory[:, :2] - middle) @ top_axes.T
     height = points[:, 2] - zero
     return _Views(
         side=side,
-        top=_equal_scale(TOP_VIEW, np.concatenate([top_xy[kept], top_way])),
+        top=_equal_scale(TOP_VIEW, np.concatenate([top_xy[kept], top_trajectory])),
         side_xy=np.column_stack([along, height]),
         top_xy=top_xy,
         surface=surface,
-        way=top_way,
+        trajectory=top_trajectory,
         exaggeration=_exaggeration(side),
         outside=int(((height < low[1]) | (height > high[1]) | (along < low[0]) | (along > high[0])).sum()),
     )
 
 
-def _along(way: Floats, travelled: Floats, forward: Floats, points: Floats) -> Floats:
+def _along(trajectory: Floats, travelled: Floats, forward: Floats, points: Floats) -> Floats:
     """Distance along the trajectory (n,) of points: that of the nearest pose, and their lead over it."""
-    pose = nearest(way[:, :2], points[:, :2])[1][:, 0]
-    ahead = ((points[:, :2] - way[pose, :2]) * forward[pose, :2]).sum(1)
+    pose = nearest(trajectory[:, :2], points[:, :2])[1][:, 0]
+    ahead = ((points[:, :2] - trajectory[pose, :2]) * forward[pose, :2]).sum(1)
     result: Floats = travelled[pose] + ahead
     return result
 
 
-def _along_the_picture(way: Floats) -> Floats:
-    """Axes (2, 2) of the view from above: the way's longest extent to the right."""
-    _, vectors = np.linalg.eigh(np.cov(way.T) if len(way) > 1 else np.eye(2))
+def _along_the_picture(trajectory: Floats) -> Floats:
+    """Axes (2, 2) of the view from above: the trajectory's longest extent to the right."""
+    _, vectors = np.linalg.eigh(np.cov(trajectory.T) if len(trajectory) > 1 else np.eye(2))
     right = vectors[:, 1]
-    if right @ (way[-1] - way[0]) < 0:
+    if right @ (trajectory[-1] - trajectory[0]) < 0:
         right = -right
     return np.array([right, [-right[1], right[0]]])
 
@@ -180,13 +186,13 @@ def _draw(road: Road, views: _Views, shown: Bools, what: str) -> Bytes:
         image,
         title=f"from the side, heights {views.exaggeration:.0f} times exaggerated"
         + (f"; {views.outside} points of both pictures lie outside, on the border" if views.outside else ""),
-        x_label="along the vehicle's way [m]",
+        x_label="along the vehicle's trajectory [m]",
         y_label="height [m]",
     )
     views.top.frame(
         image,
         title="from above, equal scales",
-        x_label="along the longest extent of the way [m]",
+        x_label="along the longest extent of the trajectory [m]",
         y_label="across [m]",
     )
     on = shown & ~(np.abs(distance) > ON_SURFACE_M)
@@ -198,7 +204,7 @@ def _draw(road: Road, views: _Views, shown: Bools, what: str) -> Bytes:
         views.side.scatter(image, views.side_xy[marks], colour)
         views.top.scatter(image, views.top_xy[marks], colour)
     views.side.line(image, views.surface, SURFACE, 2)
-    views.top.line(image, views.way, WAY, 2)
+    views.top.line(image, views.trajectory, TRAJECTORY, 2)
     return image
 
 
@@ -208,8 +214,8 @@ def _legend(image: Bytes) -> None:
         (ON, f"within {100 * ON_SURFACE_M:.0f} cm of the surface"),
         (ABOVE, "above it"),
         (BELOW, "below it"),
-        (SURFACE, "the surface below the way"),
-        (WAY, "the vehicle's way"),
+        (SURFACE, "the surface below the trajectory"),
+        (TRAJECTORY, "the vehicle's trajectory"),
     ):
         cv2.rectangle(image, (column, 972), (column + 14, 986), colour, -1)
         write_text(image, text, (column + 22, 985))

@@ -83,9 +83,9 @@ def large_upload(api: ApiProcess, folder: Path, files: int) -> dict[str, Any]:
     """Send a drive of many files, and compare with a process that only hashes and writes the same bytes."""
     payload = Payload(os.urandom(FILE_BYTES - len(_PNG)))
     plain_s = _timed(lambda: _hash_and_write(payload, folder / "plain", files, durable=False))
-    _settled(folder / "plain")
+    _written_out(folder / "plain")
     durable_s = _timed(lambda: _hash_and_write(payload, folder / "durable", files, durable=True))
-    _settled(folder / "durable")
+    _written_out(folder / "durable")
     client = api.client()
     document = manifest("long", frames=files // len(CAMERAS))
     drive_id = client.post("/v1/drives", json=document).raise_for_status().json()["id"]
@@ -124,7 +124,7 @@ def _hash_and_write(payload: Payload, folder: Path, files: int, *, durable: bool
         digest.hexdigest()
 
 
-def _settled(folder: Path) -> None:
+def _written_out(folder: Path) -> None:
     """Nothing of what was measured before is still being written while the next is measured."""
     shutil.rmtree(folder)
     os.sync()

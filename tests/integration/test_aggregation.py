@@ -64,9 +64,9 @@ def test_accuracy_and_files(street: Path, two: Path, mrasfm: Run) -> None:
     assert document["seams"][0]["inliers"] >= 60
     assert document["seams"][0]["residual_after_px"] < document["seams"][0]["residual_before_px"]
     assert 0 < errors["metric"]["rmse_m"] < 0.1
-    settled = [turned_deg(street, k, two / "calibration" / f"drive_{k}.json") for k in range(2)]
+    adjusted = [turned_deg(street, k, two / "calibration" / f"drive_{k}.json") for k in range(2)]
     before = [turned_deg(street, k, street / "scenes" / f"drive_{k}" / "calibration.json") for k in range(2)]
-    assert 0 < np.median(settled) < np.median(before) < 0.3
+    assert 0 < np.median(adjusted) < np.median(before) < 0.3
 
 
 def turned_deg(street: Path, number: int, calibration: Path) -> list[float]:

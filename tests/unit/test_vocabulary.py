@@ -27,7 +27,7 @@ _OLD_NAMES = """
 """
 OLD_NAMES = frozenset(_OLD_NAMES.split())
 NO_BEGINNINGS = {"What", "Who", "Where", "Of", "Whether", "How", "Which", "Why"}
-OLD_BEGINNINGS = ("judge_", "settle_", "settled_")
+OLD_BEGINNINGS = ("judge_", "settle_", "settled_", "_settle", "_way")
 # Names of the list that the vocabulary gives to a room, by the room's section of the settings.
 ROOMS = {("mrasfm_engine/config.py", "matching")}
 

@@ -115,7 +115,7 @@ def test_none_leaves_everything_where_it_is(two: list[Driven], untouched: Adjust
 
 
 @pytest.mark.parametrize("which", ["overlap", "all"])
-def test_bent_scenes_settle_nearer_to_the_truth(two: list[Driven], untouched: AdjustedMap, which: str) -> None:
+def test_bent_scenes_come_nearer_to_the_truth(two: list[Driven], untouched: AdjustedMap, which: str) -> None:
     result = adjusted(two, which)
     before, after = mean_error_m(untouched, two), mean_error_m(result, two)
     assert 0.0005 < after < 0.7 * before
@@ -233,7 +233,7 @@ def camera_errors_deg(result: AdjustedMap, drives: Sequence[Driven]) -> np.ndarr
 
 
 @pytest.mark.parametrize("which", ["overlap", "all"])
-def test_calibrations_settle_as_far_as_scenes_left_them_uncertain(street: Street, folder: Path, which: str) -> None:
+def test_calibrations_move_as_far_as_scenes_left_them_uncertain(street: Street, folder: Path, which: str) -> None:
     """What short drives say of their cameras is wrong in each its own way; held, it would bend and scale the map."""
     drives = [
         drive_along(street, folder / f"{which}{k}", WAYS[k], cameras_off_deg=0.15, bias_m=BIAS_M[k], seed=20 + k)

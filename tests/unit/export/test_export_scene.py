@@ -462,7 +462,7 @@ def test_our_own_pictures_may_be_longer_than_camera_images() -> None:
         picture_files.png_of(picture[:0])
 
 
-def test_a_calibration_that_settled_in_a_map(scene: Scene) -> None:
+def test_a_calibration_that_was_adjusted_in_a_map(scene: Scene) -> None:
     document = calibration_document(scene)
     names = list(document["cameras"])
     poses = {name: refined.rig_from_cam.copy() for name, refined in zip(names, scene.calibration, strict=True)}
@@ -470,9 +470,9 @@ def test_a_calibration_that_settled_in_a_map(scene: Scene) -> None:
     assert document_in_map(document, found) == document
     turn = se3.exp_so3(np.radians([0.0, 0.3, 0.0]))
     poses[names[0]] = se3.transform(turn @ found[names[0]][:3, :3], found[names[0]][:3, 3] + [0.01, 0.0, 0.0])
-    settled = document_in_map(document, found | {names[0]: poses[names[0]]})
-    assert {name for name in names if settled["cameras"][name] != document["cameras"][name]} == {names[0]}
-    camera, before = settled["cameras"][names[0]], document["cameras"][names[0]]
+    adjusted = document_in_map(document, found | {names[0]: poses[names[0]]})
+    assert {name for name in names if adjusted["cameras"][name] != document["cameras"][name]} == {names[0]}
+    camera, before = adjusted["cameras"][names[0]], document["cameras"][names[0]]
     assert camera["since_scene"]["rotation_vector_deg"] == pytest.approx([0.0, 0.3, 0.0], abs=1e-9)
     assert camera["since_scene"]["translation_m"] == pytest.approx([0.01, 0.0, 0.0], abs=1e-12)
     new, given = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("refined", "given"))

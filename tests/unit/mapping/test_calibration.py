@@ -149,7 +149,7 @@ def test_points_without_an_angle_are_told_from_those_with_one() -> None:
     assert 0 < fewer.sum() < len(fewer)
 
 
-def test_the_scale_settles_where_the_terms_cost_least() -> None:
+def test_the_scale_comes_to_where_the_terms_cost_least() -> None:
     mapper = true_model(units=6)
     terms = [calibration_prior(mapper)]
     scale_with_baselines(mapper, 1.15)

@@ -24,7 +24,7 @@ from tests.helpers.simulated_drive import (
 )
 
 UNITS = 12
-SHADOW_M_PER_UNIT = 0.4  # of a shadow along the way, of the vehicle's 1.1
+SHADOW_M_PER_UNIT = 0.4  # of a shadow along the trajectory, of the vehicle's 1.1
 ON, OFF = (
     EngineConfig(threads=1).model_copy(
         update={"mapping": EngineConfig().mapping.model_copy(update={"semantic_triangulation": on})}
@@ -174,7 +174,7 @@ def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
     assert sum(describe(on, log)["road_points_dropped"]) == 0
     said = describe_refinement(on, refinement)["road"]
     assert said["source"] is None
-    assert "below the vehicle's way" in said["reason"]
+    assert "below the vehicle's trajectory" in said["reason"]
     assert "switched off" in describe_refinement(off, switched_off)["road"]["reason"]
 
 
