@@ -27,7 +27,7 @@ def seam_picture(
 
     Parameters
     ----------
-    points_m, ways_m
+    points_m, trajectories_m
         Points (n, 3) and units' positions (u, 3) of the two scenes, in one frame.
     side_m
         Of the square that is shown.

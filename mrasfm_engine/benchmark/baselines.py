@@ -87,7 +87,7 @@ def run_baseline(
     Parameters
     ----------
     database
-        As `export_scene` writes it: with the rig, and verified matches. Every frame must be a unit.
+        As `export.scene` writes it: with the rig, and verified matches. Every frame must be a unit.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """`features.db`: keypoints, descriptors and matches as a COLMAP database, enough to aggregate later without the images.
 
-Ids are those of the model (`export_colmap`), for all images of the drive, registered or not.
+Ids are those of the model (`export.colmap`), for all images of the drive, registered or not.
 """
 
 from __future__ import annotations

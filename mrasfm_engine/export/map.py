@@ -48,7 +48,7 @@ class MapContent:
 
 
 def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Write all files of a map into the folder `out`, as `export_scene.write_scene` does; what `report.json` says.
+    """Write all files of a map into the folder `out`, as `export.scene.write_scene` does; what `report.json` says.
 
     Raises
     ------

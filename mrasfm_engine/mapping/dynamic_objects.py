@@ -56,7 +56,7 @@ def find_moving_along(mapper: Mapper, pairs: Sequence[PairMatches]) -> MovingAlo
 
     Parameters
     ----------
-    model
+    mapper
         With poses; units without one take no part. Where the vehicle hardly moves nothing is said.
     pairs
         Verified matches.

@@ -35,7 +35,7 @@ class GnssAlignment:
     world_from_model: Floats  # (4, 4), rigid
     inlier: Bools  # (n,)
     residual_m: Floats  # (n,) distance after the similarity fit
-    scale: float  # by which the model would have to be multiplied to fit the receiver best: reported, not applied
+    scale: float  # by which the reconstruction would have to be multiplied to fit the receiver best: reported, not applied
     sigma_scale: float  # its standard deviation, from independent positions with the noise that was seen
     noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
 
@@ -50,14 +50,14 @@ def align_with_gnss(
     outlier_sigmas: float,
     rng: np.random.Generator,
 ) -> GnssAlignment | str:
-    """Rigid transform from the model's frame to the receiver's.
+    """Rigid transform from the reconstruction's frame to the receiver's.
 
     Parameters
     ----------
     antenna_m
-        Positions (n, 3) of the antenna in the model, lever arm applied.
+        Positions (n, 3) of the antenna in the reconstruction, lever arm applied.
     up, forward
-        The vehicle's up and forward directions (n, 3) in the model.
+        The vehicle's up and forward directions (n, 3) in the reconstruction.
     measured_m, sigma_m
         Positions and sigmas (n, 3) of the receiver, x east, y north, z up.
     outlier_sigmas

@@ -183,7 +183,7 @@ def _registered_anew(
 
 
 def _with_tracks_of(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
-    """The model's poses and calibration with tracks from other matches, and points from these."""
+    """The mapper's poses and calibration with tracks from other matches, and points from these."""
     result = Mapper(mapper.drive, mapper.keypoints, build_tracks(mapper.keypoints, pairs), mapper.config)
     result.state = replace(mapper.state, points_m=result.state.points_m)
     result.registered, result.missing, result.motion = mapper.registered, mapper.missing, mapper.motion

@@ -238,7 +238,7 @@ def _matches_between(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: in
 
 
 def _evaluate(mapper: Mapper, u: int, v: int, anchor: Floats, pose: Floats) -> int:
-    """Points of the two units after adjusting the second; the model is left in that state."""
+    """Points of the two units after adjusting the second; the mapper is left in that state."""
     mapper.clear()
     mapper.set_pose(u, anchor)
     mapper.set_pose(v, pose)

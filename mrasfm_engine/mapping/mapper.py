@@ -42,16 +42,16 @@ class Mapper:
     registered
         (units,) which units have a pose.
     keyframe
-        (units,) which units mapping uses, see `registration.keyframes`.
-    solved
+        (units,) which units mapping uses, see `mapping.keyframes`.
+    triangulated
         (tracks,) which tracks have a point.
-    kept
+    is_inlier
         (keypoints,) which keypoints are observations of their track's point.
     missing
         (images,) images without a pose although their unit has one: only where images are registered one by one.
     motion
         Where the rig is at the images' own times, and poses that images have apart from it.
-    barred
+    rejected
         (tracks,) which tracks were dropped for what they show: they get no point until all are tried again.
     track_class
         (tracks,) the class of most keypoints of a track, as `semantics.CLASS_CODES` numbers them.
@@ -254,14 +254,14 @@ class Mapper:
         self.filter(self.triangulator.max_error_px)
 
     def drop(self, tracks: Ints) -> None:
-        """Take the points of tracks away and bar them until `complete` or `readmit`."""
+        """Take the points of tracks away and reject them until `complete` or `readmit`."""
         self.triangulated[tracks] = False
         self.rejected[tracks] = True
         rows = np.flatnonzero(self.is_inlier)
         self.is_inlier[rows[self.rejected[self.tracks.of_keypoint[rows]]]] = False
 
     def readmit(self) -> None:
-        """Triangulate barred tracks again: poses have changed since."""
+        """Triangulate rejected tracks again: poses have changed since."""
         tracks = np.flatnonzero(self.rejected)
         self.rejected[:] = False
         self.triangulate(tracks)
@@ -286,7 +286,7 @@ class Mapper:
         return int(bad.sum()), int(lost.sum())
 
     def observation_rows(self, tracks: Ints | None = None) -> Ints:
-        """Keypoints that are observations (of the given solved tracks, ascending), sorted by track."""
+        """Keypoints that are observations (of the given triangulated tracks, ascending), sorted by track."""
         if tracks is not None:
             return inlier_members(self.tracks, tracks, self.is_inlier)
         members = self.tracks.keypoints

@@ -1,4 +1,4 @@
-"""Moving the model to where the receiver, or rough poses, say that it is."""
+"""Moving the reconstruction to where the receiver, or rough poses, say that it is."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
 @dataclass(kw_only=True)
 class Placement:
-    """Fit of the model to the receiver's positions; without a prior it does not fit, and the reason says why."""
+    """Fit of the reconstruction to the receiver's positions; without a prior it does not fit, and the reason says why."""
 
     prior: PositionPrior | None = None
     reason: str = ""
@@ -37,9 +37,9 @@ class Placement:
 
 
 def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Placement:
-    """Move the model into the receiver's frame, and make its positions a prior for the adjustment.
+    """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
-    The model keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
+    The reconstruction keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
     """
     settings, times = mapper.config.gnss, mapper.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
@@ -85,7 +85,7 @@ def _align(
 
 
 def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
-    """Move the model into the frame of the rough poses (units, 4, 4; NaN where unknown), by the units' own rotations.
+    """Move the reconstruction into the frame of the rough poses (units, 4, 4; NaN where unknown), by the units' own rotations.
 
     One camera also gets its scale there. Returns whether there were poses enough.
     """

@@ -39,7 +39,7 @@ def adjust_poses(
     )
     solution, report = solve_with_chosen_points(problem, mapper.image_size_px, an_image=an_image, cancel=cancel)
     if cancel is not None and cancel():
-        raise CancelledError  # else a half-solved model would pass for a finished one
+        raise CancelledError  # else a half-solved reconstruction would pass for a finished one
     points = mapper.state.points_m
     points[tracks] = solution.points_m
     mapper.state = replace(solution, points_m=points)

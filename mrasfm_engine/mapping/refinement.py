@@ -1,4 +1,4 @@
-"""From the grown model to the scene: georeferencing, the final camera set bundle adjustments, and their certainty."""
+"""From the grown reconstruction to the scene: georeferencing, the last camera set bundle adjustments, uncertainty."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def refine(
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> Refinement:
-    """Georeference the model where positions allow, adjust everything with all priors, and estimate the uncertainty.
+    """Georeference the reconstruction where positions allow, adjust everything with all priors, and estimate the uncertainty.
 
     Parameters
     ----------

@@ -32,14 +32,14 @@ def resect(
     view_kind: Ints,
     view_params: Floats,
 ) -> Floats | None:
-    """The pose (4, 4) of a rig near an expected one (4, 4) that fits what its eyes see; None where there is none.
+    """The pose (4, 4) of a rig near an expected one (4, 4) that fits its observations; None where there is none.
 
     Parameters
     ----------
-    xy_px, points_m, eye
-        Image points (n, 2), the scene's points (n, 3) that they show, and which eye (n,) sees each.
-    rig_from_eye, eye_kind, eye_params
-        Poses (e, 4, 4) of the eyes, and their cameras as `pack_cameras` has them.
+    xy_px, points_m, view
+        Image points (n, 2), the scene's points (n, 3) that they show, and the view (n,) that observes each.
+    rig_from_view, view_kind, view_params
+        Poses (v, 4, 4) of the views, and their cameras as `pack_cameras` has them.
     """
     rotation, position = world_from_rig[:3, :3].copy(), world_from_rig[:3, 3].copy()
     views = np.ascontiguousarray(rig_from_view[:, :3, :3]), np.ascontiguousarray(rig_from_view[:, :3, 3])

@@ -36,7 +36,7 @@ class RigMotion:
 
     Parameters
     ----------
-    row bands
+    bands
         When every image (or band of its rows) was taken.
     timestamps_us
         The units' times (u,).

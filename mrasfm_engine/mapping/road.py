@@ -50,11 +50,11 @@ class RoadAssessment:
 
 
 def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
-    """Fit the road's surface to the model's points and judge each that is taken for the road's; else why not.
+    """Fit the road's surface to the mapper's points and judge each that is taken for the road's; else why not.
 
     Parameters
     ----------
-    final
+    for_map
         Whether the points are for the map. Before, only those are off that are by their own uncertainty.
     """
     config = mapper.config.mapping

@@ -1,4 +1,4 @@
-"""The finished scene from the refined model."""
+"""The finished scene from the refined reconstruction."""
 
 from __future__ import annotations
 

@@ -63,15 +63,15 @@ class Database:
     def write(self, *, durable: bool = True) -> Iterator[Session]:
         """One transaction: committed where the block ends, rolled back where it raises.
 
+        In SQLite writers take turns from the start: a transaction that reads first and wants to write later would
+        otherwise fail, at once, when another has written in between.
+
         Parameters
         ----------
         durable
             Whether SQLite waits for the disk. If not, the transaction survives a crash of any process, but a power
             cut only once the next durable one has been committed. PostgreSQL always waits: when its server crashes,
             it loses what it did not wait for.
-
-        In SQLite writers take turns from the start: a transaction that reads first and wants to write later would
-        otherwise fail, at once, when another has written in between.
         """
         with self._sessions.begin() as session:
             if self.engine.dialect.name == "sqlite":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
@@ -77,6 +78,54 @@ def test_docstrings_begin_with_what_they_describe(package: str) -> None:
         if (docstring := ast.get_docstring(node)) and docstring.split()[0] in NO_BEGINNINGS
     ]
     assert found == []
+
+
+_NAMES_SECTION = re.compile(r"^(Parameters|Attributes)\n-+\n(.*?)(?=\n\n\w+\n-{3,}|\Z)", re.DOTALL | re.MULTILINE)
+
+
+def _documented(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> Iterator[str]:
+    for section in _NAMES_SECTION.finditer(ast.get_docstring(node) or ""):
+        for line in section[2].splitlines():
+            if line and not line.startswith(" "):
+                yield from (name.strip().lstrip("*") for name in line.split(","))
+
+
+def _arguments(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+    given = function.args
+    named = (*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg)
+    return {argument.arg for argument in named if argument is not None}
+
+
+def _members(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> set[str]:
+    """Fields, properties, attributes set on `self` and arguments of the class and its bases."""
+    found: set[str] = set()
+    for part in ast.walk(node):
+        if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name):
+            found.add(part.target.id)
+        elif isinstance(part, ast.Attribute) and isinstance(part.value, ast.Name) and part.value.id == "self":
+            found.add(part.attr)
+        elif isinstance(part, ast.FunctionDef):
+            found |= {part.name} | (_arguments(part) if part.name == "__init__" else set())
+    for base in node.bases:
+        name = base.value if isinstance(base, ast.Subscript) else base
+        if isinstance(name, ast.Name) and name.id in classes and name.id != node.name:
+            found |= _members(classes[name.id], classes)
+    return found
+
+
+def test_documented_arguments_and_attributes_exist() -> None:
+    classes = {n.name: n for tree in _trees().values() for n in ast.walk(tree) if isinstance(n, ast.ClassDef)}
+    unknown = []
+    for path, tree in _trees().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                known = _arguments(node)
+            elif isinstance(node, ast.ClassDef):
+                known = _members(node, classes)
+            else:
+                continue
+            unknown += [f"{path}: {node.name}: {name}" for name in _documented(node) if name not in known]
+    assert unknown == []
 
 
 def _module_of(path: str) -> str:

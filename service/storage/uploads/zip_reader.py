@@ -46,7 +46,7 @@ class ZipReader:
 
     Attributes
     ----------
-    entries : list of (str, zipfile.ZipInfo)
+    entries
         All files with their safe names in the order of their bytes; folders are left out.
 
     Raises
