@@ -35,7 +35,7 @@ class GnssAlignment:
     world_from_model: Floats  # (4, 4), rigid
     inlier: Bools  # (n,)
     residual_m: Floats  # (n,) distance after the similarity fit
-    scale: float  # by which the reconstruction would have to be multiplied to fit the receiver best: reported, not applied
+    scale: float  # factor on the reconstruction that fits the receiver best: reported, not applied
     sigma_scale: float  # its standard deviation, from independent positions with the noise that was seen
     noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
 

@@ -27,7 +27,7 @@ SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
 @dataclass(kw_only=True)
 class Placement:
-    """Fit of the reconstruction to the receiver's positions; without a prior it does not fit, and the reason says why."""
+    """Fit of the reconstruction to the receiver's positions; without a prior it does not fit, for the reason given."""
 
     prior: PositionPrior | None = None
     reason: str = ""
@@ -85,7 +85,7 @@ def _align(
 
 
 def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
-    """Move the reconstruction into the frame of the rough poses (units, 4, 4; NaN where unknown), by the units' own rotations.
+    """Move the reconstruction into the frame of the rough poses (units, 4, 4; NaN where unknown), by rotations too.
 
     One camera also gets its scale there. Returns whether there were poses enough.
     """

@@ -80,7 +80,7 @@ def refine(
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> Refinement:
-    """Georeference the reconstruction where positions allow, adjust everything with all priors, and estimate the uncertainty.
+    """Georeference where positions allow, adjust everything with all priors, and estimate the uncertainty.
 
     Parameters
     ----------
