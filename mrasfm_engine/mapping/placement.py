@@ -87,8 +87,8 @@ def _align(
 def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float) -> bool:
     """Move the reconstruction into the frame of the rough poses (units, 4, 4; NaN where unknown).
 
-    The units' rotations determine by how much it turns, their positions where it comes to lie; a single camera also gets
-    its scale from them. Returns whether there were enough poses.
+    The units' rotations determine by how much it turns, their positions where it comes to lie; a single camera gets its
+    scale from them, too. Returns whether there were enough poses.
     """
     units = np.flatnonzero(mapper.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
     if len(units) < MIN_ROUGH_POSES:
