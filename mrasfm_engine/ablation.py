@@ -40,7 +40,7 @@ class Switch:
 
     @property
     def name(self) -> str:
-        """As in a settings file."""
+        """Name as in a settings file."""
         return f"{self.section}.{self.field}"
 
     def turned_off(self, config: EngineConfig) -> EngineConfig:

@@ -1,4 +1,4 @@
-"""From a recorded drive to a scene on disk."""
+"""The reconstruction: a recorded drive becomes a scene on disk."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class LoadedModel:
     network: Network
 
     def describe(self) -> dict[str, Any]:
-        """For the report: which file ran, under which licence, on what."""
+        """Entry of the report: which file ran, under which licence, on what."""
         return {
             "name": self.installed.name,
             "sha256": self.installed.sha256,

@@ -145,7 +145,7 @@ def prior(run: Run) -> PriorTrajectory:
 
 
 def probe(run: Run) -> None:
-    """On the first units: is the calibration the right way round?"""
+    """Check on the first units that the calibration is the right way round."""
     images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
     known = run.store.has("features", run.next_key(Stage.FEATURES, run.feature_settings))
     if len(run.drive.cameras) < 2 or known:

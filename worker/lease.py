@@ -36,13 +36,13 @@ class _Repeated(bootsteps.StartStopStep):
         raise NotImplementedError
 
     def start(self, consumer: Any) -> None:
-        """With every connection to the broker."""
+        """Start repeating, with every connection to the broker."""
         self.do(consumer)
         every_s = consumer.app.mrasfm_settings.visibility_renew_seconds
         self._timer = consumer.timer.call_repeatedly(every_s, self.do, (consumer,))
 
     def stop(self, consumer: Any) -> None:
-        """When the connection is lost or the worker stops."""
+        """Stop repeating, when the connection is lost or the worker stops."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -32,7 +32,7 @@ _BATCH = 500
 
 
 class Reconciler:
-    """Any number may run at the same time: all that one does is conditional on what the database says."""
+    """Reconciler, of which any number may run at the same time: its changes are conditional on the database."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -44,7 +44,7 @@ class Reconciler:
         self._limits = jobs.RetryLimits.from_settings(settings)
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the connections to the database."""
         self._database.close()
 
     def run(self, ended: threading.Event) -> None:

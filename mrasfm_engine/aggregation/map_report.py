@@ -88,7 +88,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
 
 
 def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
-    """Everything that is written."""
+    """Content of the map's folder."""
     reference = result.scenes[result.association.reference]
     scene = map_scene(result.assembly, result.adjusted.model, reference)
     by_name = {s.name: s for s in result.scenes}

@@ -55,7 +55,7 @@ def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Sc
 
 
 def _joined_drive(assembly: Assembly) -> Drive:
-    """Not validated: frames of different drives need not be in order of time."""
+    """The drive of several, not validated: frames of different drives need not be in order of time."""
     cameras: list[Camera] = []
     frames: list[Frame] = []
     for scene in assembly.scenes:

@@ -1,4 +1,4 @@
-"""From scenes on disk to a map on disk."""
+"""The aggregation: scenes on disk become a map on disk."""
 
 from __future__ import annotations
 

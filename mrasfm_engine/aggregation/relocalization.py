@@ -32,7 +32,7 @@ TRIALS = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sightings:
+class Matches2D3D:
     """Observations of scene a's points in images of scene b."""
 
     unit: Ints  # (n,) of b
@@ -40,9 +40,9 @@ class Sightings:
     xy_px: Floats  # (n, 2)
     points_m: Floats  # (n, 3) in a's frame
 
-    def select(self, rows: Ints | Bools) -> Sightings:
-        """Some of them."""
-        return Sightings(
+    def select(self, rows: Ints | Bools) -> Matches2D3D:
+        """Select some of them."""
+        return Matches2D3D(
             unit=self.unit[rows], image=self.image[rows], xy_px=self.xy_px[rows], points_m=self.points_m[rows]
         )
 
@@ -59,12 +59,12 @@ class Relocalization:
     inliers: int  # image points that fit
 
 
-def sightings(a: SourceScene, b: SourceScene, keypoints_a: Ints, keypoints_b: Ints, image_of_b: Ints) -> Sightings:
+def matches_2d3d(a: SourceScene, b: SourceScene, keypoints_a: Ints, keypoints_b: Ints, image_of_b: Ints) -> Matches2D3D:
     """Matches (n,) of keypoints as image points of b and points of a, each pair of these once."""
     pairs = np.column_stack([keypoints_b, a.keypoint_point[keypoints_a]])
     _, first = np.unique(pairs, axis=0, return_index=True)
     image = image_of_b[keypoints_b[first]]
-    return Sightings(
+    return Matches2D3D(
         unit=b.image_unit[image],
         image=image,
         xy_px=b.keypoint_xy_px[keypoints_b[first]].astype(np.float64),
@@ -83,14 +83,14 @@ class Relocaliser:
         ]
         self._b_from_cam = b.world_from_cam
 
-    def errors_focal(self, a_from_b: Floats, seen: Sightings) -> Floats:
+    def errors_focal(self, a_from_b: Floats, seen: Matches2D3D) -> Floats:
         """Reprojection errors (n,) in focal lengths if b lies so in a; infinite behind a camera."""
         cam_from_a = se3.inverse(a_from_b @ self._b_from_cam[seen.image])
         points = np.einsum("nij,nj->ni", cam_from_a[:, :3, :3], seen.points_m) + cam_from_a[:, :3, 3]
         camera = self._b.image_camera[seen.image]
         return reprojection_errors_focal(self._kind, self._params, camera, points, seen.xy_px)
 
-    def hypothesis(self, unit: int, seen: Sightings) -> Floats | None:
+    def hypothesis(self, unit: int, seen: Matches2D3D) -> Floats | None:
         """Transform a_from_b (4, 4) by one unit alone."""
         own = seen.select(seen.unit == unit)
         if len(own.unit) < self._config.min_unit_inliers:
@@ -102,7 +102,7 @@ class Relocaliser:
         refined = self.refined(a_from_b, own)
         return a_from_b if refined is None else refined
 
-    def _unit_pose(self, unit: int, own: Sightings) -> Floats | None:
+    def _unit_pose(self, unit: int, own: Matches2D3D) -> Floats | None:
         """a_from_rig of a unit."""
         images, eye = np.unique(own.image, return_inverse=True)
         rig_from_eye = se3.inverse(self._b.world_from_rig[unit]) @ self._b_from_cam[images]
@@ -131,7 +131,7 @@ class Relocaliser:
         eye_from_a = se3.transform(pose.rotation.matrix(), pose.translation)
         return se3.inverse(eye_from_a) @ eye_from_rig
 
-    def refined(self, a_from_b: Floats, seen: Sightings) -> Floats | None:
+    def refined(self, a_from_b: Floats, seen: Matches2D3D) -> Floats | None:
         """The transform near a given one that fits best what all units see, b being one rig with an eye an image."""
         images, eye = np.unique(seen.image, return_inverse=True)
         camera = self._b.image_camera[images]
@@ -145,7 +145,7 @@ class Relocaliser:
             self._params[camera],
         )
 
-    def agreeing(self, a_from_b: Floats, seen: Sightings) -> tuple[Ints, Bools]:
+    def agreeing(self, a_from_b: Floats, seen: Matches2D3D) -> tuple[Ints, Bools]:
         """Units that agree with a transform, and which image points (n,) fit."""
         fits = self.errors_focal(a_from_b, seen) < MAX_ERROR_FOCAL
         units, index = np.unique(seen.unit, return_inverse=True)
@@ -153,7 +153,7 @@ class Relocaliser:
         good = (inliers >= self._config.min_unit_inliers) & (inliers >= MIN_SHARE * counts)
         return units[good], fits
 
-    def relocalise(self, seen: Sightings) -> Relocalization:
+    def relocalise(self, seen: Matches2D3D) -> Relocalization:
         """Find the transform a_from_b on which the units that observe points of a agree."""
         units, counts = np.unique(seen.unit, return_counts=True)
         asked = units[counts >= self._config.min_unit_inliers]
@@ -169,7 +169,7 @@ class Relocaliser:
         best = max(proposals, key=lambda p: (len(p[1]), p[2]))
         return self._judged(best, self._rivals(best, proposals, asked, seen), asked)
 
-    def _with_all_units(self, a_from_b: Floats, seen: Sightings) -> tuple[Floats, Ints, int]:
+    def _with_all_units(self, a_from_b: Floats, seen: Matches2D3D) -> tuple[Floats, Ints, int]:
         """A transform refined by all units that agree with it, these, and how many image points of theirs fit."""
         for _ in range(2):
             agreeing, fits = self.agreeing(a_from_b, seen)
@@ -185,9 +185,9 @@ class Relocaliser:
         best: tuple[Floats, Ints, int],
         proposals: Sequence[tuple[Floats, Ints, int]],
         asked: Ints,
-        seen: Sightings,
+        seen: Matches2D3D,
     ) -> int:
-        """For how many units the best other place is nearly as good."""
+        """Number of units for which the best other place is nearly as good."""
         a_from_b, agreeing, _ = best
         _, fits = self.agreeing(a_from_b, seen)
         rest = seen.select(~fits)
@@ -204,7 +204,7 @@ class Relocaliser:
             most = max(most, sum(counts[u] >= needed[u] for u in at_best))
         return most
 
-    def _best_unit_alone(self, seen: Sightings, unit: int, asked: int) -> Relocalization:
+    def _best_unit_alone(self, seen: Matches2D3D, unit: int, asked: int) -> Relocalization:
         """The one unit that sees most decides, as in the paper."""
         a_from_b = self.hypothesis(unit, seen)
         if a_from_b is None:

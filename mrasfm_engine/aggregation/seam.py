@@ -10,7 +10,7 @@ import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.pairs import guided_pairs, probes
-from mrasfm_engine.aggregation.relocalization import Relocaliser, Relocalization, Sightings, sightings
+from mrasfm_engine.aggregation.relocalization import Matches2D3D, Relocaliser, Relocalization, matches_2d3d
 from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
 from mrasfm_engine.aggregation.seam_refinement import (
     RefinedSeam,
@@ -53,7 +53,7 @@ class Seam:
     quality: dict[str, Any] = field(default_factory=dict)
 
     def pack(self) -> tuple[Arrays, dict[str, Any]]:
-        """As a finished stage keeps it; names are not part of it."""
+        """Arrays and report for a finished stage; names are not part of them."""
         arrays = {
             name: getattr(self, name)
             for name in ("coarse_a_from_b", "a_from_b", "covariance", "shared", "units_a", "units_b", "place_b_m")
@@ -130,7 +130,7 @@ def _relocalise(
         parts += cross.match(pairs, verified=True, cancel=cancel)
         progress(min(start + BATCH_UNITS, len(order)), len(order))
         matches = CrossMatches.joined(parts)
-        seen: Sightings = sightings(a, b, matches.a, matches.b, image_of_b)
+        seen: Matches2D3D = matches_2d3d(a, b, matches.a, matches.b, image_of_b)
         found = relocaliser.relocalise(seen)
         if found.a_from_b is not None and len(found.units_agreeing) >= ENOUGH_AGREEING and not found.runner_up:
             return found, start + len(batch)

@@ -139,7 +139,7 @@ class SourceScene:
         }
 
     def pack(self) -> tuple[Arrays, dict[str, Any]]:
-        """As a finished stage keeps it; see `unpack`."""
+        """Arrays and report for a finished stage; see `unpack`."""
         return {name: getattr(self, name) for name in ARRAYS}, self._documents()
 
     @staticmethod

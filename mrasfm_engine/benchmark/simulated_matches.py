@@ -190,7 +190,7 @@ def _near_epipolar_lines(
     b_from_a: Floats, a: _View, b: _View, rows: Ints, count: int, true_partner: Ints, config: EngineConfig,
     rng: np.random.Generator,
 ) -> tuple[Ints, Ints]:  # fmt: skip
-    """Up to `count` of some rows of one view, and for each any row of the other that is not its `true_partner` and that
+    """A sample of at most `count` rows of one view, and for each any row of the other that is not its `true_partner` and that
     verification would take for it."""
     rotation, translation_m = b_from_a[:3, :3].copy(), b_from_a[:3, 3].copy()
     essential = se3.skew(translation_m) @ rotation

@@ -89,7 +89,7 @@ class Elimination:
 
 
 def _minimum_degree(n: int, row: Ints, column: Ints) -> Ints:
-    """When to eliminate each column (n,); SuperLU is asked by factorising a matrix with these places."""
+    """Order in which each column (n,) is eliminated; SuperLU is asked by factorising a matrix with these places."""
     below = row != column
     ones = np.ones(int(below.sum()))
     lower = scipy.sparse.csc_matrix((ones, (row[below], column[below])), shape=(n, n))

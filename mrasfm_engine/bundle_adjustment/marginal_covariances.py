@@ -61,7 +61,7 @@ class _Marginals:
 
 
 def _regular_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals | None:
-    """By eliminating units and cameras; None where something besides single unknowns is not determined."""
+    """Marginals by eliminating units and cameras; None where something besides single unknowns is not determined."""
     layout = system.layout
     split = UNIT_DOF * layout.num_units
     unseen = ~(system.matrix_diagonal() > 0.0)
@@ -85,7 +85,7 @@ def _regular_marginals(system: ReducedCameraSystem, position: Floats) -> _Margin
 
 
 def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:
-    """By the inverse without its null space."""
+    """Marginals by the inverse without its null space."""
     layout = system.layout
     size, split = layout.size, UNIT_DOF * layout.num_units
     if size > LARGEST_DENSE:

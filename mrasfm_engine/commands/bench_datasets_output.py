@@ -21,7 +21,7 @@ class KittiOutput:
     results: Sequence[SceneResult]
 
     def document(self) -> Document:
-        """As JSON has it."""
+        """Document for JSON."""
         return {
             "sequences": [
                 {**_scene(result), "published": asdict(KITTI[result.name]) if result.name in KITTI else None}
@@ -66,7 +66,7 @@ class NuScenesOutput:
     results: Sequence[SceneResult]
 
     def document(self) -> Document:
-        """As JSON has it."""
+        """Document for JSON."""
         scenes = []
         for result in self.results:
             document = _scene(result)

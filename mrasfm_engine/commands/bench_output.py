@@ -33,7 +33,7 @@ class DriveOutput:
     comparison: Comparison
 
     def document(self) -> Document:
-        """As JSON has it."""
+        """Document for JSON."""
         return comparison_document(self.comparison)
 
     def print(self) -> None:
@@ -60,7 +60,7 @@ class GrowthOutput:
     routes: Sequence[Growth]
 
     def document(self) -> Document:
-        """As JSON has it."""
+        """Document for JSON."""
         return {
             "routes": [
                 {

@@ -17,7 +17,7 @@ OBSERVED, ONLY_PRIOR = "observed", "only the prior"
 
 
 def calibration_document(scene: Scene) -> dict[str, Any]:
-    """By camera: `given`, `refined`, `difference` (about and along the rig's axes), `sigma` and `observed`.
+    """The calibration by camera: `given`, `refined`, `difference` about and along the rig's axes, sigma, verdict.
 
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
     A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.

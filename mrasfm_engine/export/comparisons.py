@@ -53,7 +53,7 @@ Rows = Iterator[Row]
 
 
 def nothing(document: object) -> Rows:
-    """Nothing to compare: that the file can be read is all."""
+    """No rows: it is enough that the file can be read."""
     yield from ()
 
 

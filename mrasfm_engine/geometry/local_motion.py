@@ -18,7 +18,7 @@ MAX_TURN_ACCELERATION_RADPS2 = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class LocalMotion:
-    """For each unit, rates in its own frame: at `offset` seconds t from its timestamp it is
+    """Rates of each unit in its own frame: at `offset` seconds t from its timestamp it is
 
         turned by exp(velocity t + bend t^2),        moved by velocity t + bend t^2
 

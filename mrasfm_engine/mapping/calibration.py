@@ -37,7 +37,7 @@ def calibration_prior(mapper: Mapper, held: Bools | None = None) -> CalibrationP
 
 
 def heading_change_deg(mapper: Mapper) -> float:
-    """By how much the registered units' forward directions spread, degrees."""
+    """Spread of the registered units' forward directions, degrees."""
     forward = mapper.state.unit_rotation[mapper.registered][:, :, 0]
     mean = forward.mean(0) / max(float(np.linalg.norm(forward.mean(0))), 1e-9)
     angles = np.degrees(np.arccos(np.clip(forward @ mean, -1, 1)))
@@ -94,7 +94,7 @@ def assess_calibration(
 
 
 def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
-    """By which factor the baselines would have to grow to be as given, and its standard deviation by their prior."""
+    """Factor by which the baselines would have to grow to be as given, and its standard deviation by their prior."""
     prior = calibration_prior(mapper)
     given = prior.position_m - prior.position_m.mean(0)
     current = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)

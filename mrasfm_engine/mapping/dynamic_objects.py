@@ -149,7 +149,7 @@ def _vote(a: Any, b: Any, least_px: Any, moved_px: Any, along: Any, seen: Any, m
 
 
 def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats, kind: int, params: Floats) -> Floats:
-    """By how much points (n,) of a standing world move at least from image a to image b, at whatever depth they are.
+    """Least motion of points (n,) of a static world from image a to image b, at whatever depth they are.
 
     `up` (3,) is the rig's up direction in camera axes: it bounds the depth of rays that point down. Infinite where a
     point of the world could not be in front of camera b.

@@ -128,7 +128,7 @@ def _why_not(
 
 
 def clock_offset(antenna_m: Floats, measured_m: Floats, sigma_m: Floats, times_us: Ints) -> tuple[float, float] | None:
-    """By how many seconds measured positions are ahead of aligned ones (n, 3), and the standard deviation of that.
+    """Seconds by which measured positions are ahead of aligned ones (n, 3), and the standard deviation of that.
 
     A clock that is off moves every position along the track by speed times offset. Where the speed or the direction
     changes, this cannot be mistaken for a shift or a turn of the whole track; else the standard deviation is large.

@@ -104,7 +104,7 @@ def _plausible(revisit: Revisit, mapper: Mapper, travelled_m: float) -> bool:
 
 
 def _supported(revisits: Sequence[Revisit], mapper: Mapper) -> list[Revisit]:
-    """Those that several neighbours, themselves among them, agree with: they report the same drift."""
+    """The revisits that several neighbours, themselves among them, agree with: they report the same drift."""
     if not revisits:
         return []
     units = np.array([(r.earlier, r.later) for r in revisits])

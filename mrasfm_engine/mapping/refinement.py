@@ -1,4 +1,4 @@
-"""From the grown reconstruction to the scene: georeferencing, the last camera set bundle adjustments, uncertainty."""
+"""Refinement of the grown reconstruction: georeferencing, the last camera set bundle adjustments, uncertainty."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Correspondences2D3D:
     band: Ints  # (n,)
 
     def select(self, rows: Ints) -> Correspondences2D3D:
-        """Some of them."""
+        """Select some of them."""
         return Correspondences2D3D(
             xy_px=self.xy_px[rows], points_m=self.points_m[rows], camera=self.camera[rows], band=self.band[rows]
         )

@@ -1,4 +1,4 @@
-"""Is `rig_from_cam` given as its inverse? Found on the first units, before the long work."""
+"""Check on the first units, before the long work, that `rig_from_cam` is not given as its inverse."""
 
 from __future__ import annotations
 

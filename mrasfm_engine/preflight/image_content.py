@@ -160,7 +160,7 @@ def _moments(drive: Drive, units: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _spread(items: Sequence[Item], count: int) -> list[Item]:
-    """At most so many of the items, from the first to the last."""
+    """A given number of the items at most, from the first to the last."""
     if len(items) <= count:
         return list(items)
     return [items[int(k)] for k in np.unique(np.linspace(0, len(items) - 1, count).round())]

@@ -1,4 +1,4 @@
-"""From a scene and a camera pose to an image, its semantic mask and its depth."""
+"""Renderer: image, semantic mask and depth of a scene from a camera pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From light on a sensor to eight bits."""
+"""Sensor model: light becomes eight bits."""
 
 from __future__ import annotations
 

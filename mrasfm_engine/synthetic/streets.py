@@ -30,7 +30,7 @@ class Street:
 
     @property
     def length_m(self) -> float:
-        """From the first point to the last, and back to the first if closed."""
+        """Length from the first point to the last, and back to the first if closed."""
         return float(self._s[-1])
 
     @cached_property

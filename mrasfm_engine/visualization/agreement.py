@@ -95,7 +95,7 @@ class _Block:
 
 
 def _gray(mosaic: Mosaic) -> list[list[Floats32]]:
-    """By calibration and layer."""
+    """Grey pictures by calibration and layer."""
     sigma = SMOOTHING_M / mosaic.grid.cell_m
     return [
         [

@@ -1,4 +1,4 @@
-"""By how much images and cameras are brighter than one another, from what they show of the same points and ground."""
+"""Exposure of images and cameras relative to one another, from what they show of the same points and ground."""
 
 from __future__ import annotations
 

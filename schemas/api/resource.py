@@ -99,7 +99,7 @@ class Finding(Resource):
 
 
 class Times(Resource):
-    """When a resource came and when it goes."""
+    """Times at which a resource came and goes."""
 
     created_at: datetime = Field(description="in UTC, as all times")
     expires_at: datetime | None = Field(None, description="when it will be deleted; null: never by itself")

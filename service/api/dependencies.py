@@ -156,7 +156,7 @@ def answer(status: int, body: BaseModel, *, waiting: tuple[Job, ...] = (), **hea
 
 
 def expiry_us(created_us: int, days: float | None) -> int | None:
-    """When a resource is deleted; None: never by itself."""
+    """Time at which a resource is deleted; None: never by itself."""
     return None if days is None else created_us + int(days * 86400e6)
 
 

@@ -75,7 +75,7 @@ def openapi_page(app: FastAPI) -> dict[str, Any]:
 
 
 def _restore_examples(schemas: dict[str, Any]) -> None:
-    """On the way FastAPI drops from examples what is null, and pydantic sorts their fields."""
+    """Restore examples: FastAPI drops what is null from them, and pydantic sorts their fields."""
     models: list[type[BaseModel]] = [DriveManifest, Problem, *_models(RequestBody), *_models(Resource)]
     for model in models:
         schema = schemas.get(re.sub("[^A-Za-z0-9_]", "_", model.__name__))

@@ -122,7 +122,7 @@ class Client:
         self._transport.closing.wait(seconds)
 
     def retry_budget(self) -> RetryBudget:
-        """For a series of tries of one thing."""
+        """Budget of a series of tries of one thing."""
         return self._transport.retry_budget()
 
     def status(self) -> ServiceStatus:

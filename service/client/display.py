@@ -49,7 +49,7 @@ class Display:
         self._shown.end()
 
     def report(self, stage: str, done_bytes: int, total_bytes: int) -> None:
-        """So many bytes of a stage are done."""
+        """Show how many bytes of a stage are done."""
         if total_bytes > 0:
             self._shown.bytes_done(stage, done_bytes, total_bytes)
 
@@ -71,7 +71,7 @@ class _Bars:
         self._tasks: dict[str, TaskID] = {}
 
     def begin(self) -> None:
-        """Nothing is shown before there is something."""
+        """Show nothing before there is something."""
 
     def end(self) -> None:
         with self._lock:

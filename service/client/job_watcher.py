@@ -77,7 +77,7 @@ class _Listener:
         tell(known)
 
     def listen(self, job_id: str) -> None:
-        """Until the job, or the connection, ends."""
+        """Listen until the job, or the connection, ends."""
         heard = False
         for event in self._client.events(job_id, after=self._last_id):
             heard = True

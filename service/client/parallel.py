@@ -16,7 +16,7 @@ _GRACE_S = 1.0
 
 
 def no_report(stage: str, done_bytes: int, total_bytes: int) -> None:
-    """For callers who want no progress."""
+    """Report nothing, for callers who want no progress."""
 
 
 class Meter:

@@ -129,7 +129,7 @@ class Transport:
         self._http.close()
 
     def retry_budget(self) -> RetryBudget:
-        """For a series of tries of one thing."""
+        """Budget of a series of tries of one thing."""
         return RetryBudget(lambda: self._retry_s if self._answered else self._first_retry_s, self.closing)
 
     def request(
@@ -297,7 +297,7 @@ def _given_problem(response: httpx.Response) -> Problem | None:
 
 
 def _made_up_problem(response: httpx.Response) -> Problem:
-    """For an answer that is not the service's own: of a proxy, or of something else under this URL."""
+    """A problem for an answer that is not the service's own: of a proxy, or of something else under this URL."""
     asked = f"{response.request.method} {response.request.url}"
     remedy = "Check that the URL is that of an MRASfM service; what answers here is something else, or before it."
     if response.is_redirect:

@@ -131,6 +131,6 @@ def forget_expired(session: Session, *, before_us: int) -> None:
 
 
 def alive(session: Session, upload_ids: Sequence[str]) -> set[str]:
-    """Those of the uploads that still need their bytes."""
+    """The uploads that still need their bytes."""
     needed = (Upload.id.in_(upload_ids)) & ~Upload.is_done & (Upload.expires_us > now_us())
     return set(session.scalars(select(Upload.id).where(needed)))

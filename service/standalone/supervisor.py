@@ -190,7 +190,7 @@ class Supervisor:
                 child.log.rotate_if_large()
 
     def _next_event_s(self) -> float:
-        """Until something is to be done that no signal announces."""
+        """Seconds until something is to be done that no signal announces."""
         running = [child for child in self._children.values() if child.process is not None]
         if not all(child.ready and child.proven for child in running):
             return PROBE_INTERVAL_S
@@ -374,7 +374,7 @@ class _Guard:
             self._tell(f"+{group}\n")
 
     def close(self) -> None:
-        """Let it go; it kills what is still in its list, which after an orderly stop is nothing."""
+        """Release the reaper; it kills what is still in its list, which after an orderly stop is nothing."""
         if self._process is not None:
             self._release()
             self._process.wait()
@@ -411,7 +411,7 @@ def _waking_signals(ask_stop: Callable[[], None]) -> Iterator[int]:
         ask_stop()
 
     def note(number: int, frame: FrameType | None) -> None:
-        """Nothing to do: that the signal came is what counts."""
+        """Do nothing: it counts that the signal came."""
 
     reading, writing = os.pipe()
     for descriptor in (reading, writing):
@@ -430,7 +430,7 @@ def _waking_signals(ask_stop: Callable[[], None]) -> Iterator[int]:
 
 
 def _sleep(wakeup: int, timeout_s: float) -> None:
-    """Until a signal comes, at most so long."""
+    """Sleep until a signal comes, at most so long."""
     readable, _, _ = select.select([wakeup], [], [], timeout_s)
     if readable:
         with suppress(BlockingIOError):

@@ -1,4 +1,4 @@
-"""From a file on this machine to an object in the artifact store and a blob in the database."""
+"""A file on this machine becomes an object in the artifact store and a blob in the database."""
 
 from __future__ import annotations
 

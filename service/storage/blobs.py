@@ -302,12 +302,12 @@ def lose(session: Session, blob_id: str) -> None:
 
 
 def known_keys(session: Session, keys: list[str]) -> set[str]:
-    """Those of the keys that belong to a blob."""
+    """The keys that belong to a blob."""
     return set(session.scalars(select(Blob.key).where(Blob.key.in_(keys))))
 
 
 def orphans(session: Session, keys: Sequence[str]) -> set[str]:
-    """Those of the keys that were made for projects of this database, and that no blob names.
+    """The keys that were made for projects of this database, and that no blob names.
 
     Others share the bucket or the folder: what is not certainly ours is not an orphan.
     """

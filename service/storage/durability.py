@@ -1,4 +1,4 @@
-"""When uploaded bytes are safe from a power cut: at the latest when their drive is committed.
+"""Durability of uploaded bytes: they are safe from a power cut at the latest when their drive is committed.
 
 A killed process loses nothing that it wrote to a file; a machine that loses power does. To put every file on the disk
 for good before its upload is answered would make uploads several times slower. So files of open drives may still be on

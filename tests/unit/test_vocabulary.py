@@ -27,7 +27,10 @@ _OLD_NAMES = """
     parent_death unusable_database follow Told plugins search matching settle adjustment correspondence persistence
 """
 OLD_NAMES = frozenset(_OLD_NAMES.split())
-NO_BEGINNINGS = {"What", "Who", "Where", "Of", "Whether", "How", "Which", "Why"}
+_NO_BEGINNINGS = """
+    What Who Where Of Whether How Which Why When Until By For From To On At With So Those There Is Up It They
+"""
+NO_BEGINNINGS = frozenset(_NO_BEGINNINGS.split())
 OLD_BEGINNINGS = ("judge_", "settle_", "settled_", "_settle", "_way")
 # Names of the list that the vocabulary gives to a room, by the room's section of the settings.
 ROOMS = {("mrasfm_engine/config.py", "matching")}

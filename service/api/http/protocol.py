@@ -49,17 +49,17 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         self._refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """As uvicorn's."""
+        """Extend uvicorn's method of this name."""
         super().connection_made(transport)
         self._wait_for_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """As uvicorn's."""
+        """Extend uvicorn's method of this name."""
         self._stop_waiting()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """As uvicorn's; a request whose head has no end is refused."""
+        """Take data in; a request whose head has no end is refused. Overrides uvicorn's."""
         if self._refused or self.transport.is_closing():
             return  # it goes on sending
         self._around_bytes += len(data)
@@ -73,30 +73,30 @@ class BoundedHttpProtocol(HttpToolsProtocol):
             )
 
     def on_message_begin(self) -> None:
-        """As uvicorn's."""
+        """Extend uvicorn's method of this name."""
         super().on_message_begin()
         if self._waiting is None:
             self._wait_for_head()
 
     def on_headers_complete(self) -> None:
-        """As uvicorn's."""
+        """Extend uvicorn's method of this name."""
         self._stop_waiting()
         super().on_headers_complete()
         self._in_body = True
 
     def on_body(self, body: bytes) -> None:
-        """As uvicorn's."""
+        """Extend uvicorn's method of this name."""
         self._around_bytes = max(0, self._around_bytes - len(body) - _FRAME_BYTES)
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """As uvicorn's."""
+        """Extend uvicorn's method of this name."""
         self._around_bytes = 0
         self._in_body = False
         super().on_message_complete()
 
     def send_400_response(self, msg: str) -> None:
-        """As uvicorn's, as a problem."""
+        """Send 400 as a problem; overrides uvicorn's."""
         self._refuse(MalformedRequest("this is not HTTP/1.1", remedy="Use an HTTP client."))
 
     def _wait_for_head(self) -> None:

@@ -77,7 +77,7 @@ def _run(
 
 @contextmanager
 def _turn(folder: Path) -> Iterator[None]:
-    """One at a time of all processes: a lock of the folder, which ends with whoever holds it."""
+    """Turn of one process at a time: a lock of the folder, which ends with its holder."""
     held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)

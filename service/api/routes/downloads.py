@@ -125,7 +125,7 @@ def files_of(
 def find_file(
     session: Session, table: type[File], mine: ColumnElement[bool], path: str, *, owner: str
 ) -> tuple[File, Blob]:
-    """One of these files.
+    """File of these with the given name.
 
     Raises
     ------

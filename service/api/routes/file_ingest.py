@@ -1,4 +1,4 @@
-"""From bytes in the spool to files of a drive, however they came."""
+"""Bytes in the spool become files of a drive, however they came."""
 
 from __future__ import annotations
 

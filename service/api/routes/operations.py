@@ -1,4 +1,4 @@
-"""Is it alive, is it ready, how is it: for load balancers, monitoring and people."""
+"""Liveness, readiness and status of the service, for load balancers, monitoring and people."""
 
 from __future__ import annotations
 

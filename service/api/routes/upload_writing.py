@@ -195,7 +195,7 @@ class _Held:
             self.keep(self.offset)
 
     def keep(self, offset: int) -> None:
-        """Let the upload end here."""
+        """End the upload here."""
         if self.upload.is_done:
             return
         self.file.truncate(offset)
@@ -256,7 +256,10 @@ class _Held:
             raise
 
     def _hand_over(self, sha256: str) -> None:
-        """As a PUT does. The file itself stays until that is recorded: a process that is killed here does it again."""
+        """Hand the file over as a PUT does.
+
+        The file itself stays until that is recorded: a process that is killed here does it again.
+        """
         upload, context = self.upload, self._context
         if upload.path is None:
             whole = Spooled(self.file.path, upload.size_bytes, sha256)

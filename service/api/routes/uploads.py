@@ -238,7 +238,7 @@ async def override_method(
     context: ContextDep,
     x_http_method_override: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """For clients behind what lets no PATCH or DELETE through."""
+    """Take the method from a header, for clients behind what lets no PATCH or DELETE through."""
     headers = request.headers
     resumable = headers.get("tus-resumable")
     match (x_http_method_override or "").upper():

@@ -39,7 +39,7 @@ class WorkerSeen(Base):
 
 
 class Pass(Base):
-    """When something that is done rarely was last done, by whichever process."""
+    """Time at which something that is done rarely was last done, by whichever process."""
 
     __tablename__ = "passes"
 

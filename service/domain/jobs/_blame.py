@@ -36,7 +36,7 @@ class RetryLimits:
 
     @classmethod
     def from_settings(cls, settings: Settings) -> RetryLimits:
-        """As the operator set them."""
+        """Limits as the operator set them."""
         return cls(max_attempts=settings.max_attempts, max_losses=settings.max_losses)
 
     def allow(self, *, blame: float, losses: int) -> bool:

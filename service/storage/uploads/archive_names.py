@@ -92,7 +92,7 @@ class EntryNames:
         return self._file(name) is not None or self._file(_without_top(name)) is not None
 
     def resolve(self) -> dict[str, str]:
-        """For each name that was added, the file of the drive: one common top folder does not count.
+        """The drive's file for each name that was added: one common top folder does not count.
 
         Raises
         ------

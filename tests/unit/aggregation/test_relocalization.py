@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrasfm_engine.aggregation.relocalization import Relocaliser, Relocalization, Sightings, sightings
+from mrasfm_engine.aggregation.relocalization import Matches2D3D, Relocaliser, Relocalization, matches_2d3d
 from mrasfm_engine.geometry import se3
 from tests.helpers.small_scenes import (
     CONFIG,
@@ -32,7 +32,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Driven, Driven]:
 
 
 @pytest.fixture(scope="module")
-def seen(two: tuple[Driven, Driven]) -> Sightings:
+def seen(two: tuple[Driven, Driven]) -> Matches2D3D:
     """All that b sees of a's points."""
     a, b = two
     partner = np.full(len(b.source.points_m) + 1, -1)
@@ -40,7 +40,7 @@ def seen(two: tuple[Driven, Driven]) -> Sightings:
     partner[pairs[:, 1]] = pairs[:, 0]
     rows = np.flatnonzero(partner[b.source.keypoint_point] >= 0)
     image = np.searchsorted(b.source.keypoint_first, rows, side="right") - 1
-    return Sightings(
+    return Matches2D3D(
         unit=b.source.image_unit[image],
         image=image,
         xy_px=b.source.keypoint_xy_px[rows].astype(np.float64),
@@ -48,19 +48,19 @@ def seen(two: tuple[Driven, Driven]) -> Sightings:
     )
 
 
-def some(seen: Sightings, counts: list[int], rng: np.random.Generator) -> Sightings:
-    """So many sightings of every unit."""
+def some(seen: Matches2D3D, counts: list[int], rng: np.random.Generator) -> Matches2D3D:
+    """A given number of matches of every unit."""
     rows = [rng.choice(np.flatnonzero(seen.unit == u), count, replace=False) for u, count in enumerate(counts)]
     return seen.select(np.sort(np.concatenate(rows)))
 
 
-def displaced(seen: Sightings, units: list[int], street_from_a: np.ndarray) -> Sightings:
+def displaced(seen: Matches2D3D, units: list[int], street_from_a: np.ndarray) -> Matches2D3D:
     """These units take every house for the next one."""
     by = street_from_a[:3, :3].T @ FACADE_M
     return replace(seen, points_m=seen.points_m + np.isin(seen.unit, units)[:, None] * by)
 
 
-def asked(two: tuple[Driven, Driven], seen: Sightings, **aggregation: object) -> Relocalization:
+def asked(two: tuple[Driven, Driven], seen: Matches2D3D, **aggregation: object) -> Relocalization:
     return Relocaliser(two[1].source, configured(**aggregation).aggregation, seed=0).relocalise(seen)
 
 
@@ -68,7 +68,7 @@ def place(b: Driven) -> np.ndarray:
     return b.source.trajectory_m.mean(0)
 
 
-def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, Driven], seen: Sightings) -> None:
+def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     """One unit has six times the matches of any other, all at the next house: alone it would decide."""
     a, b = two
     truth = true_a_from_b(a, b)
@@ -88,7 +88,7 @@ def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, D
     assert 0 < np.abs(by[0] @ a.street_from_scene[:3, :3].T - FACADE_M).max() < 0.3  # at the next house
 
 
-def test_without_a_majority_nothing_is_said(two: tuple[Driven, Driven], seen: Sightings) -> None:
+def test_without_a_majority_nothing_is_said(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     a, _ = two
     few = some(seen, [60] * 7, np.random.default_rng(1))
     found = asked(two, displaced(few, [0, 4], a.street_from_scene))
@@ -109,13 +109,13 @@ def test_without_a_majority_nothing_is_said(two: tuple[Driven, Driven], seen: Si
     assert split.units_asked == 7
 
 
-def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Driven], seen: Sightings) -> None:
+def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     """Every unit has its matches at the right house and nearly as many at the next one: nothing says which is right."""
     a, _ = two
     rng = np.random.default_rng(3)
     here, there = some(seen, [60] * 7, rng), some(seen, [50] * 7, rng)
     there = displaced(there, list(range(7)), a.street_from_scene)
-    both = Sightings(
+    both = Matches2D3D(
         unit=np.concatenate([here.unit, there.unit]),
         image=np.concatenate([here.image, there.image]),
         xy_px=np.concatenate([here.xy_px, there.xy_px]),
@@ -131,7 +131,7 @@ def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Drive
     assert found.runner_up <= 1
 
 
-def test_too_few_units_or_matches(two: tuple[Driven, Driven], seen: Sightings) -> None:
+def test_too_few_units_or_matches(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     rng = np.random.default_rng(4)
     least = CONFIG.aggregation.min_unit_inliers
     found = asked(two, some(seen, [least - 1] * 7, rng))
@@ -142,7 +142,7 @@ def test_too_few_units_or_matches(two: tuple[Driven, Driven], seen: Sightings) -
     assert asked(two, some(seen, [60, 60, 0, 0, 0, 0, 0], rng), min_units=2).a_from_b is not None
 
 
-def test_wrong_matches_of_every_unit_are_left_out(two: tuple[Driven, Driven], seen: Sightings) -> None:
+def test_wrong_matches_of_every_unit_are_left_out(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     """Four of ten matches of every unit are anywhere."""
     a, b = two
     rng = np.random.default_rng(5)
@@ -164,7 +164,7 @@ def test_a_pair_of_keypoint_and_point_counts_once(two: tuple[Driven, Driven]) ->
     rows_a = np.flatnonzero(a.keypoint_point == point)
     row_b = int(b.keypoints_with_points(0)[0])
     image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
-    found = sightings(a, b, rows_a, np.full(len(rows_a), row_b), image_of_b)
+    found = matches_2d3d(a, b, rows_a, np.full(len(rows_a), row_b), image_of_b)
     assert len(rows_a) > 1
     assert found.unit.tolist() == [b.image_unit[0]]
     np.testing.assert_array_equal(found.points_m, a.points_m[[point]])

@@ -15,7 +15,7 @@ _DEFAULTED = ("is_child", "waiting_for", "children_percent")
 
 
 def upgrade() -> None:
-    """To this version."""
+    """Upgrade to this version."""
     with op.batch_alter_table("jobs") as jobs:
         jobs.alter_column("drive_id", existing_type=sa.String(length=40), nullable=True)
         jobs.add_column(sa.Column("map_id", sa.String(length=40), nullable=True))
@@ -165,7 +165,7 @@ def _version_of(table: str) -> sa.ForeignKeyConstraint:
 
 
 def downgrade() -> None:
-    """To the version before. Aggregations and all that they made are lost."""
+    """Return to the version before. Aggregations and all that they made are lost."""
     for table in ("map_checkpoints", "map_files", "map_scenes", "map_versions", "maps", "job_members", "uploads"):
         op.drop_table(table)
     with op.batch_alter_table("scenes") as scenes:

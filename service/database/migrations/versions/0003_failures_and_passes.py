@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """To this version."""
+    """Upgrade to this version."""
     with op.batch_alter_table("jobs") as jobs:
         jobs.add_column(sa.Column("failures", sa.BigInteger(), nullable=False, server_default="0"))
     with op.batch_alter_table("jobs") as jobs:  # the default was for the rows that are there
@@ -30,7 +30,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """To the version before."""
+    """Return to the version before."""
     op.drop_table("passes")
     op.execute(
         "UPDATE jobs SET attempt = CASE WHEN state = 'RUNNING' THEN failures + 1 ELSE failures END "

@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """To this version."""
+    """Upgrade to this version."""
     with op.batch_alter_table("jobs") as jobs:
         jobs.add_column(sa.Column("blame", sa.Double(), nullable=False, server_default="0"))
         jobs.add_column(sa.Column("losses", sa.BigInteger(), nullable=False, server_default="0"))
@@ -28,7 +28,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """To the version before."""
+    """Return to the version before."""
     with op.batch_alter_table("jobs") as jobs:
         jobs.add_column(sa.Column("failures", sa.BigInteger(), nullable=False, server_default="0"))
     op.execute("UPDATE jobs SET failures = CAST(blame AS BIGINT)")
