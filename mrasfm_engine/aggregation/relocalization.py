@@ -53,7 +53,7 @@ class Relocalization:
 
     a_from_b: Floats | None
     reason: str
-    units_asked: int  # units with matches enough to have something to say
+    units_tried: int  # units with matches enough to have something to say
     units_agreeing: tuple[int, ...]  # units of b
     runner_up: int  # units for which the best other place is nearly as good
     inliers: int  # image points that fit
@@ -156,18 +156,18 @@ class Relocaliser:
     def relocalise(self, seen: Matches2D3D) -> Relocalization:
         """Find the transform a_from_b on which the units that observe points of a agree."""
         units, counts = np.unique(seen.unit, return_counts=True)
-        asked = units[counts >= self._config.min_unit_inliers]
-        if not self._config.agreeing_units and len(asked):
-            return self._best_unit_alone(seen, int(units[counts.argmax()]), len(asked))
+        tried = units[counts >= self._config.min_unit_inliers]
+        if not self._config.agreeing_units and len(tried):
+            return self._best_unit_alone(seen, int(units[counts.argmax()]), len(tried))
         proposals: list[tuple[Floats, Ints, int]] = []
-        for unit in asked:
+        for unit in tried:
             a_from_b = self.hypothesis(int(unit), seen)
             if a_from_b is not None:
                 proposals.append(self._with_all_units(a_from_b, seen))
         if not proposals:
-            return _none(f"of {len(asked)} units with enough matches none finds a pose", len(asked))
+            return _none(f"of {len(tried)} units with enough matches none finds a pose", len(tried))
         best = max(proposals, key=lambda p: (len(p[1]), p[2]))
-        return self._judged(best, self._rivals(best, proposals, asked, seen), asked)
+        return self._judged(best, self._rivals(best, proposals, tried, seen), tried)
 
     def _with_all_units(self, a_from_b: Floats, seen: Matches2D3D) -> tuple[Floats, Ints, int]:
         """A transform refined by all units that agree with it, these, and how many image points of theirs fit."""
@@ -184,16 +184,16 @@ class Relocaliser:
         self,
         best: tuple[Floats, Ints, int],
         proposals: Sequence[tuple[Floats, Ints, int]],
-        asked: Ints,
+        tried: Ints,
         seen: Matches2D3D,
     ) -> int:
         """Number of units for which the best other place is nearly as good."""
         a_from_b, agreeing, _ = best
         _, fits = self.agreeing(a_from_b, seen)
         rest = seen.select(~fits)
-        at_best = {int(u): int((fits & (seen.unit == u)).sum()) for u in asked}
+        at_best = {int(u): int((fits & (seen.unit == u)).sum()) for u in tried}
         others = [p[0] for p in proposals]
-        others += [h for u in asked if (h := self.hypothesis(int(u), rest)) is not None]
+        others += [h for u in tried if (h := self.hypothesis(int(u), rest)) is not None]
         most = 0
         for other in others:
             if self._same_place(other, a_from_b, agreeing):
@@ -204,26 +204,26 @@ class Relocaliser:
             most = max(most, sum(counts[u] >= needed[u] for u in at_best))
         return most
 
-    def _best_unit_alone(self, seen: Matches2D3D, unit: int, asked: int) -> Relocalization:
+    def _best_unit_alone(self, seen: Matches2D3D, unit: int, tried: int) -> Relocalization:
         """The one unit that sees most decides, as in the paper."""
         a_from_b = self.hypothesis(unit, seen)
         if a_from_b is None:
-            return _none("the unit that sees most finds no pose", asked)
+            return _none("the unit that sees most finds no pose", tried)
         _, fits = self.agreeing(a_from_b, seen)
-        return _found((a_from_b, np.array([unit]), int(fits.sum())), asked, 0, "the best unit alone decides")
+        return _found((a_from_b, np.array([unit]), int(fits.sum())), tried, 0, "the best unit alone decides")
 
-    def _judged(self, best: tuple[Floats, Ints, int], runner_up: int, asked: Ints) -> Relocalization:
+    def _judged(self, best: tuple[Floats, Ints, int], runner_up: int, tried: Ints) -> Relocalization:
         agreeing = best[1]
         reason = ""
         if len(agreeing) < self._config.min_units:
             reason = f"{len(agreeing)} units agree how the scenes lie, {self._config.min_units} are needed"
-        elif len(agreeing) < MIN_MAJORITY * len(asked):
-            reason = f"only {len(agreeing)} of {len(asked)} units agree how the scenes lie"
+        elif len(agreeing) < MIN_MAJORITY * len(tried):
+            reason = f"only {len(agreeing)} of {len(tried)} units agree how the scenes lie"
         elif runner_up > MAX_RUNNER_UP * len(agreeing):
             reason = f"{len(agreeing)} units agree on one place, but for {runner_up} another is nearly as good"
         if reason:
-            return _none(reason, len(asked), runner_up=runner_up)
-        return _found(best, len(asked), runner_up, "")
+            return _none(reason, len(tried), runner_up=runner_up)
+        return _found(best, len(tried), runner_up, "")
 
     def _same_place(self, one: Floats, other: Floats, units: Ints) -> bool:
         at = self._b.world_from_rig[units].mean(0)[:3, 3] if len(units) else np.zeros(3)
@@ -232,17 +232,17 @@ class Relocaliser:
         return bool(shift <= SAME_PLACE_M and turn <= SAME_PLACE_DEG)
 
 
-def _none(reason: str, asked: int, *, runner_up: int = 0) -> Relocalization:
+def _none(reason: str, tried: int, *, runner_up: int = 0) -> Relocalization:
     return Relocalization(
-        a_from_b=None, reason=reason, units_asked=asked, units_agreeing=(), runner_up=runner_up, inliers=0
+        a_from_b=None, reason=reason, units_tried=tried, units_agreeing=(), runner_up=runner_up, inliers=0
     )
 
 
-def _found(best: tuple[Floats, Ints, int], asked: int, runner_up: int, reason: str) -> Relocalization:
+def _found(best: tuple[Floats, Ints, int], tried: int, runner_up: int, reason: str) -> Relocalization:
     return Relocalization(
         a_from_b=best[0],
         reason=reason,
-        units_asked=asked,
+        units_tried=tried,
         units_agreeing=tuple(int(u) for u in best[1]),
         runner_up=runner_up,
         inliers=best[2],

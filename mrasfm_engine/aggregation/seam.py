@@ -86,12 +86,12 @@ def find_seam(
         Not accepted where they share too little, or what they share does not agree.
     """
     cross = CrossMatcher(a, b, matcher, config.matching, threads=config.threads)
-    found, asked = _relocalise(a, b, coarse_a_from_b, cross, config, cancel=cancel, progress=progress)
+    found, tried = _relocalise(a, b, coarse_a_from_b, cross, config, cancel=cancel, progress=progress)
     quality: dict[str, Any] = {
-        "units_asked": found.units_asked,
+        "units_tried": found.units_tried,
         "units_agreeing": len(found.units_agreeing),
         "units_elsewhere": found.runner_up,
-        "units_looked_for": asked,
+        "units_looked_for": tried,
     }
     if found.a_from_b is None:
         quality["pairs_compared"] = cross.compared
@@ -120,7 +120,7 @@ def _relocalise(
     image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
     parts: list[CrossMatches] = []
     found = Relocalization(
-        a_from_b=None, reason="their views do not overlap", units_asked=0, units_agreeing=(), runner_up=0, inliers=0
+        a_from_b=None, reason="their views do not overlap", units_tried=0, units_agreeing=(), runner_up=0, inliers=0
     )
     # From the start and from the middle at once, so that the first units are not all at one place.
     order = [wanted[i] for k in range(BATCH_UNITS) for i in range(k, len(wanted), BATCH_UNITS)]

@@ -190,8 +190,7 @@ def _near_epipolar_lines(
     b_from_a: Floats, a: _View, b: _View, rows: Ints, count: int, true_partner: Ints, config: EngineConfig,
     rng: np.random.Generator,
 ) -> tuple[Ints, Ints]:  # fmt: skip
-    """A sample of at most `count` rows of one view, and for each any row of the other that is not its `true_partner` and that
-    verification would take for it."""
+    """Wrong matches that verification takes for right ones: rows (n,) of one view, n <= `count`, and of the other."""
     rotation, translation_m = b_from_a[:3, :3].copy(), b_from_a[:3, 3].copy()
     essential = se3.skew(translation_m) @ rotation
     max_sine = math.sin(config.matching.max_error_px / max(a.focal_px, b.focal_px))

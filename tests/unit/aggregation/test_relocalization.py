@@ -60,7 +60,7 @@ def displaced(seen: Matches2D3D, units: list[int], street_from_a: np.ndarray) ->
     return replace(seen, points_m=seen.points_m + np.isin(seen.unit, units)[:, None] * by)
 
 
-def asked(two: tuple[Driven, Driven], seen: Matches2D3D, **aggregation: object) -> Relocalization:
+def relocalised(two: tuple[Driven, Driven], seen: Matches2D3D, **aggregation: object) -> Relocalization:
     return Relocaliser(two[1].source, configured(**aggregation).aggregation, seed=0).relocalise(seen)
 
 
@@ -74,14 +74,14 @@ def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, D
     truth = true_a_from_b(a, b)
     few = some(seen, [25, 25, 25, 240, 25, 25, 25], np.random.default_rng(0))
     wrong = displaced(few, [3], a.street_from_scene)
-    found = asked(two, wrong)
+    found = relocalised(two, wrong)
     assert found.a_from_b is not None, found.reason
     assert found.units_agreeing == (0, 1, 2, 4, 5, 6)
-    assert found.units_asked == 7
+    assert found.units_tried == 7
     shift, turn = off(found.a_from_b, truth, place(b))
     assert 0 < shift < 0.1
     assert 0 < turn < 0.5
-    alone = asked(two, wrong, agreeing_units=False)
+    alone = relocalised(two, wrong, agreeing_units=False)
     assert alone.a_from_b is not None
     assert alone.units_agreeing == (3,)
     by = se3.apply(alone.a_from_b, place(b)[None]) - se3.apply(truth, place(b)[None])
@@ -91,11 +91,11 @@ def test_units_that_agree_win_over_more_matches_that_do_not(two: tuple[Driven, D
 def test_without_a_majority_nothing_is_said(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     a, _ = two
     few = some(seen, [60] * 7, np.random.default_rng(1))
-    found = asked(two, displaced(few, [0, 4], a.street_from_scene))
+    found = relocalised(two, displaced(few, [0, 4], a.street_from_scene))
     assert found.a_from_b is not None
     assert found.units_agreeing == (1, 2, 3, 5, 6)
     assert found.runner_up == 2
-    four_to_three = asked(two, displaced(few, [0, 2, 4], a.street_from_scene))
+    four_to_three = relocalised(two, displaced(few, [0, 2, 4], a.street_from_scene))
     assert four_to_three.a_from_b is None
     assert four_to_three.reason == "4 units agree on one place, but for 3 another is nearly as good"
     # Three at one place, two at the other, and two anywhere.
@@ -103,10 +103,10 @@ def test_without_a_majority_nothing_is_said(two: tuple[Driven, Driven], seen: Ma
     lost = np.isin(few.unit, [5, 6])
     points = few.points_m.copy()
     points[lost] = rng.permutation(points[lost])
-    split = asked(two, displaced(replace(few, points_m=points), [0, 2, 4], a.street_from_scene))
+    split = relocalised(two, displaced(replace(few, points_m=points), [0, 2, 4], a.street_from_scene))
     assert split.a_from_b is None
     assert split.reason == "only 3 of 7 units agree how the scenes lie"
-    assert split.units_asked == 7
+    assert split.units_tried == 7
 
 
 def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
@@ -121,12 +121,12 @@ def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Drive
         xy_px=np.concatenate([here.xy_px, there.xy_px]),
         points_m=np.concatenate([here.points_m, there.points_m]),
     )
-    found = asked(two, both)
+    found = relocalised(two, both)
     assert found.a_from_b is None
     assert "another is nearly as good" in found.reason
     assert found.runner_up >= 4
     # What repeats for one unit of seven does no harm.
-    found = asked(two, both.select((both.unit == 3) | (np.arange(len(both.unit)) < len(here.unit))))
+    found = relocalised(two, both.select((both.unit == 3) | (np.arange(len(both.unit)) < len(here.unit))))
     assert found.a_from_b is not None
     assert found.runner_up <= 1
 
@@ -134,12 +134,12 @@ def test_a_facade_that_repeats_for_all_units_is_refused(two: tuple[Driven, Drive
 def test_too_few_units_or_matches(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
     rng = np.random.default_rng(4)
     least = CONFIG.aggregation.min_unit_inliers
-    found = asked(two, some(seen, [least - 1] * 7, rng))
-    assert (found.a_from_b, found.units_asked) == (None, 0)
-    found = asked(two, some(seen, [60, 60, 0, 0, 0, 0, 0], rng))
+    found = relocalised(two, some(seen, [least - 1] * 7, rng))
+    assert (found.a_from_b, found.units_tried) == (None, 0)
+    found = relocalised(two, some(seen, [60, 60, 0, 0, 0, 0, 0], rng))
     assert found.a_from_b is None
     assert found.reason == "2 units agree how the scenes lie, 3 are needed"
-    assert asked(two, some(seen, [60, 60, 0, 0, 0, 0, 0], rng), min_units=2).a_from_b is not None
+    assert relocalised(two, some(seen, [60, 60, 0, 0, 0, 0, 0], rng), min_units=2).a_from_b is not None
 
 
 def test_wrong_matches_of_every_unit_are_left_out(two: tuple[Driven, Driven], seen: Matches2D3D) -> None:
@@ -150,7 +150,7 @@ def test_wrong_matches_of_every_unit_are_left_out(two: tuple[Driven, Driven], se
     wrong = rng.random(len(mixed.unit)) < 0.4
     points = mixed.points_m.copy()
     points[wrong] = rng.permutation(points[wrong])
-    found = asked(two, replace(mixed, points_m=points))
+    found = relocalised(two, replace(mixed, points_m=points))
     assert found.a_from_b is not None, found.reason
     assert found.units_agreeing == tuple(range(7))
     assert 0.8 * (~wrong).sum() < found.inliers < 1.05 * (~wrong).sum()
