@@ -38,7 +38,8 @@ class Older:
 @pytest.fixture(params=["sqlite", "postgresql"])
 def older(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Older]:
     with tarfile.open(ARCHIVE) as archive:
-        archive.extractall(tmp_path, filter="data")
+        # Python before 3.11.4 has no filters, and those from 3.12 on want one.
+        archive.extractall(tmp_path, **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))
     settings, environment = Settings(data_dir=tmp_path / "data"), {}
     if request.param == "postgresql":
         url = environment["MRASFM_DATABASE_URL"] = request.getfixturevalue("postgres_database")
