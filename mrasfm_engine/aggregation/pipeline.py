@@ -132,7 +132,7 @@ def _join_scenes(
     chains: Sequence[Chain],
 ) -> MapResult:
     started = time.perf_counter()
-    run.begin(Stage.JOINT)
+    run.begin(Stage.MULTI_SCENE_ADJUSTMENT)
     poses, chained = known.map_from_scene.copy(), known.map_from_scene.copy()
     middle = np.stack([scene.midpoint_m for scene in found])
     reports = []
@@ -155,7 +155,7 @@ def _join_scenes(
         poses[members] = map_from_first @ joint.first_from_scene
         chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
-    run.ended(Stage.JOINT, started, loops=sum(len(chain.closings) for chain in chains))
+    run.ended(Stage.MULTI_SCENE_ADJUSTMENT, started, loops=sum(len(chain.closings) for chain in chains))
     adjusted = _adjust_map(run, found, known, graph, poses)
     return MapResult(
         scenes=found,
@@ -180,7 +180,7 @@ def _adjust_map(
     run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
 ) -> AdjustedMap:
     started = time.perf_counter()
-    run.begin(Stage.ADJUSTMENT)
+    run.begin(Stage.MAP_ADJUSTMENT)
     assembly = Assembly(scenes=found)
     positions = {
         k: p
@@ -191,7 +191,7 @@ def _adjust_map(
     owner = joined_owner(assembly, _seams_among(graph, found, range(len(found))))
     adjusted = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
     run.ended(
-        Stage.ADJUSTMENT,
+        Stage.MAP_ADJUSTMENT,
         started,
         free_units=adjusted.free_units,
         free_cameras=adjusted.free_cameras,

@@ -50,7 +50,7 @@ def test_stages_tell_when_they_begin_end_and_are_reused(tmp_path: Path) -> None:
         lines = StageLines(said[-1].append, lambda: 0.0)
         aggregate([tmp_path / "one", tmp_path / "two"], tmp_path / "map", CONFIG, progress=lines.update)
         lines.finish("done")
-    stages = ["scenes", "association", "seams", "joint", "adjustment", "pictures", "export"]
+    stages = ["scenes", "association", "seams", "multi-scene-adjustment", "map-adjustment", "pictures", "export"]
     whats = [f"[00:00] {stage}: {what}" for stage in stages for what in ("begins", "done")]
     assert [line.split(",")[0] for line in said[0]] == whats
     reused = "[00:00] seams: reused from an earlier run"
