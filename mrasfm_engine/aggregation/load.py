@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from mrasfm_engine.aggregation.source import SourceScene, unit_from_images
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.read_model import ModelImage, read_images, read_points
+from mrasfm_engine.io.read_model import ModelImage, read_images, read_points, read_vertices
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Bytes, Floats, Floats32, Ints
 from schemas import Camera, DriveManifest, Pose
@@ -270,10 +270,7 @@ def _poses(entries: Sequence[dict[str, Any]], key: str) -> Floats:
 
 
 def _point_classes(path: Path, count: int) -> Bytes:
-    types = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii").splitlines()]
-    rows = np.frombuffer(body, dtype=[(line[2], types[line[1]]) for line in lines if line[0] == "property"])
+    _, rows = read_vertices(path)
     if len(rows) != count:
         raise ValueError(f"points.ply has {len(rows)} points, model/points3D.bin {count}")
     return np.ascontiguousarray(rows["class"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +81,7 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
 def model(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
     """The poses that rigs and frames compose to, cameras, and points, as COLMAP has read them."""
     yield from _rigs_and_cameras(scene, found)
+    centres = np.full((len(scene.unit_registered), len(scene.calibration), 3), np.nan)
     registered = np.flatnonzero(scene.image_registered)
     yield Row("images: the registered ones", sorted(found.images), (registered + 1).tolist())
     yield Row("images: those with a pose", sorted(found.reg_image_ids()), (registered + 1).tolist())
@@ -91,6 +93,8 @@ def model(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
         yield Row("images: name, camera, frame, keypoints, observations", described, expected)
         composed = image.cam_from_world().matrix()
         yield Row(f"images: the composed pose of {source.file}", composed, pose[:3], POSE_TOLERANCE)
+        centres[source.unit, source.camera] = -composed[:, :3].T @ composed[:, 3]
+    yield from _baselines(scene, centres)
     yield Row("points3D: their number", found.num_points3D(), len(scene.points_m))
     yield Row("points3D: observations", found.compute_num_observations(), len(scene.observation_point))
     yield Row("the model's consistency, as COLMAP finds it,", found.is_valid(), True)
@@ -114,6 +118,17 @@ def _rigs_and_cameras(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
         sensor_from_rig = rig.sensor_from_rig(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, k + 1)).matrix()
         expected = np.linalg.inv(refined.rig_from_cam)[:3]
         yield Row(f"rigs: {given.name}'s pose", sensor_from_rig, expected, POSE_TOLERANCE)
+
+
+def _baselines(scene: Scene, centres: Floats) -> Rows:
+    """The distances of simultaneous cameras (units, cameras, 3): each is the same in every unit."""
+    if scene.unit_from_image is not None:
+        return
+    for a, b in combinations(range(centres.shape[1]), 2):
+        lengths = np.linalg.norm(centres[:, a] - centres[:, b], axis=1)
+        lengths = lengths[np.isfinite(lengths)]
+        if len(lengths):
+            yield Row(f"rigs: the distance of cameras {a} and {b}", float(np.ptp(lengths)), 0.0, POSE_TOLERANCE)
 
 
 def points_text(scene: Scene, found: ModelPoints) -> Rows:
@@ -268,7 +283,10 @@ def tum(scene: Scene, units: Ints, found: tuple[Ints, Floats]) -> Rows:
 
 
 def _registered_poses(scene: Scene) -> Floats:
-    """Poses (n, 4, 4) of the cameras at the registered images, composed of units, moves within them and cameras."""
+    """Poses (n, 4, 4) of the cameras at the registered images, composed of units, moves within them and cameras.
+
+    `Scene.world_from_cam` says the same, and is what the writers use.
+    """
     poses = []
     for i in np.flatnonzero(scene.image_registered).tolist():
         image = scene.drive.images[i]

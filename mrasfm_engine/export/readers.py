@@ -22,10 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.export.colmap import BINARY_FILES, TEXT_FILES
+from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.types import Floats, Ints
 from schemas import DriveManifest
-
-_PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 
 
 class ModelImage(NamedTuple):
@@ -35,7 +34,7 @@ class ModelImage(NamedTuple):
     name: str
     cam_from_world: Floats  # (4, 4)
     xy_px: Floats  # (n, 2)
-    point_ids: Ints  # (n,) -1 where a keypoint observes none
+    point_ids: Ints | Floats  # (n,) whole numbers, -1 where a keypoint observes none
 
 
 class ModelPoints(NamedTuple):
@@ -84,10 +83,7 @@ def tum(path: Path) -> tuple[Ints, Floats]:
 
 def ply(path: Path) -> NDArray[Any]:
     """The vertices as rows of named properties."""
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii").splitlines()]
-    count = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
-    rows = np.frombuffer(body, dtype=[(line[2], _PLY_TYPES[line[1]]) for line in lines if line[0] == "property"])
+    count, rows = read_vertices(path)
     if len(rows) != count:
         raise ValueError(f"{count} vertices announced, {len(rows)} found")
     return rows
@@ -149,9 +145,7 @@ def images_text(path: Path) -> Iterator[ModelImage]:
     for head, keypoints in zip(lines[:-1:2], lines[1::2], strict=True):
         image_id, *numbers, _, name = head.split(" ", maxsplit=9)
         rows = _numbers(keypoints).reshape(-1, 3)
-        yield ModelImage(
-            int(image_id), name, _pose([float(v) for v in numbers]), rows[:, :2], rows[:, 2].astype(np.int64)
-        )
+        yield ModelImage(int(image_id), name, _pose([float(v) for v in numbers]), rows[:, :2], rows[:, 2])
 
 
 def points_text(path: Path) -> ModelPoints:

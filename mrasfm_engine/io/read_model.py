@@ -1,17 +1,20 @@
-"""Reads back the binary COLMAP model of a written scene: what every keypoint observes, and the points."""
+"""Reads back the binary COLMAP model and the point cloud of a written scene."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.types import Bytes, Floats, Floats32, Ints
 
 POINT_HEAD = struct.Struct("<Q3d3BdQ")
 TRACK_ENTRY_BYTES = 8
+PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 MAX_KEYPOINTS = 10_000_000  # of an image: more is a damaged file
 
 
@@ -85,3 +88,17 @@ def read_points(path: Path) -> ModelPoints:
     if at != len(data) or not np.array_equal(heads[:, 0], np.arange(1, count + 1)):
         raise ValueError("its points are not numbered without gaps")
     return ModelPoints(xyz_m=heads[:, 1:4].copy(), color=heads[:, 4:7].astype(np.uint8), error_px=heads[:, 7].copy())
+
+
+def read_vertices(path: Path) -> tuple[int, NDArray[Any]]:
+    """The number of vertices that a PLY file announces, else -1, and those that it has as rows of named properties.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError
+        Where the file cannot be read or is damaged.
+    """
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii").splitlines()]
+    count = next((int(line[2]) for line in lines if line[:2] == ["element", "vertex"]), -1)
+    return count, np.frombuffer(body, dtype=[(line[2], PLY_TYPES[line[1]]) for line in lines if line[0] == "property"])

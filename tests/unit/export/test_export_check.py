@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import MrasfmError
-from mrasfm_engine.export import calibration, colmap, coordinate_frame, feature_database, ply, pose_files
+from mrasfm_engine.export import calibration, colmap, comparisons, coordinate_frame, feature_database, ply, pose_files
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.scene.scene import Scene
 from tests.helpers.export_example import assert_nothing_published, make_scene
@@ -151,3 +151,17 @@ def test_a_file_that_no_check_covers_is_refused(scene: Scene, tmp_path: Path, mo
     with pytest.raises(MrasfmError, match=r"added.json .*no check covers it"):
         write_scene(scene, tmp_path / "scene", {})
     assert_nothing_published(tmp_path / "scene")
+
+
+def test_cameras_whose_distance_changes_are_refused(scene: Scene) -> None:
+    units, cameras = len(scene.unit_registered), len(scene.calibration)
+    rng = np.random.default_rng(0)
+    rig = rng.normal(size=(cameras, 3))
+    centres = rig + rng.normal(size=(units, 1, 3))
+    centres[1] = np.nan
+    assert all(row.agrees for row in comparisons._baselines(scene, centres))
+    centres[2, 0] += 5e-6 * (rig[0] - rig[1]) / np.linalg.norm(rig[0] - rig[1])
+    (row,) = comparisons._baselines(scene, centres)
+    assert not row.agrees
+    moving = replace(scene, unit_from_image=np.tile(np.eye(4), (len(scene.drive.images), 1, 1)))
+    assert not list(comparisons._baselines(moving, centres))
