@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrasfm_engine.types import Floats
+from mrasfm_engine.types import Floats, Ints
 
 
 def skew(v: ArrayLike) -> Floats:
@@ -169,3 +169,20 @@ def slerp(rotation_a: ArrayLike, rotation_b: ArrayLike, fraction: ArrayLike) -> 
     step = log_so3(np.swapaxes(a, -1, -2) @ b) * np.asarray(fraction, dtype=np.float64)[..., None]
     result: Floats = a @ exp_so3(step)
     return result
+
+
+def interpolate(times: Ints, poses: Floats, at: Ints) -> Floats:
+    """Poses (m, 4, 4) at times (m,) between the nearest of some poses; the first and the last hold beyond them.
+
+    Parameters
+    ----------
+    times
+        Rising times (n,) of the poses (n, 4, 4), n >= 1, in whole units.
+    """
+    after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    step = np.maximum(times[after] - times[before], 1)
+    fraction = np.clip((at - times[before]) / step, 0.0, 1.0)
+    a, b = poses[before], poses[after]
+    rotation = slerp(a[:, :3, :3], b[:, :3, :3], fraction)
+    return transform(rotation, a[:, :3, 3] + fraction[:, None] * (b[:, :3, 3] - a[:, :3, 3]))

@@ -13,11 +13,10 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, pinhole_params
-from mrasfm_engine.importers.rig_folder import checked_camera, frame_times, numbered_images, read_upright_poses
+from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit
+from mrasfm_engine.importers.rig_folder import frame_times, numbered_images, pinhole_camera, read_upright_poses
 from mrasfm_engine.importers.tables import read_lines
 from mrasfm_engine.io.axes import flu_from_body
-from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera
 
@@ -112,13 +111,6 @@ def _camera(
             remedy="Give the calib.txt of the benchmark.",
             code="bad-calibration",
         )
-    header = read_header(images[min(images)])
     cam_from_body = se3.transform(np.eye(3), np.linalg.solve(k, p4))
-    return checked_camera(
-        name,
-        model="PINHOLE",
-        size=(header.width, header.height),
-        params=pinhole_params(k),
-        rig_from_cam=flu_body @ se3.inverse(cam_from_body),
-        source=f"{file}: P{name[-1]}",
-    )
+    rig_from_cam = flu_body @ se3.inverse(cam_from_body)
+    return pinhole_camera(name, images, k, rig_from_cam, source=f"{file}: P{name[-1]}")

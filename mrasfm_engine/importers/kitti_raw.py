@@ -22,12 +22,10 @@ from mrasfm_engine.importers.recording import (
     choose_scene,
     gnss_of_vehicle,
     interpolated_poses,
-    pinhole_params,
     proper_transform,
 )
-from mrasfm_engine.importers.rig_folder import checked_camera, numbered_images
+from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
 from mrasfm_engine.importers.tables import read_lines, read_numbers
-from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera, Gnss
 
@@ -92,8 +90,8 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     ins = _read_ins(drive / "oxts")
     gnss = None if ins is None else _gnss(*ins, drive / "oxts")
     truth = [None] * len(frames) if ins is None else interpolated_poses(ins[0], _poses(ins[1]), unit_times_us)
-    rig_from_cam0 = _rig_from_cam0(day)
     calibration = _table(day / "calib_cam_to_cam.txt")
+    rig_from_cam0 = _rig_from_cam0(calibration, day)
     return Recording(
         layout="KITTI raw",
         name=f"kitti-{drive.name}",
@@ -119,20 +117,13 @@ def _camera(
     file, key = day / "calib_cam_to_cam.txt", f"P_rect_{name[-2:]}"
     projection = _values(calibration, key, 12, file).reshape(3, 4)
     cam_from_cam0 = se3.transform(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
-    header = read_header(images[min(images)])
-    return checked_camera(
-        name,
-        model="PINHOLE",
-        size=(header.width, header.height),
-        params=pinhole_params(projection[:, :3]),
-        rig_from_cam=rig_from_cam0 @ se3.inverse(cam_from_cam0),
-        source=f"{file}: {key}",
-    )
+    rig_from_cam = rig_from_cam0 @ se3.inverse(cam_from_cam0)
+    return pinhole_camera(name, images, projection[:, :3], rig_from_cam, source=f"{file}: {key}")
 
 
-def _rig_from_cam0(day: Path) -> Floats:
+def _rig_from_cam0(calibration: dict[str, Floats], day: Path) -> Floats:
     """Pose of rectified camera 0 in the frame of the inertial navigation unit."""
-    calibration, file = _table(day / "calib_cam_to_cam.txt"), day / "calib_cam_to_cam.txt"
+    file = day / "calib_cam_to_cam.txt"
     rectified = np.eye(4)
     rectified[:3, :3] = _values(calibration, "R_rect_00", 9, file).reshape(3, 3)
     cam0_from_velodyne = _rigid(day / "calib_velo_to_cam.txt")

@@ -24,11 +24,9 @@ from mrasfm_engine.importers.recording import (
     choose_scene,
     gnss_of_vehicle,
     interpolated_poses,
-    pinhole_params,
 )
-from mrasfm_engine.importers.rig_folder import checked_camera, numbered_images
+from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
 from mrasfm_engine.io.documents import read_document
-from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas import Camera, Gnss
 from schemas.drive import MAX_CAMERAS, Finite
@@ -216,15 +214,8 @@ def _extrinsic(
 def _camera(folder: Path, images: dict[int, Path], rig_from_cam: Floats) -> Camera:
     file = folder / "intrinsics.json"
     k = read_document(file, _Intrinsics, what="calibration")
-    header = read_header(images[min(images)])
-    return checked_camera(
-        folder.name,
-        model="PINHOLE",
-        size=(header.width, header.height),
-        params=pinhole_params(np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])),
-        rig_from_cam=rig_from_cam,
-        source=str(file),
-    )
+    matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    return pinhole_camera(folder.name, images, matrix, rig_from_cam, source=str(file))
 
 
 def _gnss(sequence: Path) -> Gnss | None:

@@ -93,18 +93,9 @@ def interpolated_poses(times_us: Ints, world_from_any: Floats, at_us: Ints) -> l
     times_us
         Rising times (n,) of the poses (n, 4, 4), n >= 1.
     """
-    found: list[Floats | None] = []
-    for time_us in at_us.tolist():
-        if not times_us[0] <= time_us <= times_us[-1]:
-            found.append(None)
-            continue
-        b = int(np.searchsorted(times_us, time_us))
-        a = b if times_us[b] == time_us else b - 1
-        fraction = (time_us - times_us[a]) / max(int(times_us[b] - times_us[a]), 1)
-        rotation = se3.slerp(world_from_any[a, :3, :3], world_from_any[b, :3, :3], fraction)
-        position = (1 - fraction) * world_from_any[a, :3, 3] + fraction * world_from_any[b, :3, 3]
-        found.append(se3.transform(rotation, position))
-    return found
+    poses = se3.interpolate(times_us, world_from_any, at_us)
+    known = (at_us >= times_us[0]) & (at_us <= times_us[-1])
+    return [pose if there else None for pose, there in zip(poses, known, strict=True)]
 
 
 def gnss_of_vehicle(

@@ -21,6 +21,7 @@ from mrasfm_engine.importers.recording import (
 from mrasfm_engine.importers.tables import read_poses, read_times
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.documents import read_document
+from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera, LabelMap
@@ -162,6 +163,25 @@ def checked_camera(
         raise InputError(
             f"{source}: {field}: {what}", remedy="Correct the calibration.", code="bad-calibration"
         ) from None
+
+
+def pinhole_camera(name: str, images: dict[int, Path], k: Floats, rig_from_cam: Floats, *, source: str) -> Camera:
+    """A manifest's camera of rectified images with a calibration matrix (3, 3), of the first image's size.
+
+    Raises
+    ------
+    InputError
+        If the calibration is not plausible, or the first image cannot be read.
+    """
+    header = read_header(images[min(images)])
+    return checked_camera(
+        name,
+        model="PINHOLE",
+        size=(header.width, header.height),
+        params=pinhole_params(k),
+        rig_from_cam=rig_from_cam,
+        source=source,
+    )
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:

@@ -103,13 +103,6 @@ def _rough(drive: Drive) -> tuple[Floats, Floats]:
     shift = np.round(poses[0, :3, 3])
     poses[:, :3, 3] -= shift
     at = drive.timestamps_us
-    after = np.clip(np.searchsorted(times, at), min(1, len(times) - 1), len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    step = np.maximum(times[after] - times[before], 1)
-    fraction = np.clip((at - times[before]) / step, 0.0, 1.0)
-    a, b = poses[before], poses[after]
-    rotation = se3.slerp(a[:, :3, :3], b[:, :3, :3], fraction)
-    position = a[:, :3, 3] + fraction[:, None] * (b[:, :3, 3] - a[:, :3, 3])
-    result = se3.transform(rotation, position)
+    result = se3.interpolate(times, poses, at)
     result[(at < times[0] - SLACK_US) | (at > times[-1] + SLACK_US)] = np.nan
     return result, se3.transform(np.eye(3), shift)

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.local_motion import (
-    MAX_ACCELERATION_MPS2,
-    MAX_GAP_S,
-    local_motion,
-    smoothed_velocity,
-)
+from mrasfm_engine.geometry.local_motion import MAX_ACCELERATION_MPS2, MAX_GAP_S, local_motion, smoothed_velocity
 
 TWIST = np.array([0.05, -0.02, 0.6, 8.0, 0.3, -0.1])  # rad/s and m/s: a turn with some roll and climb
 START = se3.transform(se3.exp_so3([0.1, 0.2, -1.0]), [3.0, -4.0, 1.0])

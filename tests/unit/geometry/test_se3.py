@@ -141,3 +141,13 @@ def test_slerp_goes_the_short_way_at_constant_speed() -> None:
     np.testing.assert_allclose(se3.rotation_angle_deg(a.T @ path), fractions * angle, atol=1e-9)
     almost_around = se3.slerp(np.eye(3), se3.exp_so3([0, 0, np.radians(350)]), 0.5)
     np.testing.assert_allclose(se3.log_so3(almost_around), [0, 0, np.radians(-5)], atol=1e-12)
+
+
+def test_poses_are_interpolated_and_held_beyond_their_ends() -> None:
+    poses = se3.transform(se3.exp_so3([[0, 0, 0.0], [0, 0, 0.2], [0, 0, 0.6]]), [[0, 0, 0], [2, 0, 0], [2, 4, 0.0]])
+    times = np.array([0, 100, 300])
+    found = se3.interpolate(times, poses, np.array([-50, 0, 50, 100, 150, 300, 400]))
+    np.testing.assert_allclose(found[:, 0, 3], [0, 0, 1, 2, 2, 2, 2], atol=1e-12)
+    np.testing.assert_allclose(found[:, 1, 3], [0, 0, 0, 0, 1, 4, 4], atol=1e-12)
+    np.testing.assert_allclose(se3.log_so3(found[:, :3, :3])[:, 2], [0, 0, 0.1, 0.2, 0.3, 0.6, 0.6], atol=1e-12)
+    np.testing.assert_allclose(se3.interpolate(times[:1], poses[:1], np.array([-1, 0, 9])), poses[[0, 0, 0]])
