@@ -6,10 +6,7 @@ import base64
 import binascii
 import re
 
-from service.errors import (
-    MalformedDigest,
-    ServiceError,
-)
+from service.errors import MalformedDigest, ServiceError
 
 _ALGORITHM = "sha-256"
 # One member of RFC 8941's dictionary whose value is a byte sequence, with parameters that mean nothing here.

@@ -21,9 +21,7 @@ from service.api.http.request_bodies import request_sha256
 from service.database.tables import Job
 from service.domain import jobs
 from service.domain.idempotency import Answer, once
-from service.errors import (
-    Unauthorized,
-)
+from service.errors import Unauthorized
 from service.job_queue import BrokerError
 
 log = logging.getLogger("mrasfm.api")

@@ -10,10 +10,7 @@ from sqlalchemy import delete, false
 from service.api.context import Context
 from service.database.connections import is_current
 from service.database.tables import WorkerSeen
-from service.errors import (
-    NotReady,
-    ServiceError,
-)
+from service.errors import NotReady, ServiceError
 
 _KEPT_S = 2.0  # many may ask, also without a key
 _TIMEOUT_S = 8.0

@@ -14,13 +14,7 @@ from sqlalchemy.orm import Session
 from schemas.api.drives import DriveState
 from service.database.tables import Blob, Drive, DriveFile, now_us
 from service.domain.access import is_id
-from service.errors import (
-    DriveCommitted,
-    FileExists,
-    NotInManifest,
-    ServiceError,
-    not_found,
-)
+from service.errors import DriveCommitted, FileExists, NotInManifest, ServiceError, not_found
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 

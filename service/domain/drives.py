@@ -18,12 +18,7 @@ from service.domain import drive_files, jobs
 from service.domain.access import require
 from service.domain.manifest_facts import ManifestFacts
 from service.domain.maps import require_unused
-from service.errors import (
-    DriveChanging,
-    DriveIncomplete,
-    DriveInUse,
-    TooManyDrives,
-)
+from service.errors import DriveChanging, DriveIncomplete, DriveInUse, TooManyDrives
 from service.storage import blobs, durability
 from service.storage.blob_writer import StoredFile
 

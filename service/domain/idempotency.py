@@ -21,11 +21,7 @@ from sqlalchemy.orm import Session
 from service.database.connections import Database, clock_us
 from service.database.tables import IdempotencyKey, Job, new_id
 from service.domain.request_holds import Hold, HoldKeeper
-from service.errors import (
-    IdempotencyKeyReused,
-    RequestInFlight,
-    ServiceError,
-)
+from service.errors import IdempotencyKeyReused, RequestInFlight, ServiceError
 
 
 @dataclass(frozen=True, kw_only=True)

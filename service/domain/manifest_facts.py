@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from schemas.api.drives import FileRole
 from schemas.api.problems import ProblemItem
 from schemas.drive import DriveManifest
-from service.errors import (
-    InvalidDocument,
-    ServiceError,
-)
+from service.errors import InvalidDocument, ServiceError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,13 +13,7 @@ from service.database.tables import TERMINAL, Job, JobMember, Map, MapFile, MapS
 from service.domain import jobs
 from service.domain.access import require
 from service.domain.scenes import media_type
-from service.errors import (
-    MapBusy,
-    UsedByJob,
-    UsedByMap,
-    VersionCurrent,
-    not_found,
-)
+from service.errors import MapBusy, UsedByJob, UsedByMap, VersionCurrent, not_found
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 

@@ -12,11 +12,7 @@ from schemas.api.drives import DriveState
 from service.database.tables import Drive, Project, Upload, new_id, now_us
 from service.domain import drive_files, drives
 from service.domain.access import require
-from service.errors import (
-    TooManyUploads,
-    UploadExpired,
-    not_found,
-)
+from service.errors import TooManyUploads, UploadExpired, not_found
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 

@@ -26,11 +26,7 @@ from service.database.tables import (
     new_id,
     now_us,
 )
-from service.errors import (
-    QuotaFull,
-    ServiceError,
-    StorageChanged,
-)
+from service.errors import QuotaFull, ServiceError, StorageChanged
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,13 +19,7 @@ from typing import Generic, Protocol, TypeVar
 
 import anyio
 
-from service.errors import (
-    DiskFull,
-    ServiceError,
-    WrongDigest,
-    WrongLength,
-    require_size,
-)
+from service.errors import DiskFull, ServiceError, WrongDigest, WrongLength, require_size
 
 Result = TypeVar("Result")
 Written = TypeVar("Written", covariant=True)

@@ -22,15 +22,7 @@ from tests.benchmarks.chaos.processes import Process, Role, identity_of, kill, r
 from tests.benchmarks.chaos.records import Records
 from tests.benchmarks.chaos.report import MOST_HELD_S, out_of_bounds, table
 from tests.benchmarks.chaos.sending import Sender
-from tests.benchmarks.chaos.victims import (
-    Attempt,
-    Kill,
-    Purpose,
-    counted,
-    histogram,
-    shares_of,
-    was_near_a_publication,
-)
+from tests.benchmarks.chaos.victims import Attempt, Kill, Purpose, counted, histogram, shares_of, was_near_a_publication
 from tests.helpers.live_api import Client, sha256_of
 from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi

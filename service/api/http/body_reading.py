@@ -17,12 +17,7 @@ from service.api.context import DOCUMENT_WITHIN_S, Context
 from service.api.dependencies import CallerDep
 from service.api.http.request_bodies import BODY, Body
 from service.api.manifests.bounded_process import LARGE_BYTES
-from service.errors import (
-    ServiceError,
-    TooSlow,
-    invalid_document,
-    require_size,
-)
+from service.errors import ServiceError, TooSlow, invalid_document, require_size
 from service.settings import Settings
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -9,11 +9,7 @@ from dataclasses import dataclass, field
 
 import anyio
 
-from service.errors import (
-    Busy,
-    ServiceError,
-    TooManyLargeBodies,
-)
+from service.errors import Busy, ServiceError, TooManyLargeBodies
 
 _RETRY_AFTER_S = 10
 

@@ -13,9 +13,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from schemas.drive import MAX_PATH_CHARACTERS
 from service.database.tables import Drive, Job, Map, Scene
-from service.errors import (
-    BadCursor,
-)
+from service.errors import BadCursor
 
 Paged = TypeVar("Paged", Drive, Job, Map, Scene)
 

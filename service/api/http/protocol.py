@@ -16,12 +16,7 @@ from uvicorn.server import ServerState
 
 from service.api.http.problem_response import problem_response
 from service.api.middleware.security_headers import add_security_headers
-from service.errors import (
-    HeadTooLarge,
-    MalformedRequest,
-    ServiceError,
-    TooSlow,
-)
+from service.errors import HeadTooLarge, MalformedRequest, ServiceError, TooSlow
 
 if TYPE_CHECKING:
     from uvicorn._types import ASGI3Application

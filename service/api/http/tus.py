@@ -10,11 +10,7 @@ from datetime import UTC, datetime
 from email.utils import format_datetime
 
 from service.domain.uploads import Announced
-from service.errors import (
-    MalformedUpload,
-    ServiceError,
-    TusVersion,
-)
+from service.errors import MalformedUpload, ServiceError, TusVersion
 
 VERSION = "1.0.0"
 EXTENSIONS = "creation,checksum,expiration,termination"

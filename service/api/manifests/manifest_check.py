@@ -13,12 +13,7 @@ from typing import TypeVar
 from schemas.api.resource import Finding
 from service.api.context import Context
 from service.api.manifests.bounded_process import TooCostlyError, end_of_log, run_on_document
-from service.errors import (
-    CheckFailed,
-    ManifestTooLarge,
-    ServiceError,
-    store_unavailable,
-)
+from service.errors import CheckFailed, ManifestTooLarge, ServiceError, store_unavailable
 
 log = logging.getLogger("mrasfm.api")
 

@@ -8,11 +8,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.http.problem_response import problem_response
-from service.errors import (
-    EncodedBody,
-    ServiceError,
-    TooSlow,
-)
+from service.errors import EncodedBody, ServiceError, TooSlow
 
 
 class BodyRules:

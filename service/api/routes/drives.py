@@ -26,10 +26,7 @@ from service.domain import drives
 from service.domain.drives import Stored
 from service.domain.idempotency import Answer
 from service.domain.manifest_facts import ManifestFacts
-from service.errors import (
-    DriveRejected,
-    ServiceError,
-)
+from service.errors import DriveRejected, ServiceError
 from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.durability import secure_drive
 from service.storage.garbage_collection import collect_unused

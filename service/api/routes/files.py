@@ -28,10 +28,7 @@ from service.database.tables import Blob, DriveFile
 from service.digests import parse_digest
 from service.domain import drive_files, drives
 from service.domain.idempotency import Answer
-from service.errors import (
-    PartialBody,
-    ServiceError,
-)
+from service.errors import PartialBody, ServiceError
 from service.storage.spool import receive, receive_into
 
 router = APIRouter(prefix="/v1/drives/{drive_id}", tags=["files"])

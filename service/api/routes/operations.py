@@ -20,9 +20,7 @@ from service.api.http.responses import gives, problems
 from service.api.metrics import CONTENT_TYPE, ONLINE_US, Metrics
 from service.api.readiness import Readiness
 from service.database.tables import Job, JobState, WorkerSeen, now_us
-from service.errors import (
-    Unauthorized,
-)
+from service.errors import Unauthorized
 from service.job_queue import QUEUES, BrokerError
 
 router = APIRouter(tags=["operation"])

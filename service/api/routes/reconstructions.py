@@ -19,9 +19,7 @@ from service.api.routes.drives import rejected
 from service.database.tables import now_us
 from service.domain import drives, jobs
 from service.domain.idempotency import Answer
-from service.errors import (
-    DriveNotCommitted,
-)
+from service.errors import DriveNotCommitted
 
 router = APIRouter(prefix="/v1/reconstructions", tags=["reconstructions"])
 

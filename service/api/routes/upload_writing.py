@@ -16,12 +16,7 @@ from service.api.http.tus import Checksum
 from service.api.routes.file_ingest import keep_archive, keep_file, require_open, require_wanted
 from service.database.tables import Upload, now_us
 from service.domain import uploads
-from service.errors import (
-    ChecksumMismatch,
-    ServiceError,
-    WrongDigest,
-    WrongOffset,
-)
+from service.errors import ChecksumMismatch, ServiceError, WrongDigest, WrongOffset
 from service.storage.blob_writer import file_sha256
 from service.storage.durability import boot_id
 from service.storage.spool import Spooled, require_space

@@ -18,12 +18,7 @@ from service.api.routes.upload_writing import UploadWriting, current_offset, dis
 from service.database.tables import Upload, now_us
 from service.domain import drives, uploads
 from service.domain.idempotency import Answer
-from service.errors import (
-    MethodNotAllowed,
-    ServiceError,
-    WrongMediaType,
-    require_size,
-)
+from service.errors import MethodNotAllowed, ServiceError, WrongMediaType, require_size
 from service.storage.spool import require_space
 
 

@@ -15,14 +15,7 @@ from service.database.tables import Drive, Job, JobState, Project, new_id
 from service.domain.jobs._completion import after_end
 from service.domain.jobs._dependencies import orphans
 from service.domain.jobs._queries import ACTIVE, active_of_drive, change, close_attempts, locked, tell_state
-from service.errors import (
-    CheckActive,
-    DriveDeleted,
-    JobEnded,
-    JobNotFailed,
-    QuotaFull,
-    TooManyJobs,
-)
+from service.errors import CheckActive, DriveDeleted, JobEnded, JobNotFailed, QuotaFull, TooManyJobs
 
 
 class OfTree(TypedDict, total=False):

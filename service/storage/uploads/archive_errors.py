@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from service.errors import (
-    DamagedArchive,
-    ServiceError,
-)
+from service.errors import DamagedArchive, ServiceError
 
 _SHOWN_CHARACTERS = 120
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.errors import (
-    ArchiveTooLarge,
-    ServiceError,
-)
+from service.errors import ArchiveTooLarge, ServiceError
 from service.storage.uploads.archive_errors import shown
 
 # Below this nothing is a bomb, and short files of one colour compress a thousandfold.

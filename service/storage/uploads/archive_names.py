@@ -6,12 +6,7 @@ import re
 from collections.abc import Collection
 
 from schemas.file_names import MANIFEST_NAME, composed, portable_key
-from service.errors import (
-    EmptyArchive,
-    ServiceError,
-    UnexpectedFile,
-    UnsafeArchive,
-)
+from service.errors import EmptyArchive, ServiceError, UnexpectedFile, UnsafeArchive
 from service.storage.uploads.archive_errors import shown
 
 _MAX_NAME_BYTES = 1024  # the manifest's paths have up to 512 characters, and a top folder may come before them

@@ -20,11 +20,7 @@ from typing import Protocol
 
 import anyio
 
-from service.errors import (
-    ServiceError,
-    UploadLocked,
-    require_size,
-)
+from service.errors import ServiceError, UploadLocked, require_size
 from service.storage.spool import BATCH_BYTES, BatchWriter, DiskLimiter, Part, full_disk_is_507, require_space
 
 _FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC

@@ -14,13 +14,7 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any, BinaryIO, cast
 
-from service.errors import (
-    ArchiveTooLarge,
-    NotAnArchive,
-    ServiceError,
-    UnsafeArchive,
-    UnsupportedArchive,
-)
+from service.errors import ArchiveTooLarge, NotAnArchive, ServiceError, UnsafeArchive, UnsupportedArchive
 from service.storage.uploads.archive_errors import damaged, shown
 from service.storage.uploads.archive_limits import SMALL_BYTES, ArchiveLimits, Budget, require_ratio
 from service.storage.uploads.archive_names import safe_name
