@@ -41,7 +41,7 @@ class FeatureConfig(_Section):
     max_keypoints: Count = Field(2048, description="per image; 1024 costs accuracy")
     spread: bool = Field(
         True,
-        description="a network's keypoints are taken all over the image first; `false` takes the strongest",
+        description="keypoints are taken all over the image first; `false` takes the strongest",
     )
     refine: bool = Field(
         True, description="`xfeat`: keypoints move to the nearest detail, and those without one are dropped"

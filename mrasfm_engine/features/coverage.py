@@ -1,6 +1,6 @@
 """Orders keypoints so that those at the front, however many are taken, cover the image.
 
-A network is surest of crisp corners, which crowd together on what is far: most of the strongest keypoints say the same
+A detector is surest of crisp corners, which crowd together on what is far: most of the strongest keypoints say the same
 thing again, and few lie on the ground and walls nearby. The scale of a drive without positions rests on the distances
 between cameras, and only near points tell these from a camera that is turned by a hundredth of a degree: without them
 the calibration's error becomes one of scale.

@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE, NO_FEATURES, colors_at
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes
 
 SMALLEST_DESCRIPTOR_SUM = 1e-3
+CANDIDATES = 4  # times the number wanted, of which those are chosen that cover the image
 
 
 class SiftExtractor:
@@ -26,7 +28,7 @@ class SiftExtractor:
         scale = min(1.0, self._config.max_side_px / max(gray.shape))
         if scale < 1.0:
             gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        small_mask, wanted = None, self._config.max_keypoints
+        small_mask, wanted = None, self._config.max_keypoints * (CANDIDATES if self._config.spread else 1)
         if mask is not None:
             small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
             # OpenCV masks only after it has chosen the strongest: the rest of the image must not use up the number.
@@ -41,7 +43,10 @@ class SiftExtractor:
         keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
         if not keypoints:
             return NO_FEATURES
-        order = np.argsort([-k.response for k in keypoints], kind="stable")[: self._config.max_keypoints]
+        order = np.argsort([-k.response for k in keypoints], kind="stable")
+        if self._config.spread:
+            order = order[covering_order(np.array([keypoints[i].pt for i in order], np.float32))]
+        order = order[: self._config.max_keypoints]
         # OpenCV puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
         xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (
             gray.shape[1] / rgb.shape[1],

@@ -221,3 +221,16 @@ def test_a_truncated_mask_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixtu
     with pytest.raises(InputError, match=r"mask\.png is truncated"):
         extract_features(drive, SiftExtractor(FeatureConfig()), threads=1)
     capfd.readouterr()
+
+
+def test_keypoints_cover_the_image_although_the_strongest_crowd() -> None:
+    image, _ = blobs(np.random.default_rng(2))
+    faint = 60 + 0.35 * (image.astype(float) - 60)
+    faint[:240, :320] = image[:240, :320]  # a sixth of the blobs
+    shares = {}
+    for spread in (True, False):
+        config = FeatureConfig(max_keypoints=250, spread=spread)
+        xy = SiftExtractor(config).extract(np.round(faint).astype(np.uint8), None).xy_px
+        assert len(xy) == 250
+        shares[spread] = ((xy[:, 0] < 320) & (xy[:, 1] < 240)).mean()
+    assert 0.1 < shares[True] < 0.6 * shares[False]
