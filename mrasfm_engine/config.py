@@ -102,9 +102,6 @@ class MatchConfig(_Section):
     min_matches: Count = Field(15, description="pairs with fewer matches or fewer inliers are dropped")
     same_class: bool = Field(True, description="matches between different classes of the masks are dropped")
     max_error_px: Positive = Field(2.0, description="largest epipolar distance of an inlier")
-    calibration_error_px: Positive = Field(
-        8.0, description="the same between cameras of one unit, where the calibration gives the geometry"
-    )
 
 
 class MappingConfig(_Section):
@@ -169,9 +166,6 @@ class BundleAdjustmentConfig(_Section):
         description="one factor for fx and fy of each camera varies, with its prior, where `rig_from_cam` varies too",
     )
     min_heading_change_deg: Positive = Field(15.0, description="without GNSS, calibration is held on straighter drives")
-    max_scale_sigma: Positive = Field(
-        0.1, description="calibration is held where freeing it would leave the scale more uncertain than this"
-    )
 
 
 class GnssConfig(_Section):

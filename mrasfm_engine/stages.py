@@ -30,6 +30,7 @@ from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.pair_selection import pairs_from_poses, pairs_from_window, pairs_without_selection
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.matching.retrieval import revisit_pairs
+from mrasfm_engine.matching.simultaneous import contradiction
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
 from mrasfm_engine.registry import Components, load_components
@@ -47,7 +48,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 1, Stage.MAPPING: 1}
+VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 2}
 
 
 @dataclass
@@ -261,10 +262,13 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             pairs,
             run.components.matcher,
             run.config.matching,
+            run.config.bundle_adjustment,
             threads=run.config.threads,
             progress=run.step(Stage.MATCHES),
             cancel=run.cancel,
         )
+        names = [camera.name for camera in run.drive.cameras]
+        contradicted = contradiction(names, run.drive.rig_from_cam, result.rig)
         return pack_pairs(result.pairs), {
             "candidate_pairs": len(pairs),
             "verified_pairs": len(result.pairs),
@@ -272,11 +276,21 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             "dropped_between_classes": result.across_classes,
             "matches": sum(len(p.matches) for p in result.pairs),
             "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),
+            "simultaneous": {
+                "matches": result.rig.matches,
+                "share_that_fits_calibration_as_given": round(result.rig.fitted_as_given, 4),
+                "share_that_fits_calibration_as_corrected": round(result.rig.fitted, 4),
+            },
+            "contradiction": None if contradicted is None else as_json(contradicted),
         }
 
     settings = [section.model_dump() for section in (run.config.pairs, run.config.matching, run.config.gnss)]
+    priors = {"refine_calibration", "sigma_rotation_deg", "sigma_translation_m"}
+    settings.append(run.config.bundle_adjustment.model_dump(include=priors))
     settings.append({"use_gnss": run.config.use_gnss, "models": run.components.fingerprint_of("matcher")})
     arrays, report = run.stage(Stage.MATCHES, settings, work)
+    if report["contradiction"] is not None:
+        run.report["findings"].append(report["contradiction"])
     if not report["verified_pairs"]:
         raise ReconstructionError(
             f"nothing matches: none of {report['candidate_pairs']} image pairs has a verified match",

@@ -12,6 +12,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.matching.simultaneous import calibration_sigmas
 from mrasfm_engine.types import Bools, Floats
 
 MIN_BASELINES_M2 = 1e-6
@@ -24,13 +25,13 @@ def calibration_prior(mapper: Mapper, held: Bools | None = None) -> CalibrationP
 
     Directions that are `held` (cameras, 6) stay as given.
     """
-    settings, cameras = mapper.config.bundle_adjustment, mapper.drive.cameras
     given = mapper.drive.rig_from_cam
+    sigma_rotation_rad, sigma_translation_m = calibration_sigmas(mapper.drive, mapper.config.bundle_adjustment)
     prior = CalibrationPrior(
         rotation=given[:, :3, :3],
         position_m=given[:, :3, 3],
-        sigma_rotation_rad=np.radians([c.sigma_rotation_deg or settings.sigma_rotation_deg for c in cameras]),
-        sigma_translation_m=np.array([c.sigma_translation_m or settings.sigma_translation_m for c in cameras]),
+        sigma_rotation_rad=sigma_rotation_rad,
+        sigma_translation_m=sigma_translation_m,
         held=held,
     )
     return prior.with_weights(mapper.state)
@@ -57,8 +58,8 @@ def assess_calibration(
 ) -> CalibrationDecision:
     """Decide whether the drive observes the calibration: freeing an unobserved one makes everything worse.
 
-    A straight trajectory without GNSS never does. Else the cost of freeing decides: the images, the priors and the
-    positions must still know the scale.
+    A straight trajectory without GNSS never does. How long the baselines are, images never tell: their prior does, and
+    positions.
 
     Parameters
     ----------
@@ -84,10 +85,8 @@ def assess_calibration(
     )
     if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
         sigma = covariances(problem, problem.state).sigma_scale
-        if np.isnan(sigma):
+        if not np.isfinite(sigma):
             return CalibrationDecision(False, "held as given: too few units to tell what freeing it would do")
-        if sigma > settings.max_scale_sigma:
-            return CalibrationDecision(False, f"held as given: freed, it would leave scale uncertain by {sigma:.0%}")
     return CalibrationDecision(
         True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"
     )

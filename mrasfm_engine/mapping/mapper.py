@@ -17,6 +17,7 @@ from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.mapping.rig_motion import RigMotion
+from mrasfm_engine.matching.simultaneous import rig_of_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import PairMatches
@@ -129,6 +130,22 @@ class Mapper:
         for image in np.flatnonzero(arrays["has_own_pose"]):
             mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
         return mapper
+
+    def correct_calibration(self, pairs: Sequence[PairMatches]) -> None:
+        """Begin with the calibration as simultaneous images correct it, see `matching.simultaneous`."""
+
+        def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+            a, b = (
+                self.keypoints.first[i] + m for i, m in zip((pair.image_a, pair.image_b), pair.matches.T, strict=True)
+            )
+            return self.keypoints.rays[a[pair.inliers]], self.keypoints.rays[b[pair.inliers]]
+
+        rig = rig_of_drive(self.drive, pairs, rays_of, self.config.matching, self.config.bundle_adjustment)
+        self.state = replace(
+            self.state,
+            camera_rotation=np.ascontiguousarray(rig.rig_from_cam[:, :3, :3]),
+            camera_position_m=np.ascontiguousarray(rig.rig_from_cam[:, :3, 3]),
+        )
 
     def with_points_of(self, units: Bools) -> Mapper:
         """A mapper of the same poses whose units (units,) alone are registered, with points triangulated from these."""

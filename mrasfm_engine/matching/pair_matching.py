@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, in_front_of_both
+from mrasfm_engine.matching.simultaneous import RigEstimate, SimultaneousMatches, are_simultaneous, rig_of_drive
+from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import may_match
-from mrasfm_engine.types import Cancel, CountProgress, Ints, Ints32
-
-SIMULTANEOUS_US = 2_000  # cameras less apart than this are one rig: a fast car goes 6 cm
+from mrasfm_engine.types import Cancel, CountProgress, Floats, Ints, Ints32
 
 
 class Matcher(Protocol):
@@ -42,7 +40,8 @@ class SearchResult:
     pairs: list[PairMatches]
     few_matches: int  # pairs with too few matches
     few_inliers: int  # pairs whose matches fit no geometry
-    across_classes: int = 0  # matches that were dropped because their ends are of different semantic classes
+    across_classes: int  # matches that were dropped because their ends are of different semantic classes
+    rig: RigEstimate  # as simultaneous images show it
 
 
 def match_pairs(
@@ -51,6 +50,7 @@ def match_pairs(
     pairs: Ints,
     matcher: Matcher,
     config: MatchConfig,
+    calibration: BundleAdjustmentConfig,
     *,
     threads: int,
     progress: CountProgress | None = None,
@@ -58,9 +58,10 @@ def match_pairs(
 ) -> SearchResult:
     """Match and verify image pairs (n, 2).
 
-    Between units an essential matrix must explain the matches. Between cameras of one unit the calibration gives the
-    geometry, up to its error: matches far from its epipolar lines or behind a camera are out as well. Matches between
-    different semantic classes are dropped before either.
+    An essential matrix must explain the matches of a pair. Between simultaneous images of one unit the calibration
+    gives the geometry: all of their matches together correct it where they contradict it (see `simultaneous`), and
+    matches far from the epipolar lines that follow, or behind a camera, are out as well. Matches between different
+    semantic classes are dropped before either.
     """
     cameras = [drive.cameras[i.camera] for i in drive.images]
     prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
@@ -86,12 +87,6 @@ def match_pairs(
         ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
         ca, cb = drive.images[a].camera, drive.images[b].camera
         inliers = essential_inliers(ra, rb, max_error=config.max_error_px / min(focal[ca], focal[cb]))
-        apart_us = abs(drive.images[a].timestamp_us - drive.images[b].timestamp_us)
-        # The vehicle's motion between two instants is part of the geometry, and not known yet.
-        if drive.images[a].unit == drive.images[b].unit and apart_us <= SIMULTANEOUS_US:
-            b_from_a = se3.inverse(drive.rig_from_cam[cb]) @ drive.rig_from_cam[ca]
-            gate = config.calibration_error_px / min(focal[ca], focal[cb])
-            inliers &= (epipolar_errors(b_from_a, ra, rb) < gate) & in_front_of_both(b_from_a, ra, rb)
         if inliers.sum() < config.min_matches:
             return "few inliers"
         return PairMatches(image_a=a, image_b=b, matches=matches, inliers=inliers)
@@ -113,9 +108,40 @@ def match_pairs(
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+
+    def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+        a, b = pair.matches[pair.inliers].T
+        return rays[pair.image_a][a], rays[pair.image_b][b]
+
+    rig = rig_of_drive(drive, found, rays_of, config, calibration)
+    checked = [
+        _in_rig(
+            drive,
+            pair,
+            rays_of(pair),
+            rig,
+            max_error=config.max_error_px / focal[[drive.images[i].camera for i in (pair.image_a, pair.image_b)]].min(),
+        )
+        if are_simultaneous(drive, pair.image_a, pair.image_b)
+        else pair
+        for pair in found
+    ]
+    kept = [pair for pair in checked if pair.inliers.sum() >= config.min_matches]
     return SearchResult(
-        pairs=found,
+        pairs=kept,
         few_matches=lost["few matches"],
-        few_inliers=lost["few inliers"],
+        few_inliers=lost["few inliers"] + len(found) - len(kept),
         across_classes=int(across_classes.sum()),
+        rig=rig,
     )
+
+
+def _in_rig(
+    drive: Drive, pair: PairMatches, rays: tuple[Floats, Floats], rig: RigEstimate, *, max_error: float
+) -> PairMatches:
+    """A simultaneous pair with those inliers that agree with the rig."""
+    a, b = (drive.images[image].camera for image in (pair.image_a, pair.image_b))
+    inliers = pair.inliers.copy()
+    found = SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays[0], rays_b=rays[1])
+    inliers[pair.inliers] = rig.fits(found, max_error=max_error)
+    return replace(pair, inliers=inliers)

@@ -52,6 +52,21 @@ def parallax_rad(rays_a: Floats, rays_b: Floats) -> float:
     return float(np.median(np.arccos(cosine)))
 
 
+def signed_parallax(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Floats:
+    """Sines (n,) of the angles between rays about their epipolar planes' normals: negative where they meet behind.
+
+    Of a ray's two planes, with either camera's ray, the one that says less; zero where rays are parallel.
+    """
+    ra, t = rays_a @ b_from_a[:3, :3].T, b_from_a[:3, 3]
+    between = np.cross(rays_b, ra)
+    by_ray = []
+    for rays in (ra, rays_b):
+        normal = np.cross(t, rays)
+        by_ray.append((between * normal).sum(1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12))
+    result: Floats = np.minimum(*by_ray)
+    return result
+
+
 def in_front_of_both(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Bools:
     """Return which pairs of rays (n,) meet in front of both cameras under a known pose, or are parallel to within
     rounding.

@@ -72,7 +72,9 @@ def changing_light(data: Path, work: Path, models: Path) -> Iterator[Figure]:
         components = load_components(config, None)
         features = extract_features(drive, components.extractor, threads=THREADS)
         pairs = pairs_from_window(drive, config.pairs)
-        found = match_pairs(drive, features, pairs, components.matcher, config.matching, threads=THREADS)
+        found = match_pairs(
+            drive, features, pairs, components.matcher, config.matching, config.bundle_adjustment, threads=THREADS
+        )
         inliers = {(p.image_a, p.image_b): int(p.inliers.sum()) for p in found.pairs}
         for kind, parity in (("bright with dark", 1), ("dark with dark, bright with bright", 0)):
             of_kind = [(int(a), int(b)) for a, b in pairs if (units[a] - units[b]) % 2 == parity]

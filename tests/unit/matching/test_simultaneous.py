@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.matching.simultaneous import (
+    RigEstimate,
+    SimultaneousMatches,
+    contradiction,
+    epipolar_derivatives,
+    estimate_rig,
+    rig_of_drive,
+)
+from mrasfm_engine.matching.verification import signed_parallax
+from mrasfm_engine.scene.scene import PairMatches
+from tests.helpers.simulated_drive import SimulatedDrive, make_simulated_drive, true_matches
+
+DEG = np.pi / 180
+
+
+def turned(camera: int, rotation_deg: list[float]) -> SimulatedDrive:
+    """A drive of six cameras of which one is given with another rotation than it has, about its own axes."""
+
+    def given(rig_from_cam: np.ndarray) -> np.ndarray:
+        rig_from_cam[camera, :3, :3] = rig_from_cam[camera, :3, :3] @ se3.exp_so3(np.array(rotation_deg) * DEG)
+        return rig_from_cam
+
+    return make_simulated_drive(units=6, cameras=6, points=3000, given=given)
+
+
+def estimate(simulated: SimulatedDrive, *, wrong: int = 0, **calibration: bool) -> RigEstimate:
+    kinds, params = pack_cameras(simulated.drive.cameras)
+
+    def rays(image: int, keypoints: np.ndarray) -> np.ndarray:
+        camera = simulated.drive.images[image].camera
+        return unproject_pixels(int(kinds[camera]), params[camera], simulated.features[image].xy_px[keypoints])
+
+    def rays_of(pair: PairMatches) -> tuple[np.ndarray, np.ndarray]:
+        a, b = pair.matches[pair.inliers].T
+        return rays(pair.image_a, a), rays(pair.image_b, b)
+
+    pairs = true_matches(simulated, window=0, wrong=wrong)
+    return rig_of_drive(simulated.drive, pairs, rays_of, MatchConfig(), BundleAdjustmentConfig(**calibration))
+
+
+def relative_error_deg(found: np.ndarray, true: np.ndarray, a: int, b: int) -> float:
+    """Error of the rotation between two cameras."""
+    off = (found[a, :3, :3].T @ found[b, :3, :3]).T @ (true[a, :3, :3].T @ true[b, :3, :3])
+    return float(np.degrees(np.linalg.norm(se3.log_so3(off))))
+
+
+def test_a_rig_that_is_given_well_stays_exactly_as_given() -> None:
+    simulated = turned(1, [0.0, 0.0, 0.0])
+    rig = estimate(simulated)
+    np.testing.assert_array_equal(rig.rig_from_cam, simulated.drive.rig_from_cam)
+    assert rig.matches > 500
+    assert rig.fitted_as_given == rig.fitted > 0.98
+    assert contradiction([c.name for c in simulated.drive.cameras], simulated.drive.rig_from_cam, rig) is None
+
+
+@pytest.mark.parametrize("wrong", [0, 10])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_camera_that_is_turned_within_its_prior_is_found(sign: int, wrong: int) -> None:
+    simulated = turned(1, [sign * 1.5, 0.0, 0.0])
+    rig = estimate(simulated, wrong=wrong)
+    true = simulated.truth.rig_from_cam
+    neighbours = [b for b in range(6) if b != 1 and true[b, :3, 2] @ true[1, :3, 2] > 0.3]
+    assert neighbours
+    for b in neighbours:
+        assert relative_error_deg(simulated.drive.rig_from_cam, true, 1, b) == pytest.approx(1.5, abs=0.01)
+        assert relative_error_deg(rig.rig_from_cam, true, 1, b) < 0.3
+    assert rig.fitted > rig.fitted_as_given + 0.1
+
+
+def test_what_was_found_is_said_where_most_matches_contradict_the_calibration() -> None:
+    given = make_simulated_drive(units=6, cameras=2, points=2000).drive.rig_from_cam
+    estimated = given.copy()
+    estimated[1, :3, :3] = estimated[1, :3, :3] @ se3.exp_so3(np.array([1.5, 0.0, 0.0]) * DEG)
+    rig = RigEstimate(
+        rig_from_cam=estimated, covariance_rad2=np.eye(6), variance_translation_m2=np.ones(2), matches=800,
+        fitted_as_given=0.02, fitted=0.99,
+    )  # fmt: skip
+    found = contradiction(["front", "left"], given, rig)
+    assert found is not None
+    assert "front and left turned by 1.50 deg" in found.what
+    assert "2% fit the calibration as given, 99%" in found.what
+
+
+def test_settings_that_hold_the_calibration_hold_it_here_too() -> None:
+    simulated = turned(1, [1.5, 0.0, 0.0])
+    rig = estimate(simulated, refine_calibration=False)
+    np.testing.assert_array_equal(rig.rig_from_cam, simulated.drive.rig_from_cam)
+    assert rig.matches == 0
+    # Nothing is known but the prior, so the gate is as wide as that.
+    assert np.sqrt(rig.covariance_rad2[0, 0]) == pytest.approx(2.0 * DEG)
+
+
+def test_cameras_at_one_place_and_matches_of_nothing_do_no_harm() -> None:
+    rng = np.random.default_rng(0)
+    given = make_simulated_drive(units=1, cameras=6, points=50).drive.rig_from_cam.copy()
+    given[:, :3, 3] = given[0, :3, 3]
+    rays = rng.normal(size=(2, 300, 3)) + np.array([0, 0, 3])
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    found = [SimultaneousMatches(camera_a=0, camera_b=1, rays_a=rays[0], rays_b=rays[1])]
+    sigmas = np.full(6, 2.0 * DEG), np.full(6, 0.05)
+    rig = estimate_rig(
+        given, found, sigma_rotation_rad=sigmas[0], sigma_translation_m=sigmas[1], focal_px=np.full(6, 700.0),
+        max_error_px=2.0,
+    )  # fmt: skip
+    turned_deg = np.degrees(
+        np.linalg.norm(se3.log_so3(rig.rig_from_cam[:, :3, :3] @ given[:, :3, :3].swapaxes(1, 2)), axis=1)
+    )
+    assert turned_deg.max() < 6.0
+    assert np.isfinite(rig.covariance_rad2).all()
+
+
+def test_derivatives_are_those_of_the_error() -> None:
+    rng = np.random.default_rng(0)
+    poses = np.stack([se3.transform(se3.exp_so3(rng.normal(0, 0.2, 3)), rng.normal(0, 0.5, 3)) for _ in range(2)])
+    points = rng.uniform(-2, 2, (20, 3)) + np.array([0, 0, 8])
+    rays = [se3.apply(se3.inverse(pose), points) for pose in poses]
+    rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
+    # Off the epipolar lines by so little that what the derivatives leave out, the length's, does not show.
+    rays[0] = rays[0] @ se3.exp_so3(np.array([1e-7, 2e-7, -1e-7])).T
+    at, by_rotation, by_shift, _ = epipolar_derivatives(*poses, *rays)
+    step = 1e-7
+    for axis in range(3):
+        delta = step * np.eye(3)[axis]
+        for camera in range(2):
+            moved = poses.copy()
+            moved[camera, :3, :3] = se3.exp_so3(delta) @ moved[camera, :3, :3]
+            change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
+            np.testing.assert_allclose(by_rotation[camera][:, axis], change, atol=1e-5)
+        moved = poses.copy()
+        moved[0, :3, 3] += delta
+        change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
+        np.testing.assert_allclose(by_shift[:, axis], change, atol=1e-5)
+
+
+def test_parallax_has_the_sign_of_the_side_on_which_rays_meet() -> None:
+    rng = np.random.default_rng(0)
+    b_from_a = se3.transform(se3.exp_so3([0.02, -0.01, 0.03]), [-0.5, 0.02, 0.1])
+    points = rng.uniform(-2, 2, (50, 3)) + np.array([0, 0, 10])
+    rays_a, rays_b = points, se3.apply(b_from_a, points)
+    rays_a, rays_b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (rays_a, rays_b))
+    front = signed_parallax(b_from_a, rays_a, rays_b)
+    angles = np.arccos(((rays_a @ b_from_a[:3, :3].T) * rays_b).sum(1))
+    np.testing.assert_allclose(front, np.sin(angles), rtol=1e-6)
+    backward = b_from_a.copy()
+    backward[:3, 3] *= -1
+    np.testing.assert_allclose(signed_parallax(backward, rays_a, rays_b), -front, rtol=1e-6)
+    assert np.abs(signed_parallax(b_from_a, rays_a, rays_a @ b_from_a[:3, :3].T)).max() < 1e-9
