@@ -18,8 +18,14 @@ from mrasfm_engine.types import Bools, Floats, Ints
 SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
 SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
 HYPOTHESES = 300
-SCALE_RANGE = (0.8, 1.25)  # of the receiver's trajectory against the rig's; farther off, something is wrong
+LEAST_SCALE_RANGE = 1.25  # of the receiver's trajectory against the rig's, where the baselines are known better
+SCALE_SIGMAS = 3.0
 MIN_CONSENSUS = 0.3  # of the positions
+# A trajectory whose calibration is off a little bends, by so much of its extent; a good receiver sees that first. The
+# least of these is taken under which most positions agree.
+BENDS = (0.01, 0.03, 0.1)
+MOST = 0.7
+MIRRORED = (1, 0, 2)  # axes of measured positions whose latitude and longitude are swapped
 LOSS_SCALE = 2.0
 MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
 
@@ -48,9 +54,13 @@ def align_with_gnss(
     sigma_m: Floats,
     *,
     outlier_sigmas: float,
+    sigma_rig_scale: float,
     rng: np.random.Generator,
 ) -> GnssAlignment | str:
     """Rigid transform from the reconstruction's frame to the receiver's.
+
+    The reconstruction may be bent, as it may have been made with a calibration that only the receiver corrects. Its
+    positions are judged again once they have taken part in an adjustment, see `placement.judge_again`.
 
     Parameters
     ----------
@@ -62,6 +72,8 @@ def align_with_gnss(
         Positions and sigmas (n, 3) of the receiver, x east, y north, z up.
     outlier_sigmas
         Residuals beyond so many sigmas are outliers.
+    sigma_rig_scale
+        Of the reconstruction's scale, relative, by what is known of the rig's baselines.
     rng
         Draws the hypotheses.
 
@@ -77,17 +89,20 @@ def align_with_gnss(
     spread = np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1)
     if np.sqrt((spread**2).sum()) < MIN_EXTENT_SIGMAS * float(np.median(sigma_m[:, :2])):
         return f"the car moved by {2 * spread.max():.1f} m, too little against the receiver's noise to tell directions"
-    start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, SCALE_RANGE)
+    most = max(LEAST_SCALE_RANGE, float(np.exp(min(SCALE_SIGMAS * sigma_rig_scale, 1.0))))
+    scale_range = (1.0 / most, most)
+    start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)
+    if inlier.mean() < MOST:
+        bent = _bent(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)
+        if bent is not None:
+            start, inlier = bent
     if inlier.sum() < 3 or inlier.mean() < MIN_CONSENSUS:
         return _why_not(a, measured_m, sigma_m, inlier, outlier_sigmas, rng)
     similarity, factor = start @ level, 1.0
     for _ in range(4):
         similarity = _refine(similarity, antenna_m, up, forward, measured_m, sigma_m * factor, inlier)
         off_m = _apply(similarity, antenna_m) - measured_m
-        whitened = np.linalg.norm(off_m / sigma_m, axis=1)
-        # 1.54 is the median length of a standard normal 3-vector.
-        factor = max(1.0, float(np.median(whitened[inlier])) / 1.54)
-        inlier = whitened < outlier_sigmas * factor
+        inlier, factor = judge(off_m, sigma_m, inlier, outlier_sigmas=outlier_sigmas)
         if inlier.sum() < 3:
             return "no consistent set of positions was found"
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
@@ -95,7 +110,7 @@ def align_with_gnss(
     centre = np.average(antenna_m[inlier], axis=0, weights=weight)
     spread = float(((antenna_m[inlier] - centre) ** 2 / (factor * sigma_m[inlier]) ** 2).sum())
     sigma_scale = 1.0 / np.sqrt(max(spread, 1e-12)) / scale
-    if not SCALE_RANGE[0] - 3 * sigma_scale <= scale <= SCALE_RANGE[1] + 3 * sigma_scale:
+    if not scale_range[0] - 3 * sigma_scale <= scale <= scale_range[1] + 3 * sigma_scale:
         return _scale_is_off(scale)
     return GnssAlignment(
         world_from_model=se3.transform(rotation, _apply(similarity, centre[None])[0] - rotation @ centre),
@@ -105,6 +120,49 @@ def align_with_gnss(
         sigma_scale=float(sigma_scale),
         noise_factor=factor,
     )
+
+
+def judge(off_m: Floats, sigma_m: Floats, inlier: Bools, *, outlier_sigmas: float) -> tuple[Bools, float]:
+    """Judge residuals (n, 3), in the order of time; which are no outliers, and the factor on their sigmas.
+
+    The factor, at least 1, is that by which those exceed their sigmas that were no outliers before. In it, a residual is
+    one if it is too large and jumps: a scene that bends moves residuals little by little, and its receiver is right.
+    """
+    whitened = np.linalg.norm(off_m / sigma_m, axis=1)
+    # 1.54 is the median length of a standard normal 3-vector.
+    factor = max(1.0, float(np.median(whitened[inlier])) / 1.54)
+    fits = whitened < outlier_sigmas * factor
+    jump = np.linalg.norm(np.diff(off_m, axis=0) / np.hypot(sigma_m[1:], sigma_m[:-1]), axis=1)
+    follows = jump < outlier_sigmas * factor
+    for order in (range(1, len(fits)), range(len(fits) - 2, -1, -1)):
+        for i in order:
+            before = i - 1 if order.step > 0 else i + 1
+            fits[i] |= fits[before] and follows[min(i, before)]
+    return fits, factor
+
+
+def _bent(
+    a: Floats,
+    measured: Floats,
+    sigma: Floats,
+    outlier_sigmas: float,
+    rng: np.random.Generator,
+    scale_range: tuple[float, float],
+) -> tuple[Floats, Bools] | None:
+    """The similarity and its inliers under the least bend with which most positions agree.
+
+    None where there is none, or where the positions' mirror image, of no rigid motion, agrees better.
+    """
+    extent_m = float(np.sqrt(((a[:, :2] - np.median(a[:, :2], axis=0)) ** 2).sum(1).mean()))
+    for bend in BENDS:
+        wide_m = np.hypot(sigma, bend * extent_m)
+        start, inlier = _best_yaw(a, measured, wide_m, outlier_sigmas, rng, scale_range)
+        mirrored = _best_yaw(a, measured[:, MIRRORED], wide_m, outlier_sigmas, rng, scale_range)[1]
+        if mirrored.mean() >= MOST and mirrored.sum() >= inlier.sum():
+            return None
+        if inlier.mean() >= MOST:
+            return start, inlier
+    return None
 
 
 def _scale_is_off(scale: float) -> str:

@@ -112,12 +112,12 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "from": _scale_source(mapper, refinement),
         }
     if placement is not None and alignment is not None:
-        times = mapper.drive.timestamps_us[placement.units[~alignment.inlier]]
+        times = mapper.drive.timestamps_us[placement.units[~placement.inlier]]
         result["gnss"] = {
-            "units_used": int(alignment.inlier.sum()),
+            "units_used": int(placement.inlier.sum()),
             "outliers_at_us": [int(t) for t in times],
-            "residual_rms_m": float(np.sqrt((alignment.residual_m[alignment.inlier] ** 2).mean())),
-            "noise_factor": alignment.noise_factor,
+            "residual_rms_m": float(np.sqrt((placement.residual_m[placement.inlier] ** 2).mean())),
+            "noise_factor": placement.noise_factor,
             "scale_of_rig_against_gnss": alignment.scale,
         }
     elif placement is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,9 +11,9 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset, judge
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Bools, Floats, Ints
 from schemas.findings import Finding, warning
 
 MIN_CLOCK_OFFSET_S = 0.05
@@ -21,6 +21,7 @@ CLOCK_OFFSET_SIGMAS = 5.0
 MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receiver's scale:
 SCALE_DISAGREEMENT_SIGMAS = 3.0
 MIN_ROUGH_POSES = 2
+MIN_POSITIONS = 3
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
@@ -32,7 +33,12 @@ class Placement:
     prior: PositionPrior | None = None
     reason: str = ""
     alignment: GnssAlignment | None = None
-    units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that took part in aligning
+    units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that have a position
+    measured_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) positions of these
+    sigma_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3)
+    inlier: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (n,)
+    residual_m: Floats = field(default_factory=lambda: np.zeros(0))  # (n,) of the scene as it was judged last
+    noise_factor: float = 1.0  # by which residuals exceed their sigmas
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
 
@@ -47,11 +53,12 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> 
     single = mapper.drive.has_single_camera
     if single and len(units) > 1:
         scale_with_baselines(mapper, _extent(measured[units]) / _extent(mapper.state.unit_position_m[units]))
-    alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma)
+    sigma_rig_scale = scale_of_baselines(mapper)[1]
+    alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
     for _ in range(SCALE_ROUNDS if single else 0):
         if isinstance(alignment, GnssAlignment):
             scale_with_baselines(mapper, alignment.scale)
-            alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma)
+            alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
     if isinstance(alignment, str):
         return Placement(reason=alignment)
     _move(mapper, alignment.world_from_model)
@@ -60,17 +67,53 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> 
     findings = []
     if not single:
         findings = _findings(mapper, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
-    prior = PositionPrior(
-        unit=good,
-        position_m=measured[good],
-        sigma_m=sigma[good] * alignment.noise_factor * np.sqrt(correlated),
-        lever_arm_m=np.asarray(antenna_in_rig_m),
+    placement = Placement(
+        alignment=alignment,
+        units=units,
+        measured_m=measured[units],
+        sigma_m=sigma[units],
+        inlier=alignment.inlier,
+        residual_m=alignment.residual_m,
+        noise_factor=alignment.noise_factor,
+        findings=findings,
     )
-    return Placement(prior=prior, alignment=alignment, units=units, findings=findings)
+    return _with_prior(mapper, placement, np.asarray(antenna_in_rig_m))
+
+
+def judge_again(mapper: Mapper, placement: Placement) -> Placement:
+    """Judge all positions by where the adjustment has put their units.
+
+    Those that were outliers of a bent trajectory come back, with the weight that they have by their sigmas.
+    """
+    assert placement.prior is not None
+    units, arm_m = placement.units, placement.prior.lever_arm_m
+    off_m = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ arm_m - placement.measured_m
+    outlier_sigmas = mapper.config.gnss.outlier_sigmas
+    inlier, factor = judge(off_m, placement.sigma_m, placement.inlier, outlier_sigmas=outlier_sigmas)
+    inlier &= mapper.registered[units]
+    if inlier.sum() < MIN_POSITIONS:
+        return placement
+    residual_m = np.linalg.norm(off_m, axis=1)
+    judged = replace(placement, inlier=inlier, residual_m=residual_m, noise_factor=factor)
+    return _with_prior(mapper, judged, arm_m)
+
+
+def _with_prior(mapper: Mapper, placement: Placement, antenna_in_rig_m: Floats) -> Placement:
+    """The placement with its positions that are no outliers as a term of the adjustment."""
+    good = placement.inlier
+    units = placement.units[good]
+    correlated = _samples_per_correlation_time(mapper.drive.timestamps_us[units], mapper.config.gnss.correlation_time_s)
+    prior = PositionPrior(
+        unit=units,
+        position_m=placement.measured_m[good],
+        sigma_m=placement.sigma_m[good] * placement.noise_factor * np.sqrt(correlated),
+        lever_arm_m=antenna_in_rig_m,
+    )
+    return replace(placement, prior=prior)
 
 
 def _align(
-    mapper: Mapper, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats
+    mapper: Mapper, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats, sigma_rig_scale: float
 ) -> GnssAlignment | str:
     rotation = mapper.state.unit_rotation[units]
     return align_with_gnss(
@@ -80,6 +123,7 @@ def _align(
         measured[units],
         sigma[units],
         outlier_sigmas=mapper.config.gnss.outlier_sigmas,
+        sigma_rig_scale=sigma_rig_scale,
         rng=np.random.default_rng(mapper.config.seed),
     )
 

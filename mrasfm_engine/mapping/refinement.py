@@ -31,12 +31,15 @@ from mrasfm_engine.mapping.miscalibration import (
     find_miscalibrations,
     find_wrong_pair,
 )
-from mrasfm_engine.mapping.placement import Placement, place_by_gnss, place_by_rough_poses
+from mrasfm_engine.mapping.placement import Placement, judge_again, place_by_gnss, place_by_rough_poses
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering
+MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
+BENT = 1.5  # by such a factor on their sigmas,
+STRAIGHTENED = 0.7  # and each leaves at most so much of it
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 3e-2  # of the last step of the last round: a quarter of a standard deviation
 ROUGH_DECREMENT_TOLERANCE = 0.5  # in those before, after which observations change anyway
@@ -120,22 +123,12 @@ def refine(
         result.recalibrated = _wrong_although_held(mapper, free_units, positions, result, cancel)
     result.focal_free = mapper.config.bundle_adjustment.refine_focal and result.calibration.free
     _rescale(mapper, result, _terms(mapper, positions, result))
+    positions = _unbend(mapper, positions, result, free_units, cancel)
     for done in range(ROUNDS):
         is_last = done == ROUNDS - 1
         result.sigma_px = _observation_sigma(mapper)
-        terms = _terms(mapper, positions, result)
-        result.adjustments.append(
-            adjust_poses(
-                mapper,
-                free_units & mapper.registered,
-                free_cameras=result.recalibrated,
-                free_focal=result.focal_free,
-                terms=terms,
-                options=_options(mapper, result.sigma_px, rough=not is_last),
-                cancel=cancel,
-            )
-        )
-        _rescale(mapper, result, terms)
+        _adjust(mapper, positions, result, free_units, rough=not is_last, cancel=cancel)
+        positions = _judged_again(mapper, positions, result)
         if is_last:
             mapper.readmit()
         else:
@@ -160,6 +153,63 @@ def refine(
         result.miscalibrations = find_miscalibrations(*known)
         result.wrong_pair = find_wrong_pair(*known)
     return result
+
+
+def _adjust(
+    mapper: Mapper,
+    positions: PositionPrior | None,
+    result: Refinement,
+    free_units: Bools,
+    *,
+    rough: bool,
+    cancel: Cancel | None,
+) -> None:
+    """Adjust everything that varies, with all priors."""
+    terms = _terms(mapper, positions, result)
+    result.adjustments.append(
+        adjust_poses(
+            mapper,
+            free_units & mapper.registered,
+            free_cameras=result.recalibrated,
+            free_focal=result.focal_free,
+            terms=terms,
+            options=_options(mapper, result.sigma_px, rough=rough),
+            cancel=cancel,
+        )
+    )
+    _rescale(mapper, result, terms)
+
+
+def _unbend(
+    mapper: Mapper,
+    positions: PositionPrior | None,
+    result: Refinement,
+    free_units: Bools,
+    cancel: Cancel | None,
+) -> PositionPrior | None:
+    """Adjust until positions, of which a bent trajectory contradicts most, agree with it as well as they can.
+
+    They begin with the weight that the bend leaves them; what the adjustment has straightened makes the next more
+    certain [graduated non-convexity].
+    """
+    for _ in range(MAX_UNBENDING if positions is not None and mapper.config.bundle_adjustment.priors else 0):
+        assert result.placement is not None
+        before = result.placement.noise_factor
+        if before < BENT:
+            break
+        _adjust(mapper, positions, result, free_units, rough=True, cancel=cancel)
+        positions = _judged_again(mapper, positions, result)
+        if result.placement.noise_factor > STRAIGHTENED * before:
+            break
+    return positions
+
+
+def _judged_again(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> PositionPrior | None:
+    """The positions as a prior, judged by the adjusted scene; as they are where they took no part in it."""
+    if positions is None or result.placement is None or not mapper.config.bundle_adjustment.priors:
+        return positions
+    result.placement = judge_again(mapper, result.placement)
+    return result.placement.prior
 
 
 def _wrong_although_held(
@@ -225,19 +275,7 @@ def _hold_unobserved(
     """
     assert result.directions is not None
     result.held = result.directions.to_hold
-    terms = _terms(mapper, positions, result)
-    result.adjustments.append(
-        adjust_poses(
-            mapper,
-            free_units,
-            free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-            free_focal=result.focal_free,
-            terms=terms,
-            options=_options(mapper, result.sigma_px),
-            cancel=cancel,
-        )
-    )
-    _rescale(mapper, result, terms)
+    _adjust(mapper, positions, result, free_units, rough=False, cancel=cancel)
 
 
 def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:

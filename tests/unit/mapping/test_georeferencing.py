@@ -30,6 +30,7 @@ class Track:
             self.measured_m,
             self.sigma_m,
             outlier_sigmas=4.0,
+            sigma_rig_scale=0.05,
             rng=np.random.default_rng(0),
         )
 
