@@ -125,8 +125,8 @@ def align_with_gnss(
 def judge(off_m: Floats, sigma_m: Floats, inlier: Bools, *, outlier_sigmas: float) -> tuple[Bools, float]:
     """Judge residuals (n, 3), in the order of time; which are no outliers, and the factor on their sigmas.
 
-    The factor, at least 1, is that by which those exceed their sigmas that were no outliers before. In it, a residual is
-    one if it is too large and jumps: a scene that bends moves residuals little by little, and its receiver is right.
+    The factor, at least 1, is that by which those exceed their sigmas that were no outliers before. An outlier exceeds
+    them by more and jumps: a scene that bends moves residuals little by little, and its receiver is right.
     """
     whitened = np.linalg.norm(off_m / sigma_m, axis=1)
     # 1.54 is the median length of a standard normal 3-vector.

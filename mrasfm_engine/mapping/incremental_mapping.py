@@ -195,10 +195,11 @@ def _with_tracks_of(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
 
 
 def _register_next(mapper: Mapper, log: MappingLog) -> Registration | None:
-    """Register the unit that sees most points; units that failed wait until they see more."""
+    """Register the unit whose images are covered best by points; units that failed wait until they see more."""
     counts = mapper.visible_counts()
     waiting = np.flatnonzero(~mapper.registered & mapper.keyframe & (counts >= mapper.config.mapping.min_pnp_inliers))
-    for unit in waiting[np.argsort(-counts[waiting], kind="stable")].tolist():
+    scores = np.array([mapper.visibility_score(unit) for unit in waiting.tolist()])
+    for unit in waiting[np.argsort(-scores, kind="stable")].tolist():
         failed = log.failures.get(unit)
         if failed is not None and counts[unit] < 1.2 * failed.correspondences:
             continue

@@ -17,6 +17,7 @@ from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.mapping.rig_motion import RigMotion
+from mrasfm_engine.mapping.visibility_pyramid import finest_cells, visibility_score
 from mrasfm_engine.matching.simultaneous import rig_of_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
@@ -100,6 +101,7 @@ class Mapper:
         bounds = np.searchsorted(keypoints.unit[order], np.arange(units + 1))
         tracked = tracks.of_keypoint >= 0
         self.rows_of_unit = [rows[tracked[rows]] for rows in (order[lo:hi] for lo, hi in pairwise(bounds))]
+        self._cell = finest_cells(keypoints.xy_px, keypoints.camera, self.image_size_px)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Everything that mapping has found, for `from_arrays`."""
@@ -228,6 +230,12 @@ class Mapper:
         count_members(self.tracks, changed, self.triangulated, self.keypoints.unit, self._visible)
         self._visible_of[changed] = self.triangulated[changed]
         return self._visible
+
+    def visibility_score(self, unit: int) -> int:
+        """How well the points that a unit sees cover its images, see `visibility_pyramid`."""
+        rows, of_keypoint = self.rows_of_unit[unit], self.tracks.of_keypoint
+        cameras = len(self.camera_kind)
+        return visibility_score(rows, self._cell, self.keypoints.camera, of_keypoint, self.triangulated, cameras)
 
     def triangulate(self, which: Ints | None = None) -> int:
         """Triangulate tracks (all by default) from registered units; how many of them have a point."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset, judge
 from mrasfm_engine.synthetic.simulate import simulate_trajectory
 
 ARM_M = np.array([-0.5, 0.2, 1.8])
@@ -135,6 +135,36 @@ def test_a_jump_that_stays_is_not_averaged_in() -> None:
     assert found.inlier[:45].all()
     assert not found.inlier[45:].any()
     assert errors(found, t)[0] < 0.2
+
+
+@pytest.mark.parametrize("sigma_m", [0.02, 0.05, 0.3, 1.0])
+def test_a_scene_that_bends_is_aligned_however_good_the_receiver_is(sigma_m: float) -> None:
+    t = track(units=150, sigma_m=sigma_m)
+    way = np.arange(150) / 150
+    t.model_from_rig[:, :3, 3] += t.model_from_rig[:, :3, 1] * (8.0 * way**2)[:, None]
+    found = t.align()
+    assert isinstance(found, GnssAlignment)
+    assert found.inlier.mean() > 0.95
+    assert errors(found, t)[0] < 8.0
+    # What the bend leaves is seen where it exceeds the receiver's noise.
+    assert found.noise_factor > 5 if sigma_m < 0.1 else found.noise_factor < 5
+
+
+def test_what_a_bend_made_an_outlier_comes_back_and_a_jump_does_not() -> None:
+    rng = np.random.default_rng(0)
+    sigma_m = np.full((100, 3), 0.05)
+    noise_m = rng.normal(size=(100, 3)) * sigma_m
+    bend_m = np.zeros((100, 3))
+    bend_m[60:, 0] = np.linspace(0, 1.0, 40) ** 2
+    jump_m = np.zeros((100, 3))
+    jump_m[20:35, 1] = 3.0
+    before = np.arange(100) < 60
+    bent, factor = judge(noise_m + bend_m, sigma_m, before, outlier_sigmas=4.0)
+    assert bent.all()
+    assert factor < 1.3
+    jumped, factor = judge(noise_m + bend_m + jump_m, sigma_m, before, outlier_sigmas=4.0)
+    np.testing.assert_array_equal(jumped, jump_m[:, 1] == 0)
+    assert judge(20 * noise_m, sigma_m, before, outlier_sigmas=4.0)[1] == pytest.approx(20 * factor, rel=0.5)
 
 
 def test_sigmas_that_promise_too_much_are_found_out() -> None:
