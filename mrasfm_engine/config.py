@@ -158,12 +158,19 @@ class BundleAdjustmentConfig(_Section):
     sigma_rotation_deg: Positive = Field(2.0, description="prior of `rig_from_cam` where the manifest declares none")
     sigma_translation_m: Positive = Field(0.05, description="prior of `rig_from_cam` where the manifest declares none")
     sigma_focal: Positive = Field(
-        0.002, description="prior of a focal length relative to itself, where focal lengths vary"
+        0.002, description="prior of a focal length relative to itself, where intrinsics vary"
+    )
+    sigma_principal_point: Positive = Field(
+        0.002, description="prior of a principal point relative to the focal length, where intrinsics vary"
+    )
+    sigma_distortion: Positive = Field(
+        0.005, description="prior of a radial term of distortion, where intrinsics vary; of a tangential one a fifth"
     )
     refine_calibration: bool = Field(True, description="`rig_from_cam` varies where motion or GNSS make it observable")
     refine_focal: bool = Field(
         False,
-        description="one factor for fx and fy of each camera varies, with its prior, where `rig_from_cam` varies too",
+        description="the intrinsics of each camera's model vary with their priors, where `rig_from_cam` varies too and "
+        "the drive observes the focal length",
     )
     min_heading_change_deg: Positive = Field(15.0, description="without GNSS, calibration is held on straighter drives")
 

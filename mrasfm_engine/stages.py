@@ -363,6 +363,8 @@ def scene(
     between = register_between_keyframes(mapper, max_error_px=run.config.mapping.filter_error_px)
     if refinement.placement is not None:
         run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
+    if refinement.intrinsics is not None:
+        run.report["findings"] += [as_json(finding) for finding in refinement.intrinsics.findings(mapper)]
     run.report["findings"] += [
         as_json(miscalibration.finding(run.drive.cameras[wrong.camera].name, wrong))
         for wrong in refinement.miscalibrations

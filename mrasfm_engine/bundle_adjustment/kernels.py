@@ -11,7 +11,7 @@ row by row,
 
     d/dX     =  N                       d/dtau_u = -N            d/domega_u = N x (X - t_u)
     d/dtau_c = -M                       d/domega_c = M x (x_band - t_c)
-    d/dphi   =  pixel - principal point
+    d/dphi   =  pixel - principal point      d/dintrinsics: see `intrinsics_derivatives`
 
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
 reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
@@ -50,7 +50,12 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 BEHIND_PX = 1000.0  # what an observation costs whose point is behind the camera
 MIN_DEPTH_M = 1e-3
-IMAGE_SUMS = 35  # unit's block by its lower triangle, gradient, with the focal length, focal length's own
+UNIT_SUMS = 27  # of an image: its unit's block by its lower triangle, and gradient
+
+
+def image_sums(intrinsics: int) -> int:
+    """Number of an image's sums: its unit's, then of so many intrinsics with the unit, with one another, gradient."""
+    return UNIT_SUMS + 6 * intrinsics + intrinsics * (intrinsics + 1) // 2 + intrinsics
 
 
 class Views(NamedTuple):
@@ -91,11 +96,12 @@ class Observed(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Slots of units and cameras in the reduced vector, -1 where held; number of free units."""
+    """Slots of units and cameras in the reduced vector, -1 where held; number of free units, unknowns of a camera."""
 
     unit: Ints
     camera: Ints
     num_units: int
+    camera_dof: int
 
 
 class Sums(NamedTuple):
@@ -194,7 +200,42 @@ def linearise(
         jc[i, 0], jc[i, 1], jc[i, 2] = m1 * rig[2] - m2 * rig[1], m2 * rig[0] - m0 * rig[2], m0 * rig[1] - m1 * rig[0]
         jc[i, 3], jc[i, 4], jc[i, 5] = -m0, -m1, -m2
         jc[i, 6] = (proj[i] - k[2 + i]) * s
+    if jc.shape[1] > 7:
+        intrinsics_derivatives(kind, k, cam, proj, s, jc)
     return True
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def intrinsics_derivatives(kind: int, k: Any, cam: Any, proj: Any, s: float, jc: Any) -> None:
+    """Derivatives, times s, of a pixel in log(fy / fx), cx, cy and the four terms of distortion into jc[:, 7:14].
+
+    A perspective camera's distortion is the radial one's, of which it has none: how far it may be off is asked all the
+    same.
+    """
+    a, b = cam[0] / cam[2], cam[1] / cam[2]
+    r2 = a * a + b * b
+    jc[0, 7], jc[1, 7] = 0.0, (proj[1] - k[3]) * s
+    jc[0, 8], jc[1, 8] = s, 0.0
+    jc[0, 9], jc[1, 9] = 0.0, s
+    fx, fy = k[0] * s, k[1] * s
+    if kind == 2:
+        r = math.sqrt(r2)
+        theta = math.atan(r)
+        power = theta**3 / max(r, 1e-12)
+        for i in range(4):
+            jc[0, 10 + i], jc[1, 10 + i] = fx * a * power, fy * b * power
+            power *= theta * theta
+    else:
+        jc[0, 10], jc[1, 10] = fx * a * r2, fy * b * r2
+        jc[0, 11], jc[1, 11] = fx * a * r2 * r2, fy * b * r2 * r2
+        jc[0, 12], jc[1, 12] = fx * 2.0 * a * b, fy * (r2 + 2.0 * b * b)
+        jc[0, 13], jc[1, 13] = fx * (r2 + 2.0 * a * a), fy * 2.0 * a * b
+
+
+@njit(cache=True, inline="always")
+def image_sums_gradient(intrinsics: int) -> int:
+    """Place of the intrinsics' gradient among an image's sums."""
+    return UNIT_SUMS + 6 * intrinsics + intrinsics * (intrinsics + 1) // 2
 
 
 @njit(cache=True, inline="always")
@@ -230,21 +271,24 @@ def accumulate(
 ) -> None:  # fmt: skip
     """Eliminate points order[lo:hi].
 
-    Sums of observations by image are added to `sums.images` (images, IMAGE_SUMS). The elimination is subtracted from
-    the matrix: from blocks (b, 36) of the units' pattern, (cameras, units, 42) of the border and (cameras, cameras, 49)
-    of the cameras, of all three the lower blocks, and from the gradient (n,). Every point's V^-1 (p, 6) and gradient
-    (p, 3) are kept.
+    Sums of observations by image are added to `sums.images` (images, see `image_sums`). The elimination is subtracted
+    from the matrix: from blocks (b, 36) of the units' pattern, (cameras, units, 6 d) of the border and (cameras,
+    cameras, d^2) of the cameras, where d are a camera's unknowns; of all three the lower blocks, and from the gradient
+    (n,). Every point's V^-1 (p, 6) and gradient (p, 3) are kept.
     """
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
-    unit_slot, camera_slot, num_units = free_slots
+    unit_slot, camera_slot, num_units, dof = free_slots
+    intrinsics = dof - 6
+    own, own_gradient = UNIT_SUMS + 6 * intrinsics, image_sums_gradient(intrinsics)
     order, first_point, blocks, first_block, places, first_place = groups
     images, s_units, s_border, s_cameras, g, v_inverse, v_gradient = sums
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
-    jx, jc = np.empty((2, 3)), np.empty((2, 7))
+    jx, jc = np.empty((2, 3)), np.empty((2, dof))
     v, inv, e = np.empty(6), np.empty(6), np.empty(3)
-    w = np.empty((MAX_BLOCKS, 3, 7))  # coupling of a point to its blocks, transposed
-    tiled, repeated = np.empty((MAX_BLOCKS, 3 * 42)), np.empty(3 * 42)  # W_j and W_i V^-1, spread over blocks' entries
+    w = np.empty((MAX_BLOCKS, 3, dof))  # coupling of a point to its blocks, transposed
+    # W_j and W_i V^-1, spread over blocks' entries
+    tiled, repeated = np.empty((MAX_BLOCKS, 3 * 6 * dof)), np.empty(3 * 6 * dof)
     group = np.searchsorted(first_point, lo, side="right") - 1
     for index in range(lo, hi):
         while index >= first_point[group + 1]:
@@ -328,20 +372,23 @@ def accumulate(
                         )  # fmt: skip
             sc = camera_slot[c]
             if sc >= 0:
-                f0, f1 = jc[0, 6], jc[1, 6]
-                n0, n1, n2 = f0 * a0 + f1 * c0, f0 * a1 + f1 * c1, f0 * a2 + f1 * c2
-                s[27] += n1 * d2 - n2 * d1
-                s[28] += n2 * d0 - n0 * d2
-                s[29] += n0 * d1 - n1 * d0
-                s[30] -= n0
-                s[31] -= n1
-                s[32] -= n2
-                s[33] += f0 * f0 + f1 * f1
-                s[34] += f0 * r0 + f1 * r1
+                for k in range(intrinsics):
+                    f0, f1 = jc[0, 6 + k], jc[1, 6 + k]
+                    n0, n1, n2 = f0 * a0 + f1 * c0, f0 * a1 + f1 * c1, f0 * a2 + f1 * c2
+                    o = UNIT_SUMS + 6 * k
+                    s[o] += n1 * d2 - n2 * d1
+                    s[o + 1] += n2 * d0 - n0 * d2
+                    s[o + 2] += n0 * d1 - n1 * d0
+                    s[o + 3] -= n0
+                    s[o + 4] -= n1
+                    s[o + 5] -= n2
+                    for other in range(k + 1):
+                        s[own + k * (k + 1) // 2 + other] += f0 * jc[0, 6 + other] + f1 * jc[1, 6 + other]
+                    s[own_gradient + k] += f0 * r0 + f1 * r1
                 at = _find(blocks, b0, b1, num_units + sc)
                 if at >= 0:
                     wc = w[at]
-                    for i in range(7):
+                    for i in range(dof):
                         x0, x1 = jc[0, i], jc[1, i]
                         wc[0, i] += x0 * a0 + x1 * c0
                         wc[1, i] += x0 * a1 + x1 * c1
@@ -362,13 +409,14 @@ def accumulate(
         x2 = inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2]
         for i in range(b1 - b0):
             block = blocks[b0 + i]
-            rows = 6 if block < num_units else 7
-            o = 6 * block if block < num_units else 6 * num_units + 7 * (block - num_units)
+            rows = 6 if block < num_units else dof
+            o = 6 * block if block < num_units else 6 * num_units + dof * (block - num_units)
             for a in range(rows):
                 g[o + a] -= w[i, 0, a] * x0 + w[i, 1, a] * x1 + w[i, 2, a] * x2
         _subtract_products(
-            w, inv, tiled, repeated, blocks, b0, b1, num_units, places, first_place[group], s_units, s_border, s_cameras
-        )
+            w, inv, tiled, repeated, blocks, b0, b1, num_units, dof,
+            places, first_place[group], s_units, s_border, s_cameras,
+        )  # fmt: skip
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
@@ -376,7 +424,7 @@ def _add_unit(
     w: Any, weight: float, t00: float, t01: float, t02: float, t10: float, t11: float, t12: float, t20: float,
     t21: float, t22: float, v00: float, v01: float, v02: float, v11: float, v12: float, v22: float,
 ) -> None:  # fmt: skip
-    """Add weight [V [d]x, -V] to w (3, 7)."""
+    """Add weight [V [d]x, -V] to w (3, at least 6)."""
     w[0, 0] += weight * t00
     w[0, 1] += weight * t01
     w[0, 2] += weight * t02
@@ -399,7 +447,7 @@ def _add_unit(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _subtract_products(
-    w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int, places: Any,
+    w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int, dof: int, places: Any,
     place: int, s_units: Any, s_border: Any, s_cameras: Any,
 ) -> None:  # fmt: skip
     """S_ij -= W_i V^-1 W_j' for all pairs of a point's blocks.
@@ -407,37 +455,39 @@ def _subtract_products(
     Entry (a, b) of a product needs row a of W_i V^-1 and row b of W_j. Both are first spread over the 6 columns of a
     block, so that one loop without gaps runs over all of its entries.
     """
-    count = b1 - b0
+    count, wide = b1 - b0, 6 * dof
     for i in range(count):
         block = blocks[b0 + i]
-        rows = 6 if block < num_units else 7
+        rows = 6 if block < num_units else dof
         for a in range(rows):
             x0, x1, x2 = w[i, 0, a], w[i, 1, a], w[i, 2, a]
             y0 = x0 * inv[0] + x1 * inv[1] + x2 * inv[2]
             y1 = x0 * inv[1] + x1 * inv[3] + x2 * inv[4]
             y2 = x0 * inv[2] + x1 * inv[4] + x2 * inv[5]
             for k in range(6 * a, 6 * a + 6):
-                repeated[k], repeated[42 + k], repeated[84 + k] = y0, y1, y2
+                repeated[k], repeated[wide + k], repeated[2 * wide + k] = y0, y1, y2
         if rows == 6:
             for a in range(6):
                 x0, x1, x2 = w[i, 0, a], w[i, 1, a], w[i, 2, a]
-                for k in range(a, 42, 6):
-                    tiled[i, k], tiled[i, 42 + k], tiled[i, 84 + k] = x0, x1, x2
+                for k in range(a, wide, 6):
+                    tiled[i, k], tiled[i, wide + k], tiled[i, 2 * wide + k] = x0, x1, x2
         entries = 6 * rows
         for j in range(i + 1):
             other = blocks[b0 + j]
             if other >= num_units:
                 target = s_cameras[block - num_units, other - num_units]
-                for a in range(7):
-                    y0, y1, y2 = repeated[6 * a], repeated[42 + 6 * a], repeated[84 + 6 * a]
-                    for b in range(7):
-                        target[7 * a + b] -= y0 * w[j, 0, b] + y1 * w[j, 1, b] + y2 * w[j, 2, b]
+                for a in range(dof):
+                    y0, y1, y2 = repeated[6 * a], repeated[wide + 6 * a], repeated[2 * wide + 6 * a]
+                    for b in range(dof):
+                        target[dof * a + b] -= y0 * w[j, 0, b] + y1 * w[j, 1, b] + y2 * w[j, 2, b]
                 continue
             target = s_units[places[place + i * (i + 1) // 2 + j]] if rows == 6 else s_border[block - num_units, other]
             source = tiled[j]
             for k in range(entries):
                 target[k] -= (
-                    repeated[k] * source[k] + repeated[42 + k] * source[42 + k] + repeated[84 + k] * source[84 + k]
+                    repeated[k] * source[k]
+                    + repeated[wide + k] * source[wide + k]
+                    + repeated[2 * wide + k] * source[2 * wide + k]
                 )
 
 
@@ -456,7 +506,9 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
-    unit_slot, camera_slot, num_units = free_slots
+    unit_slot, camera_slot, num_units, dof = free_slots
+    intrinsics = dof - 6
+    own, own_gradient = UNIT_SUMS + 6 * intrinsics, image_sums_gradient(intrinsics)
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
         u, c, band = image_unit[image], image_camera[image], image_band[image]
@@ -475,25 +527,30 @@ def add_images(
                     for k in range(6):
                         x += t[k, i] * h[k, j]
                     th[i, j] = x
-            o = 6 * num_units + 7 * sc
+            o = 6 * num_units + dof * sc
             square = s_cameras[sc, sc]
             for i in range(6):
-                x, y = 0.0, 0.0
+                x = 0.0
                 for k in range(6):
                     x += t[k, i] * s[21 + k]
-                    y += t[k, i] * s[27 + k]
                 g[o + i] += x
-                square[42 + i] += y
+                for f in range(intrinsics):
+                    y = 0.0
+                    for k in range(6):
+                        y += t[k, i] * s[UNIT_SUMS + 6 * f + k]
+                    square[dof * (6 + f) + i] += y
                 for j in range(6):
                     z = 0.0
                     for k in range(6):
                         z += th[i, k] * t[k, j]
-                    square[7 * i + j] += z
+                    square[dof * i + j] += z
                     if i == j:
                         diagonal[o + i] += z
-            g[o + 6] += s[34]
-            square[48] += s[33]
-            diagonal[o + 6] += s[33]
+            for f in range(intrinsics):
+                g[o + 6 + f] += s[own_gradient + f]
+                for other in range(f + 1):
+                    square[dof * (6 + f) + 6 + other] += s[own + f * (f + 1) // 2 + other]
+                diagonal[o + 6 + f] += s[own + f * (f + 1) // 2 + f]
         for a in range(3):
             if motion is None:
                 if a > 0:
@@ -512,7 +569,8 @@ def add_images(
                 for j in range(6):
                     for i in range(6):
                         border[6 * i + j] += wa * th[i, j]
-                    border[36 + j] += wa * s[27 + j]
+                    for f in range(intrinsics):
+                        border[36 + 6 * f + j] += wa * s[UNIT_SUMS + 6 * f + j]
             for b in range(3):
                 if motion is None:
                     if b > 0:
@@ -569,10 +627,10 @@ def substitute(
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
-    jx, jc, e = np.empty((2, 3)), np.empty((2, 7)), np.empty(3)
+    unit_slot, camera_slot, num_units, dof = free_slots
+    jx, jc, e = np.empty((2, 3)), np.empty((2, dof)), np.empty(3)
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, _ = observed
-    unit_slot, camera_slot, num_units = free_slots
     for p in range(lo, hi):
         for i in range(3):
             e[i] = v_gradient[p, i]
@@ -607,8 +665,8 @@ def substitute(
             m0 = jx[0, 0] * x0 + jx[0, 1] * x1 + jx[0, 2] * x2
             m1 = jx[1, 0] * x0 + jx[1, 1] * x1 + jx[1, 2] * x2
             if sc >= 0:
-                o = 6 * num_units + 7 * sc
-                for i in range(7):
+                o = 6 * num_units + dof * sc
+                for i in range(dof):
                     m0 += jc[0, i] * step[o + i]
                     m1 += jc[1, i] * step[o + i]
             for i in range(3):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
@@ -22,7 +22,8 @@ class Covariances:
     """Marginal standard deviations; infinite where nothing determines an unknown."""
 
     sigma_unit_position_m: Floats  # (u, 3), NaN for fixed units
-    sigma_camera: Floats  # (c, 7) rotation (rad), translation (m), log focal; NaN for fixed cameras
+    # (c, 14) rotation (rad), translation (m), intrinsics as in `problem`; NaN for fixed cameras, 0 for what is held
+    sigma_camera: Floats
     sigma_scale: float  # relative, of the trajectory's size
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
 
@@ -42,9 +43,11 @@ def covariances(problem: Problem, state: State) -> Covariances:
         found = _dense_marginals(system, position)
     per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
     per_unit[layout.unit_slot >= 0] = np.sqrt(found.units)
-    per_camera = np.full((len(layout.camera_slot), CAMERA_DOF), np.nan)
-    per_camera[layout.camera_slot >= 0] = np.sqrt(np.diagonal(found.cameras)).reshape(-1, CAMERA_DOF)
-    poses = (CAMERA_DOF * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
+    dof = layout.camera_dof
+    per_camera = np.full((len(layout.camera_slot), 6 + INTRINSICS), np.nan)
+    per_camera[layout.camera_slot >= 0] = 0.0
+    per_camera[layout.camera_slot >= 0, :dof] = np.sqrt(np.diagonal(found.cameras)).reshape(-1, dof)
+    poses = (dof * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
     return Covariances(
         sigma_unit_position_m=per_unit[:, 3:],
         sigma_camera=per_camera,
@@ -56,7 +59,7 @@ def covariances(problem: Problem, state: State) -> Covariances:
 @dataclass(frozen=True, kw_only=True)
 class _Marginals:
     units: Floats  # (free units, 6) variances
-    cameras: Floats  # (7 c, 7 c) covariance of the free cameras; zero where held
+    cameras: Floats  # (d c, d c) covariance of the free cameras; zero where held
     sigma_scale: float
 
 
@@ -71,7 +74,7 @@ def _regular_marginals(system: ReducedCameraSystem, position: Floats) -> _Margin
     units, cameras = solved.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    covariance = np.zeros((CAMERA_DOF * layout.num_cameras,) * 2)
+    covariance = np.zeros((layout.camera_dof * layout.num_cameras,) * 2)
     covariance[np.ix_(solved.free, solved.free)] = cameras
     loose = solved.free[unseen[split:][solved.free]]
     covariance[loose, loose] = np.inf

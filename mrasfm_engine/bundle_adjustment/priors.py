@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, Layout
+from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
@@ -108,7 +108,7 @@ def _add_rig(
     step = np.tile(np.eye(6), (len(r), 1, 1))  # derivatives of corrections by steps of their cameras
     step[:, :3, :3] = se3.inverse_left_jacobian((r * sigma)[:, :3])
     free = np.flatnonzero(layout.camera_slot[cameras] >= 0)
-    rows = (CAMERA_DOF * layout.camera_slot[cameras[free]])[:, None] + np.arange(6)
+    rows = (layout.camera_dof * layout.camera_slot[cameras[free]])[:, None] + np.arange(6)
     j = (step / sigma[:, :, None])[free]
 
     loose = (np.where(held, 0.0, r) ** 2).sum(1, keepdims=True)
@@ -177,14 +177,21 @@ class CameraPosePrior:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FocalPrior:
-    """Keeps focal lengths near what was given: residual log(f / f_given) / sigma, sigma relative to f."""
+class IntrinsicsPrior:
+    """Keeps intrinsics near what was given: residuals [phi, alpha, cx, cy, d0, d1, d2, d3] - given over sigma.
 
-    focal_px: Floats  # (c,) given
-    sigma: Floats  # (c,)
+    phi is the logarithm of fx over what was given, alpha that of fy over fx; see `problem`.
+    """
+
+    params: Floats  # (c, 8) given
+    sigma: Floats  # (c, INTRINSICS); infinite for those of which nothing is known
 
     def _residuals(self, state: State) -> Floats:
-        result: Floats = np.log(state.camera_params[:, 0] / self.focal_px) / self.sigma
+        now, given = state.camera_params, self.params
+        off = now - given
+        off[:, 0] = np.log(now[:, 0] / given[:, 0])
+        off[:, 1] = np.log(now[:, 1] / given[:, 1]) - off[:, 0]
+        result: Floats = off / self.sigma
         return result
 
     def cost(self, state: State) -> float:
@@ -193,12 +200,13 @@ class FocalPrior:
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        if not layout.free_focal:
-            return
-        cameras = np.flatnonzero(layout.camera_slot >= 0)
-        rows = CAMERA_DOF * layout.camera_slot[cameras] + 6
-        extra.cameras[rows, rows] += 1.0 / self.sigma[cameras] ** 2
-        extra.camera_gradient[rows] += self._residuals(state)[cameras] / self.sigma[cameras]
+        dof = layout.camera_dof
+        for camera in np.flatnonzero(layout.camera_slot >= 0).tolist():
+            slot = layout.camera_slot[camera]
+            varies = np.flatnonzero(layout.free_intrinsics[slot])
+            rows = dof * slot + 6 + varies
+            extra.cameras[rows, rows] += 1.0 / self.sigma[camera, varies] ** 2
+            extra.camera_gradient[rows] += self._residuals(state)[camera, varies] / self.sigma[camera, varies]
 
 
 @dataclass(frozen=True, kw_only=True)

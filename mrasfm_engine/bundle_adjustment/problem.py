@@ -1,6 +1,6 @@
 """Variables and observations of camera set bundle adjustment.
 
-Variables are the poses of rigid units, `rig_from_cam` and one focal factor of every camera, and points. A pose is
+Variables are the poses of rigid units, `rig_from_cam` and the intrinsics of every camera, and points. A pose is
 stored as rotation and position of the moving frame in the fixed one (`world_from_rig`, `rig_from_cam`), so that a step
 
     R <- exp(omega) R,   t <- t + tau
@@ -9,7 +9,11 @@ has its rotation vector omega and translation tau in the axes of the fixed frame
 cameras, in this order, make up the reduced vector of unknowns:
 
     unit slot u:    [omega (3, rad), tau (3, m)]            at 6 u
-    camera slot c:  [omega (3, rad), tau (3, m), phi]       at 6 U + 7 c,   focal lengths <- focal lengths * exp(phi)
+    camera slot c:  [omega (3, rad), tau (3, m), intrinsics]    at 6 U + d c
+
+Of a camera's intrinsics [phi, alpha, cx, cy, d0, d1, d2, d3] the first is a factor of both focal lengths, the second of
+fy alone: fx <- fx exp(phi), fy <- fy exp(phi + alpha); the others are those of `geometry.camera_model`, in pixels and
+as they are. Where no more than phi varies, the vector has no other: d is 7, else 14.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
 
 UNIT_DOF = 6
-CAMERA_DOF = 7
+INTRINSICS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,23 +82,30 @@ class Layout:
     camera_slot: Ints  # (c,) -1 where fixed
     num_units: int
     num_cameras: int
-    free_focal: bool
+    free_intrinsics: Bools  # (cameras, INTRINSICS) of the free cameras by slot: which of them vary
 
     @staticmethod
-    def from_free(free_units: Bools, free_cameras: Bools, *, free_focal: bool = False) -> Layout:
-        """The layout with the marked units and cameras free."""
+    def from_free(free_units: Bools, free_cameras: Bools, *, free_intrinsics: Bools | None = None) -> Layout:
+        """The layout with the marked units and cameras free, and of these the marked intrinsics (c, INTRINSICS)."""
+        if free_intrinsics is None:
+            free_intrinsics = np.zeros((len(free_cameras), INTRINSICS), dtype=np.bool_)
         return Layout(
             unit_slot=np.where(free_units, np.cumsum(free_units) - 1, -1).astype(np.int64),
             camera_slot=np.where(free_cameras, np.cumsum(free_cameras) - 1, -1).astype(np.int64),
             num_units=int(free_units.sum()),
             num_cameras=int(free_cameras.sum()),
-            free_focal=free_focal,
+            free_intrinsics=free_intrinsics[free_cameras],
         )
+
+    @property
+    def camera_dof(self) -> int:
+        """Number of a camera's places in the reduced vector."""
+        return 6 + (INTRINSICS if self.free_intrinsics[:, 1:].any() else 1)
 
     @property
     def size(self) -> int:
         """Length of the reduced vector."""
-        return UNIT_DOF * self.num_units + CAMERA_DOF * self.num_cameras
+        return UNIT_DOF * self.num_units + self.camera_dof * self.num_cameras
 
     def unit_offsets(self, units: Ints) -> Ints:
         """First index of each (free) unit's step."""
@@ -102,13 +113,14 @@ class Layout:
 
     def camera_offsets(self, cameras: Ints) -> Ints:
         """First index of each (free) camera's step."""
-        return UNIT_DOF * self.num_units + CAMERA_DOF * self.camera_slot[cameras]
+        return UNIT_DOF * self.num_units + self.camera_dof * self.camera_slot[cameras]
 
     def held(self) -> Ints:
-        """Positions of the reduced vector that have a slot but may not move (focal factors that are held)."""
-        if self.free_focal:
-            return np.zeros(0, dtype=np.int64)
-        return UNIT_DOF * self.num_units + CAMERA_DOF * np.arange(self.num_cameras, dtype=np.int64) + 6
+        """Positions of the reduced vector that have a slot but may not move (intrinsics that are held)."""
+        places = np.zeros((self.num_cameras, self.camera_dof), dtype=np.bool_)
+        places[:, 6:] = ~self.free_intrinsics[:, : self.camera_dof - 6]
+        result: Ints = UNIT_DOF * self.num_units + np.flatnonzero(places)
+        return result
 
 
 def retract(state: State, layout: Layout, step: Floats, points_m: Floats) -> State:
@@ -116,7 +128,7 @@ def retract(state: State, layout: Layout, step: Floats, points_m: Floats) -> Sta
     units = np.flatnonzero(layout.unit_slot >= 0)
     cameras = np.flatnonzero(layout.camera_slot >= 0)
     d_unit = step[: UNIT_DOF * layout.num_units].reshape(-1, UNIT_DOF)
-    d_camera = step[UNIT_DOF * layout.num_units :].reshape(-1, CAMERA_DOF)
+    d_camera = step[UNIT_DOF * layout.num_units :].reshape(-1, layout.camera_dof)
     unit_rotation, unit_position = state.unit_rotation.copy(), state.unit_position_m.copy()
     unit_rotation[units] = se3.exp_so3(d_unit[:, :3]) @ unit_rotation[units]
     unit_position[units] += d_unit[:, 3:]
@@ -124,7 +136,10 @@ def retract(state: State, layout: Layout, step: Floats, points_m: Floats) -> Sta
     camera_rotation[cameras] = se3.exp_so3(d_camera[:, :3]) @ camera_rotation[cameras]
     camera_position[cameras] += d_camera[:, 3:6]
     camera_params = state.camera_params.copy()
-    camera_params[cameras, :2] *= np.exp(d_camera[:, 6:])
+    camera_params[cameras, :2] *= np.exp(d_camera[:, 6:7])
+    if layout.camera_dof > 7:
+        camera_params[cameras, 1] *= np.exp(d_camera[:, 7])
+        camera_params[cameras, 2:] += d_camera[:, 8:]
     return replace(
         state,
         unit_rotation=unit_rotation,

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.block_cholesky import BlockFactor
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout
+from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
 from mrasfm_engine.bundle_adjustment.schur_structure import SchurStructure
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -33,7 +33,7 @@ class Extra:
     """Sums of the terms that are not image observations: one block per unit, and the cameras' square."""
 
     units: Floats  # (units, 6, 6)
-    cameras: Floats  # (7 cameras, 7 cameras)
+    cameras: Floats  # (d cameras, d cameras), d the layout's camera_dof
     gradient: Floats  # (n,)
 
     @property
@@ -43,7 +43,7 @@ class Extra:
 
     @property
     def camera_gradient(self) -> Floats:
-        """View (7 cameras,) of the cameras' gradient."""
+        """View (d cameras,) of the cameras' gradient."""
         return self.gradient[UNIT_DOF * len(self.units) :]
 
     @property
@@ -56,7 +56,7 @@ class Extra:
         """Zeros to add to."""
         return Extra(
             units=np.zeros((layout.num_units, UNIT_DOF, UNIT_DOF)),
-            cameras=np.zeros((CAMERA_DOF * layout.num_cameras,) * 2),
+            cameras=np.zeros((layout.camera_dof * layout.num_cameras,) * 2),
             gradient=np.zeros(layout.size),
         )
 
@@ -68,8 +68,8 @@ class ReducedCameraSystem:
     layout: Layout
     structure: SchurStructure
     units: Floats  # (blocks of the units' pattern, 6, 6); diagonal ones are symmetric
-    border: Floats  # (cameras, units, 7, 6)
-    cameras: Floats  # (7 cameras, 7 cameras)
+    border: Floats  # (cameras, units, d, 6)
+    cameras: Floats  # (d cameras, d cameras), d the layout's camera_dof
     diagonal: Floats  # (n,) of the matrix before points were eliminated: what Marquardt's damping scales
     gradient: Floats  # (n,)
     v_inverse: Floats  # (p, 6)
@@ -84,16 +84,16 @@ class ReducedCameraSystem:
         extra: Extra,
     ) -> ReducedCameraSystem:
         """The system from what `accumulate` summed (units, border, cameras, diagonal, gradient) and other terms."""
-        c = layout.num_cameras
+        c, dof = layout.num_cameras, layout.camera_dof
         units = sums[0].reshape(-1, UNIT_DOF, UNIT_DOF)
-        border = sums[1].reshape(c, layout.num_units, CAMERA_DOF, UNIT_DOF)
-        squares = sums[2].reshape(c, c, CAMERA_DOF, CAMERA_DOF)
+        border = sums[1].reshape(c, layout.num_units, dof, UNIT_DOF)
+        squares = sums[2].reshape(c, c, dof, dof)
         diagonal, gradient = sums[3:]
         # Diagonal blocks come by their lower triangle.
         on = structure.pattern.first[:-1]
         lower = np.tril(units[on])
         units[on] = lower + np.swapaxes(np.tril(lower, -1), 1, 2) + extra.units
-        size = CAMERA_DOF * c
+        size = dof * c
         cameras = np.tril(np.swapaxes(squares, 1, 2).reshape(size, size))
         cameras = cameras + np.tril(cameras, -1).T + extra.cameras
         unit_diagonal = np.diagonal(extra.units, axis1=1, axis2=2).ravel()
@@ -125,8 +125,8 @@ class ReducedCameraSystem:
         return result
 
     def _border_rows(self) -> Floats:
-        """B (7 cameras, 6 units)."""
-        size = CAMERA_DOF * self.layout.num_cameras
+        """B (d cameras, 6 units)."""
+        size = self.layout.camera_dof * self.layout.num_cameras
         return np.swapaxes(self.border, 1, 2).reshape(size, UNIT_DOF * self.layout.num_units)
 
     def matrix_diagonal(self) -> Floats:
@@ -161,7 +161,7 @@ class ReducedCameraSystem:
         factor = BlockFactor.from_blocks(self.structure.elimination, units)
         if factor is None:
             return None
-        free = np.setdiff1d(np.arange(CAMERA_DOF * layout.num_cameras), layout.held() - split)
+        free = np.setdiff1d(np.arange(layout.camera_dof * layout.num_cameras), layout.held() - split)
         border = self._border_rows()[free]
         coupled = factor.solve(np.ascontiguousarray(border.T))
         square = self.cameras[np.ix_(free, free)] - border @ coupled

@@ -11,7 +11,6 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.bundle_adjustment.kernels import (
-    IMAGE_SUMS,
     Bands,
     Motion,
     Observed,
@@ -20,12 +19,13 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     Views,
     accumulate,
     add_images,
+    image_sums,
     squared_errors,
     substitute,
 )
 from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, refine_points
 from mrasfm_engine.bundle_adjustment.priors import Term
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, RowBandMotion, retract
+from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout, Observations, RowBandMotion, retract
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.schur_structure import SchurStructure
@@ -124,7 +124,8 @@ class Problem:
 
     @property
     def _slots(self) -> Slots:
-        return Slots(self.layout.unit_slot, self.layout.camera_slot, self.layout.num_units)
+        layout = self.layout
+        return Slots(layout.unit_slot, layout.camera_slot, layout.num_units, layout.camera_dof)
 
     def retract(self, state: State, step: Floats, points_m: Floats) -> State:
         """The state after a step of the reduced vector, with new points."""
@@ -200,13 +201,13 @@ class Problem:
     def normal_equations(self, state: State, damping: float) -> ReducedCameraSystem:
         """The reduced system at a state."""
         o, layout, options, structure = self.observations, self.layout, self.options, self.structure
-        units, cameras, p = layout.num_units, layout.num_cameras, o.num_points
+        units, cameras, dof, p = layout.num_units, layout.num_cameras, layout.camera_dof, o.num_points
         parts = min(options.threads, max(1, p // 256))
-        images = np.zeros((parts, len(structure.image_unit), IMAGE_SUMS))
+        images = np.zeros((parts, len(structure.image_unit), image_sums(dof - 6)))
         blocks = (
             np.zeros((parts, len(structure.pattern.row), UNIT_DOF * UNIT_DOF)),
-            np.zeros((parts, cameras, units, CAMERA_DOF * UNIT_DOF)),
-            np.zeros((parts, cameras, cameras, CAMERA_DOF * CAMERA_DOF)),
+            np.zeros((parts, cameras, units, dof * UNIT_DOF)),
+            np.zeros((parts, cameras, cameras, dof * dof)),
         )
         gradient = np.zeros((parts, layout.size))
         v_inverse, v_gradient = np.empty((p, 6)), np.empty((p, 3))

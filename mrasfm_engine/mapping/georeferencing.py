@@ -60,7 +60,7 @@ def align_with_gnss(
     """Rigid transform from the reconstruction's frame to the receiver's.
 
     The reconstruction may be bent, as it may have been made with a calibration that only the receiver corrects. Its
-    positions are judged again once they have taken part in an adjustment, see `placement.judge_again`.
+    positions are judged again once they have taken part in an adjustment, see `placement.reassess_positions`.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def align_with_gnss(
     for _ in range(4):
         similarity = _refine(similarity, antenna_m, up, forward, measured_m, sigma_m * factor, inlier)
         off_m = _apply(similarity, antenna_m) - measured_m
-        inlier, factor = judge(off_m, sigma_m, inlier, outlier_sigmas=outlier_sigmas)
+        inlier, factor = assess_residuals(off_m, sigma_m, inlier, outlier_sigmas=outlier_sigmas)
         if inlier.sum() < 3:
             return "no consistent set of positions was found"
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
@@ -122,7 +122,7 @@ def align_with_gnss(
     )
 
 
-def judge(off_m: Floats, sigma_m: Floats, inlier: Bools, *, outlier_sigmas: float) -> tuple[Bools, float]:
+def assess_residuals(off_m: Floats, sigma_m: Floats, inlier: Bools, *, outlier_sigmas: float) -> tuple[Bools, float]:
     """Judge residuals (n, 3), in the order of time; which are no outliers, and the factor on their sigmas.
 
     The factor, at least 1, is that by which those exceed their sigmas that were no outliers before. An outlier exceeds

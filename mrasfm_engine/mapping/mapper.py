@@ -232,7 +232,7 @@ class Mapper:
         return self._visible
 
     def visibility_score(self, unit: int) -> int:
-        """How well the points that a unit sees cover its images, see `visibility_pyramid`."""
+        """Score of how well the points that a unit sees cover its images, see `visibility_pyramid`."""
         rows, of_keypoint = self.rows_of_unit[unit], self.tracks.of_keypoint
         cameras = len(self.camera_kind)
         return visibility_score(rows, self._cell, self.keypoints.camera, of_keypoint, self.triangulated, cameras)
@@ -333,7 +333,7 @@ class Mapper:
         free_units: Bools,
         *,
         free_cameras: Bools | None = None,
-        free_focal: bool = False,
+        free_intrinsics: Bools | None = None,
         terms: Sequence[Term] = (),
         options: SolverOptions,
     ) -> tuple[Problem, Ints]:
@@ -353,7 +353,7 @@ class Mapper:
             layout=Layout.from_free(
                 free_units & self.registered,
                 np.zeros(len(self.camera_kind), dtype=np.bool_) if free_cameras is None else free_cameras,
-                free_focal=free_focal,
+                free_intrinsics=free_intrinsics,
             ),
             terms=terms,
             options=options,

@@ -11,7 +11,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset, judge
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, assess_residuals, clock_offset
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas.findings import Finding, warning
@@ -80,7 +80,7 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> 
     return _with_prior(mapper, placement, np.asarray(antenna_in_rig_m))
 
 
-def judge_again(mapper: Mapper, placement: Placement) -> Placement:
+def reassess_positions(mapper: Mapper, placement: Placement) -> Placement:
     """Judge all positions by where the adjustment has put their units.
 
     Those that were outliers of a bent trajectory come back, with the weight that they have by their sigmas.
@@ -89,7 +89,7 @@ def judge_again(mapper: Mapper, placement: Placement) -> Placement:
     units, arm_m = placement.units, placement.prior.lever_arm_m
     off_m = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ arm_m - placement.measured_m
     outlier_sigmas = mapper.config.gnss.outlier_sigmas
-    inlier, factor = judge(off_m, placement.sigma_m, placement.inlier, outlier_sigmas=outlier_sigmas)
+    inlier, factor = assess_residuals(off_m, placement.sigma_m, placement.inlier, outlier_sigmas=outlier_sigmas)
     inlier &= mapper.registered[units]
     if inlier.sum() < MIN_POSITIONS:
         return placement

@@ -9,7 +9,8 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions, solve
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
@@ -23,6 +24,7 @@ from mrasfm_engine.mapping.calibration import (
     scale_with_baselines,
 )
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
+from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
     MIN_OTHERS,
@@ -31,7 +33,7 @@ from mrasfm_engine.mapping.miscalibration import (
     find_miscalibrations,
     find_wrong_pair,
 )
-from mrasfm_engine.mapping.placement import Placement, judge_again, place_by_gnss, place_by_rough_poses
+from mrasfm_engine.mapping.placement import Placement, place_by_gnss, place_by_rough_poses, reassess_positions
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
@@ -55,7 +57,7 @@ class Refinement:
     placement: Placement | None = None  # by GNSS, where it was to be used
     placed_by_rough_poses: bool = False
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
-    focal_free: bool = False
+    intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
@@ -121,14 +123,21 @@ def refine(
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
     if not result.calibration.free:
         result.recalibrated = _wrong_although_held(mapper, free_units, positions, result, cancel)
-    result.focal_free = mapper.config.bundle_adjustment.refine_focal and result.calibration.free
+    result.intrinsics = held_intrinsics(mapper)
+    if mapper.config.bundle_adjustment.refine_focal and result.calibration.free:
+        result.intrinsics = assess_intrinsics(
+            mapper,
+            free_units=free_units,
+            terms=_terms(mapper, positions, result),
+            options=_options(mapper, result.sigma_px),
+        )
     _rescale(mapper, result, _terms(mapper, positions, result))
     positions = _unbend(mapper, positions, result, free_units, cancel)
     for done in range(ROUNDS):
         is_last = done == ROUNDS - 1
         result.sigma_px = _observation_sigma(mapper)
         _adjust(mapper, positions, result, free_units, rough=not is_last, cancel=cancel)
-        positions = _judged_again(mapper, positions, result)
+        positions = _reassessed(mapper, positions, result)
         if is_last:
             mapper.readmit()
         else:
@@ -171,7 +180,7 @@ def _adjust(
             mapper,
             free_units & mapper.registered,
             free_cameras=result.recalibrated,
-            free_focal=result.focal_free,
+            free_intrinsics=None if result.intrinsics is None else result.intrinsics.free,
             terms=terms,
             options=_options(mapper, result.sigma_px, rough=rough),
             cancel=cancel,
@@ -198,17 +207,17 @@ def _unbend(
         if before < BENT:
             break
         _adjust(mapper, positions, result, free_units, rough=True, cancel=cancel)
-        positions = _judged_again(mapper, positions, result)
+        positions = _reassessed(mapper, positions, result)
         if result.placement.noise_factor > STRAIGHTENED * before:
             break
     return positions
 
 
-def _judged_again(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> PositionPrior | None:
+def _reassessed(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> PositionPrior | None:
     """The positions as a prior, judged by the adjusted scene; as they are where they took no part in it."""
     if positions is None or result.placement is None or not mapper.config.bundle_adjustment.priors:
         return positions
-    result.placement = judge_again(mapper, result.placement)
+    result.placement = reassess_positions(mapper, result.placement)
     return result.placement.prior
 
 
@@ -332,8 +341,8 @@ def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) 
     elif result.recalibrated.any():
         # The cameras that stay hold the gauge.
         terms.append(replace(calibration_prior(mapper), gauge_weights=(~result.recalibrated).astype(np.float64)))
-    if result.focal_free:
-        terms.append(_focal_prior(mapper))
+    if result.intrinsics is not None and result.intrinsics.free.any():
+        terms.append(intrinsics_prior(mapper))
     if positions is not None:
         terms += [
             positions,
@@ -344,14 +353,6 @@ def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) 
             ),
         ]
     return terms
-
-
-def _focal_prior(mapper: Mapper) -> FocalPrior:
-    given = np.array([camera.params[0] for camera in mapper.drive.cameras])
-    sigma = np.array([camera.sigma_focal_px or np.nan for camera in mapper.drive.cameras]) / given
-    return FocalPrior(
-        focal_px=given, sigma=np.where(np.isfinite(sigma), sigma, mapper.config.bundle_adjustment.sigma_focal)
-    )
 
 
 def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
@@ -369,10 +370,16 @@ def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refineme
     ]
     if several and not result.calibration.free:
         terms.append(calibration_prior(mapper))
+    free_intrinsics = None
+    if result.intrinsics is not None and result.intrinsics.asked:
+        # Whoever lets the focal length vary is not certain of the others either.
+        free_intrinsics = np.full((len(mapper.camera_kind), INTRINSICS), several)
+        if not result.intrinsics.free.any():
+            terms.append(intrinsics_prior(mapper))
     problem, _ = mapper.problem(
         _free_units(mapper, georeferenced=positions is not None),
         free_cameras=np.full(len(mapper.camera_kind), several),
-        free_focal=result.focal_free,
+        free_intrinsics=free_intrinsics,
         terms=terms,
         options=_options(mapper, result.sigma_px),
     )

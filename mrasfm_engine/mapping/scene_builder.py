@@ -95,7 +95,7 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
         sigma = refinement.certainty.sigma_camera[:, :6]
-        if refinement.focal_free:
+        if refinement.intrinsics is not None and refinement.intrinsics.asked:
             focal = refinement.certainty.sigma_camera[:, 6] * mapper.state.camera_params[:, 0]
     if refinement.directions is not None:
         observed = refinement.directions.observed & refinement.recalibrated[:, None]

@@ -1,4 +1,4 @@
-"""How well the points that a unit sees cover the images of its cameras: which unit is to be registered next.
+"""Visibility pyramids: how well the points that a unit sees cover its images, so which unit is registered next.
 
 Many points in one corner fix a pose worse than a few all over the image. Each image is divided into 2 x 2, 4 x 4, ...
 64 x 64 cells; every cell that has a point counts as many as its level has cells, and a unit's score is the sum over its

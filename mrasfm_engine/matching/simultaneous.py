@@ -82,7 +82,7 @@ class RigEstimate:
     fitted: float
 
     def fits(self, found: SimultaneousMatches, *, max_error: float) -> Bools:
-        """Which matches (n,) meet in front of both cameras, near their epipolar lines.
+        """Mask (n,) of the matches that meet in front of both cameras, near their epipolar lines.
 
         `max_error` (rad) is what keypoints may be off; to it comes what the poses are uncertain by.
         """
@@ -124,7 +124,7 @@ def contradiction(names: Sequence[str], given: Floats, rig: RigEstimate) -> Find
 
 
 def are_simultaneous(drive: Drive, image_a: int, image_b: int) -> bool:
-    """Whether two images are of one unit and one instant: else the vehicle's motion lies between them, unknown yet."""
+    """True for images of one unit and one instant; else the vehicle's motion lies between them, unknown yet."""
     a, b = drive.images[image_a], drive.images[image_b]
     return a.unit == b.unit and abs(a.timestamp_us - b.timestamp_us) <= SIMULTANEOUS_US
 
@@ -133,7 +133,7 @@ def rig_of_drive(
     drive: Drive,
     pairs: Sequence[PairMatches],
     rays_of: Callable[[PairMatches], tuple[Floats, Floats]],
-    matching: MatchConfig,
+    match_config: MatchConfig,
     calibration: BundleAdjustmentConfig,
 ) -> RigEstimate:
     """The drive's rig from the inliers of its simultaneous pairs; where settings hold the calibration, as it is given.
@@ -153,7 +153,7 @@ def rig_of_drive(
         sigma_rotation_rad=sigma_rotation_rad,
         sigma_translation_m=sigma_translation_m,
         focal_px=pack_cameras(drive.cameras)[1][:, :2].mean(1),
-        max_error_px=matching.max_error_px,
+        max_error_px=match_config.max_error_px,
     )
 
 

@@ -176,7 +176,7 @@ class CeresProblem:
         problem, layout = self.problem, self.problem.layout
         options = pycolmap.BundleAdjustmentOptions()
         options.refine_principal_point = options.refine_extra_params = False
-        options.refine_focal_length = layout.free_focal
+        options.refine_focal_length = bool(layout.free_intrinsics[:, 0].any())
         options.print_summary = False
         options.refine_sensor_from_rig = layout.num_cameras > 0
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -230,7 +230,7 @@ class CeresProblem:
             units[u] = se3.inverse(matrix_of(self.unit_pose(u))) @ self.reference_from_unit[u]
         for c in np.flatnonzero(layout.camera_slot >= 0).tolist():
             cameras[c] = self.rig_from_reference @ se3.inverse(matrix_of(self.camera_pose(c)))
-            if layout.free_focal:
+            if layout.free_intrinsics[:, 0].any():
                 params[c, :2] = self.intrinsics(c)[0]
         return replace(
             before,
@@ -297,7 +297,7 @@ def _sensor(camera_id: int) -> pycolmap.sensor_t:
 
 def _camera(problem: Problem, camera: int, camera_id: int) -> pycolmap.Camera:
     kind, params = int(problem.camera_kind[camera]), problem.state.camera_params[camera]
-    one_focal = problem.layout.free_focal and problem.layout.camera_slot[camera] >= 0
+    one_focal = problem.layout.free_intrinsics[:, 0].any() and problem.layout.camera_slot[camera] >= 0
     model, terms = (ONE_FOCAL_MODEL if one_focal else MODEL)[kind]
     if one_focal and (params[0] != params[1] or params[4 + terms :].any()):
         raise ValueError(

@@ -99,7 +99,7 @@ def _residuals(term: priors.Term, handed: CeresProblem) -> Iterator[Residuals]:
             return _calibration(term, handed)
         case priors.CameraPosePrior():
             return _camera_poses(term, handed)
-        case priors.FocalPrior():
+        case priors.IntrinsicsPrior():
             return _focal_lengths(term, handed)
         case priors.PositionPrior():
             return _positions(term, handed)
@@ -149,11 +149,11 @@ def _heights(blocks: list[Floats], *, axes: Floats, up: Floats, sigma: Floats) -
     return axes @ turned / sigma, [derivative / sigma[:, None]]
 
 
-def _focal_lengths(term: priors.FocalPrior, handed: CeresProblem) -> Iterator[Residuals]:
+def _focal_lengths(term: priors.IntrinsicsPrior, handed: CeresProblem) -> Iterator[Residuals]:
     """log(f / given) / sigma."""
     layout = handed.problem.layout
-    for c in np.flatnonzero(layout.camera_slot >= 0).tolist() if layout.free_focal else ():
-        function = partial(_focal_length, given=float(term.focal_px[c]), sigma=float(term.sigma[c]))
+    for c in np.flatnonzero(layout.camera_slot >= 0).tolist() if layout.free_intrinsics[:, 0].any() else ():
+        function = partial(_focal_length, given=float(term.params[c, 0]), sigma=float(term.sigma[c, 0]))
         yield Residuals(function=function, count=1, blocks=[handed.intrinsics(c)])
 
 

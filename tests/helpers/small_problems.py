@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.priors import Term
-from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
+from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, Layout, Observations
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry import se3
@@ -45,6 +45,7 @@ def make_case(
     free_units: Sequence[bool] | None = None,
     free_cameras: Sequence[bool] | None = None,
     free_focal: bool = False,
+    free_intrinsics: bool = False,
     seed: int = 0,
     options: SolverOptions | None = None,
 ) -> Case:
@@ -80,11 +81,30 @@ def make_case(
         layout=Layout.from_free(
             np.array(first_fixed if free_units is None else free_units, dtype=np.bool_),
             np.array([False] * cameras if free_cameras is None else free_cameras, dtype=np.bool_),
-            free_focal=free_focal,
+            free_intrinsics=intrinsics_mask(cameras, focal=free_focal, every=free_intrinsics),
         ),
         options=options or SolverOptions(),
     )
     return Case(truth=truth, problem=problem, simulation=sim)
+
+
+def intrinsics_mask(cameras: int, *, focal: bool, every: bool = False) -> np.ndarray:
+    """Which intrinsics (cameras, INTRINSICS) vary: focal lengths, all or none."""
+    mask = np.full((cameras, INTRINSICS), every)
+    mask[:, 0] |= focal
+    return mask
+
+
+def with_focal(layout: Layout, free: bool) -> Layout:
+    """The layout with the focal lengths of its cameras, and no other intrinsics, free or held."""
+    return replace(layout, free_intrinsics=intrinsics_mask(layout.num_cameras, focal=free))
+
+
+def focal_prior(params: np.ndarray, sigma: np.ndarray) -> IntrinsicsPrior:
+    """A prior of focal lengths, with sigmas (cameras,) relative to them, and of no other intrinsics."""
+    every = np.full(params.shape, np.inf)
+    every[:, 0] = sigma
+    return IntrinsicsPrior(params=params.copy(), sigma=every)
 
 
 def project(state: State, kind: Any, unit: Any, camera: Any, point: Any, band: Any = None) -> np.ndarray:

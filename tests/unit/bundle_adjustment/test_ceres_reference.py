@@ -13,7 +13,7 @@ from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.bundle_adjustment.priors import (
     CalibrationPrior,
     CameraPosePrior,
-    FocalPrior,
+    IntrinsicsPrior,
     PositionPrior,
     Term,
     UprightPrior,
@@ -25,7 +25,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
 from mrasfm_engine.scene.state import State
 from tests.helpers.ceres_reference import CeresProblem, solve_with_ceres
-from tests.helpers.small_problems import make_case, perturbed, project
+from tests.helpers.small_problems import focal_prior, make_case, perturbed, project
 
 UNITS, CAMERAS, POINTS = 6, 3, 150
 MODELS = ([PERSPECTIVE] * 3, [RADIAL, PERSPECTIVE, RADIAL], [FISHEYE] * 3)
@@ -62,7 +62,7 @@ def started(problem: Problem, rng: Rng, *, terms: Sequence[Term] = (), by: float
         problem.state, rng,
         units=np.flatnonzero(layout.unit_slot >= 0).tolist(), cameras=np.flatnonzero(layout.camera_slot >= 0).tolist(),
         unit_m=0.03 * by, unit_deg=0.1 * by, camera_m=0.01 * by, camera_deg=0.1 * by, point_m=0.05 * by,
-        focal=0.002 * by if layout.free_focal else 0.0,
+        focal=0.002 * by if layout.free_intrinsics[:, 0].any() else 0.0,
     )  # fmt: skip
     state.points_m[fixed] = problem.state.points_m[fixed]
     return replace(problem, state=state, terms=terms)
@@ -92,10 +92,12 @@ def position_prior(
     return PositionPrior(unit=which, position_m=measured_m + off_m, sigma_m=sigma_m, lever_arm_m=lever_arm_m)
 
 
-def focal_prior(truth: State, rng: Rng) -> FocalPrior:
+def any_focal_prior(truth: State, rng: Rng) -> IntrinsicsPrior:
     """Of focal lengths that are off by some sigmas."""
     off = rng.choice([-0.003, 0.003], CAMERAS)
-    return FocalPrior(focal_px=truth.camera_params[:, 0] * np.exp(off), sigma=rng.uniform(3e-4, 1e-3, CAMERAS))
+    given = truth.camera_params.copy()
+    given[:, :2] *= np.exp(off)[:, None]
+    return focal_prior(given, rng.uniform(3e-4, 1e-3, CAMERAS))
 
 
 def upright_prior() -> UprightPrior:
@@ -162,7 +164,7 @@ def focal_lengths(rng: Rng) -> Problem:
     """Two units are fixed, and give the scale where cameras are free."""
     cameras = [False, True, bool(rng.random() < 0.5)]
     problem = problem_at_truth(rng, units=[False, False] + [True] * 4, cameras=cameras, free_focal=True)
-    prior = focal_prior(problem.state, rng)
+    prior = any_focal_prior(problem.state, rng)
     return started(problem, rng, terms=[prior])
 
 
@@ -216,7 +218,7 @@ def everything(rng: Rng) -> Problem:
     problem = problem_at_truth(rng, units=[True] * 6, cameras=[True] * 3, free_focal=True, outliers=0.03)
     terms = [
         calibration_prior(problem.state, rng),
-        focal_prior(problem.state, rng),
+        any_focal_prior(problem.state, rng),
         position_prior(problem.state, rng),
         upright_prior(),
     ]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.kernels import BEHIND_PX
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior, PositionPrior, UprightPrior
-from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, UNIT_DOF, Layout, Observations, RowBandMotion
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, IntrinsicsPrior, PositionPrior, UprightPrior
+from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout, Observations, RowBandMotion
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
@@ -16,6 +16,8 @@ from mrasfm_engine.scene.state import State
 from tests.helpers.small_problems import (
     Case,
     dense_normal_equations,
+    focal_prior,
+    intrinsics_mask,
     make_case,
     moved,
     numeric_gradient,
@@ -24,16 +26,20 @@ from tests.helpers.small_problems import (
 )
 
 
-def case_of_all_kinds(seed: int = 0) -> tuple[Case, State]:
-    """Perspective, radial and fisheye cameras, everything free but the first unit, away from the optimum."""
+def case_of_all_kinds(seed: int = 0, *, free_intrinsics: bool = False) -> tuple[Case, State]:
+    """Cameras of all kinds, everything free but the first unit, away from the optimum.
+
+    Of a perspective one no distortion varies, so there is none where all intrinsics do.
+    """
     case = make_case(
         units=3,
         cameras=3,
         points=90,
-        kinds=[PERSPECTIVE, RADIAL, FISHEYE],
+        kinds=[RADIAL if free_intrinsics else PERSPECTIVE, RADIAL, FISHEYE],
         free_units=[False, True, True],
         free_cameras=[True, True, True],
         free_focal=True,
+        free_intrinsics=free_intrinsics,
         seed=seed,
         options=SolverOptions(sigma_px=0.7, loss_scale=2.0),
     )
@@ -69,7 +75,7 @@ def with_bands(case: Case, state: State, seed: int = 0) -> tuple[Problem, State]
     return replace(case.problem, observations=observations, motion=held), replace(state, **motion)
 
 
-def all_terms(case: Case) -> list[CalibrationPrior | PositionPrior | UprightPrior | FocalPrior]:
+def all_terms(case: Case) -> list[CalibrationPrior | PositionPrior | UprightPrior | IntrinsicsPrior]:
     truth, units = case.truth, np.arange(len(case.truth.unit_rotation))
     return [
         CalibrationPrior(
@@ -78,7 +84,7 @@ def all_terms(case: Case) -> list[CalibrationPrior | PositionPrior | UprightPrio
             sigma_rotation_rad=np.full(len(truth.camera_rotation), np.radians(2.0)),
             sigma_translation_m=np.full(len(truth.camera_rotation), 0.05),
         ),
-        FocalPrior(focal_px=truth.camera_params[:, 0], sigma=np.full(len(truth.camera_params), 0.002)),
+        focal_prior(truth.camera_params, np.full(len(truth.camera_params), 0.002)),
         PositionPrior(
             unit=units,
             position_m=truth.unit_position_m + np.array([0.1, -0.2, 0.3]),
@@ -95,8 +101,9 @@ def schur(h: np.ndarray, g: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]
     return h[:n, :n] - structure @ h[n:, :n], g[:n] - structure @ g[n:]
 
 
-def test_the_cost_has_the_gradient_of_all_camera_kinds_and_terms() -> None:
-    case, state = case_of_all_kinds()
+@pytest.mark.parametrize("free_intrinsics", [False, True])
+def test_the_cost_has_the_gradient_of_all_camera_kinds_and_terms(free_intrinsics: bool) -> None:
+    case, state = case_of_all_kinds(free_intrinsics=free_intrinsics)
     problem = replace(case.problem, terms=all_terms(case)[1:])  # the gauge's weights are held in a step: tested apart
     _, g = dense_normal_equations(problem, state)
     numeric = numeric_gradient(problem, state, range(len(g)))
@@ -107,9 +114,12 @@ def test_the_cost_has_the_gradient_of_all_camera_kinds_and_terms() -> None:
 
 
 @pytest.mark.parametrize("with_terms", [False, True])
+@pytest.mark.parametrize("free_intrinsics", [False, True])
 @pytest.mark.parametrize("seed", range(2))
-def test_the_reduced_system_is_the_schur_complement_of_the_full_one(seed: int, with_terms: bool) -> None:
-    case, state = case_of_all_kinds(seed)
+def test_the_reduced_system_is_the_schur_complement_of_the_full_one(
+    seed: int, free_intrinsics: bool, with_terms: bool
+) -> None:
+    case, state = case_of_all_kinds(seed, free_intrinsics=free_intrinsics)
     problem = replace(case.problem, terms=all_terms(case) if with_terms else ())
     h, g = dense_normal_equations(problem, state)
     n = problem.layout.size
@@ -122,8 +132,9 @@ def test_the_reduced_system_is_the_schur_complement_of_the_full_one(seed: int, w
     np.testing.assert_array_equal(system.matrix, system.matrix.T)
 
 
-def test_the_step_equals_that_of_the_dense_full_system() -> None:
-    case, state = case_of_all_kinds()
+@pytest.mark.parametrize("free_intrinsics", [False, True])
+def test_the_step_equals_that_of_the_dense_full_system(free_intrinsics: bool) -> None:
+    case, state = case_of_all_kinds(free_intrinsics=free_intrinsics)
     problem = replace(case.problem, terms=all_terms(case))
     damping, n = 1e-3, problem.layout.size
     h, g = dense_normal_equations(problem, state)
@@ -229,13 +240,15 @@ def test_threads_share_the_work_without_changing_it() -> None:
 
 
 def test_fixed_units_and_cameras_have_no_place_in_the_system() -> None:
-    layout = Layout.from_free(np.array([False, True, False, True]), np.array([True, False]), free_focal=False)
-    assert layout.size == 2 * UNIT_DOF + CAMERA_DOF
+    layout = Layout.from_free(np.array([False, True, False, True]), np.array([True, False]))
+    assert layout.size == 2 * UNIT_DOF + 7
     assert layout.unit_slot.tolist() == [-1, 0, -1, 1]
     assert layout.unit_offsets(np.array([1, 3])).tolist() == [0, 6]
     assert layout.camera_offsets(np.array([0])).tolist() == [12]
     assert layout.held().tolist() == [18]
-    assert not len(Layout.from_free(np.array([True]), np.array([True]), free_focal=True).held())
+    one = np.array([True])
+    assert not len(Layout.from_free(one, one, free_intrinsics=intrinsics_mask(1, focal=True)).held())
+    assert Layout.from_free(one, one, free_intrinsics=intrinsics_mask(1, focal=True, every=True)).size == 6 + 14
 
 
 def test_an_observation_behind_its_camera_costs_and_pulls_nothing() -> None:

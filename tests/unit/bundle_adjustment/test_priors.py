@@ -9,7 +9,6 @@ from mrasfm_engine.bundle_adjustment import priors
 from mrasfm_engine.bundle_adjustment.priors import (
     CalibrationPrior,
     CameraPosePrior,
-    FocalPrior,
     PositionPrior,
     Term,
     UprightPrior,
@@ -20,7 +19,16 @@ from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.bundle_adjustment.solver import Report, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
-from tests.helpers.small_problems import Case, make_case, moved, numeric_gradient, perturbed, rotation_errors_deg
+from tests.helpers.small_problems import (
+    Case,
+    focal_prior,
+    make_case,
+    moved,
+    numeric_gradient,
+    perturbed,
+    rotation_errors_deg,
+    with_focal,
+)
 
 UNITS, CAMERAS = 4, 5
 
@@ -186,7 +194,7 @@ def numeric_jacobian(residuals, case: Case, state: State) -> np.ndarray:  # type
 
 def test_focal_prior() -> None:
     case, state = free_case()
-    prior = FocalPrior(focal_px=case.truth.camera_params[:, 0], sigma=np.full(CAMERAS, 0.002))
+    prior = focal_prior(case.truth.camera_params, np.full(CAMERAS, 0.002))
     h = check_gradient(prior, case, state)
     free = 6 * 3 + 7 * np.arange(CAMERAS - 1) + 6
     np.testing.assert_allclose(np.diagonal(h)[free], 1 / 0.002**2)
@@ -199,8 +207,8 @@ def test_focal_prior() -> None:
 
 def test_focal_prior_adds_nothing_where_focal_lengths_are_held() -> None:
     case, state = free_case()
-    layout = replace(case.problem.layout, free_focal=False)
-    prior = FocalPrior(focal_px=case.truth.camera_params[:, 0], sigma=np.full(CAMERAS, 0.002))
+    layout = with_focal(case.problem.layout, False)
+    prior = focal_prior(case.truth.camera_params, np.full(CAMERAS, 0.002))
     h, g = added(prior, state, layout)
     assert not h.any()
     assert not g.any()

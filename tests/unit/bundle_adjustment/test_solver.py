@@ -5,11 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, FocalPrior
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
 from mrasfm_engine.scene.state import State
-from tests.helpers.small_problems import Case, make_case, perturbed, position_errors_m, rotation_errors_deg
+from tests.helpers.small_problems import (
+    Case,
+    focal_prior,
+    make_case,
+    perturbed,
+    position_errors_m,
+    rotation_errors_deg,
+    with_focal,
+)
 
 FIRST_FIXED = [False] + [True] * 7
 
@@ -104,16 +112,14 @@ def test_a_focal_length_is_recovered_where_free_and_kept_where_held() -> None:
     start = replace(case.truth, camera_params=given)
     terms = [
         calibration_prior(case.truth, rotation_deg=0.05, translation_m=0.002),
-        FocalPrior(focal_px=given[:, 0], sigma=np.full(2, 0.01)),
+        focal_prior(given, np.full(2, 0.01)),
     ]
     solution, _ = solve(replace(case.problem, state=start, terms=terms))
     left = np.abs(solution.camera_params[:, 0] / case.truth.camera_params[:, 0] - 1)
     assert 1e-7 < left.max() < 0.0012
     np.testing.assert_allclose(solution.camera_params[:, 1] / solution.camera_params[:, 0], given[:, 1] / given[:, 0])
     np.testing.assert_array_equal(solution.camera_params[:, 2:], given[:, 2:])
-    held, _ = solve(
-        replace(case.problem, state=start, layout=replace(case.problem.layout, free_focal=False), terms=terms)
-    )
+    held, _ = solve(replace(case.problem, state=start, layout=with_focal(case.problem.layout, False), terms=terms))
     np.testing.assert_array_equal(held.camera_params, given)
     assert not np.array_equal(held.camera_rotation, start.camera_rotation)
 

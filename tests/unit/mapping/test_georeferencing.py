@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, clock_offset, judge
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, assess_residuals, clock_offset
 from mrasfm_engine.synthetic.simulate import simulate_trajectory
 
 ARM_M = np.array([-0.5, 0.2, 1.8])
@@ -159,12 +159,12 @@ def test_what_a_bend_made_an_outlier_comes_back_and_a_jump_does_not() -> None:
     jump_m = np.zeros((100, 3))
     jump_m[20:35, 1] = 3.0
     before = np.arange(100) < 60
-    bent, factor = judge(noise_m + bend_m, sigma_m, before, outlier_sigmas=4.0)
+    bent, factor = assess_residuals(noise_m + bend_m, sigma_m, before, outlier_sigmas=4.0)
     assert bent.all()
     assert factor < 1.3
-    jumped, factor = judge(noise_m + bend_m + jump_m, sigma_m, before, outlier_sigmas=4.0)
+    jumped, factor = assess_residuals(noise_m + bend_m + jump_m, sigma_m, before, outlier_sigmas=4.0)
     np.testing.assert_array_equal(jumped, jump_m[:, 1] == 0)
-    assert judge(20 * noise_m, sigma_m, before, outlier_sigmas=4.0)[1] == pytest.approx(20 * factor, rel=0.5)
+    assert assess_residuals(20 * noise_m, sigma_m, before, outlier_sigmas=4.0)[1] == pytest.approx(20 * factor, rel=0.5)
 
 
 def test_sigmas_that_promise_too_much_are_found_out() -> None:

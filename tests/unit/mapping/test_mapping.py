@@ -131,7 +131,8 @@ def test_the_prior_puts_the_scene_into_its_frame() -> None:
     mapper, log = reconstruct(simulated, prior=prior)
     assert log.initialisation is not None
     u = log.initialisation.units[0]
-    np.testing.assert_allclose(mapper.state.world_from_rig[u], prior[u], atol=1e-9)
+    # Its later neighbours and it settle among themselves, by far less than the prior is off.
+    np.testing.assert_allclose(mapper.state.world_from_rig[u], prior[u], atol=0.01)
     assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < 0.03
 
 

@@ -1,0 +1,137 @@
+"""Intrinsics of the cameras: their prior, and whether the drive observes them.
+
+Along a straight street a longer focal length, a longer way and a little distortion look nearly alike. An adjustment
+that frees the focal length alone lets it take what the lens model leaves, and is very certain of it. So when it is
+asked how well the drive knows the focal length, all intrinsics vary under their priors, those that the camera's model
+does not have as well: a rectified image is as free of distortion as its calibration was right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions
+from mrasfm_engine.geometry.camera_model import FISHEYE, pack_cameras
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.types import Bools, Floats
+from schemas.drive import CAMERA_MODELS
+from schemas.findings import Finding, warning
+
+OBSERVED_RATIO = 1.0 / 3.0  # a focal length is worth freeing when its posterior is below this share of the prior
+BEYOND_PRIOR_SIGMAS = 4.0
+SIGMA_ASPECT = 5e-4  # of fy over fx: pixels are square
+TANGENTIAL_SHARE = 0.2  # of the sigma of radial distortion: lenses are centred better than they are modelled
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntrinsicsDecision:
+    """Decision which intrinsics vary.
+
+    Attributes
+    ----------
+    free
+        (cameras, INTRINSICS)
+    sigma_focal
+        (cameras,) what the drive would know of the focal lengths, relative; NaN where nobody asked.
+    prior_sigma_focal
+        (cameras,) the same by the prior.
+    """
+
+    free: Bools
+    sigma_focal: Floats = field(default_factory=lambda: np.zeros(0))
+    prior_sigma_focal: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def asked(self) -> bool:
+        """True where the settings let intrinsics vary."""
+        return len(self.sigma_focal) > 0
+
+    def findings(self, mapper: Mapper) -> list[Finding]:
+        """Focal lengths that the drive does not observe, and those that left their priors."""
+        found = []
+        off = np.log(mapper.state.camera_params[:, 0] / pack_cameras(mapper.drive.cameras)[1][:, 0])
+        for c, camera in enumerate(mapper.drive.cameras if self.asked else ()):
+            if not self.free[c, 0]:
+                found.append(
+                    warning(
+                        "focal-not-observed",
+                        f"the focal length of camera {camera.name} is held as given: the drive would know it to "
+                        f"{self.sigma_focal[c]:.2%}, where its prior says {self.prior_sigma_focal[c]:.2%}",
+                        "Give a drive that turns, or leave refine_focal off.",
+                    )
+                )
+            elif abs(off[c]) > BEYOND_PRIOR_SIGMAS * self.prior_sigma_focal[c]:
+                found.append(
+                    warning(
+                        "focal-beyond-prior",
+                        f"the focal length of camera {camera.name} is {off[c]:+.2%} off what is given, "
+                        f"{abs(off[c]) / self.prior_sigma_focal[c]:.0f} sigmas of its prior",
+                        "Check params and sigma_focal_px of the camera.",
+                    )
+                )
+        return found
+
+
+def held_intrinsics(mapper: Mapper) -> IntrinsicsDecision:
+    """The decision that all stay as given, for nobody asked."""
+    return IntrinsicsDecision(free=np.zeros((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_))
+
+
+def assess_intrinsics(
+    mapper: Mapper, *, free_units: Bools, terms: Sequence[Term], options: SolverOptions
+) -> IntrinsicsDecision:
+    """Free the intrinsics that the cameras' models have where the drive observes the focal length.
+
+    Parameters
+    ----------
+    free_units, terms, options
+        Of the adjustment that would follow, with the calibration's prior; that of the intrinsics is added.
+    """
+    cameras = len(mapper.camera_kind)
+    prior = intrinsics_prior(mapper)
+    problem, _ = mapper.problem(
+        free_units,
+        free_cameras=np.ones(cameras, dtype=np.bool_),
+        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
+        terms=[prior, *terms],
+        options=options,
+    )
+    sigma = covariances(problem, problem.state).sigma_camera[:, 6]
+    observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
+    return IntrinsicsDecision(
+        free=_of_models(mapper) & observed[:, None], sigma_focal=sigma, prior_sigma_focal=prior.sigma[:, 0]
+    )
+
+
+def intrinsics_prior(mapper: Mapper) -> IntrinsicsPrior:
+    """The prior of all cameras' intrinsics from the manifest's sigmas, or the default ones."""
+    settings = mapper.config.bundle_adjustment
+    _, params = pack_cameras(mapper.drive.cameras)
+    sigma = np.empty((len(params), INTRINSICS))
+    for c, camera in enumerate(mapper.drive.cameras):
+        focal_px = params[c, 0]
+        sigma[c, 0] = settings.sigma_focal if camera.sigma_focal_px is None else camera.sigma_focal_px / focal_px
+        sigma[c, 1] = SIGMA_ASPECT
+        sigma[c, 2:4] = settings.sigma_principal_point * focal_px
+        sigma[c, 4:] = settings.sigma_distortion
+        if mapper.camera_kind[c] != FISHEYE:
+            sigma[c, 6:] *= TANGENTIAL_SHARE
+    return IntrinsicsPrior(params=params, sigma=sigma)
+
+
+def _of_models(mapper: Mapper) -> Bools:
+    """Intrinsics (cameras, INTRINSICS) that the cameras' models have."""
+    result = np.zeros((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_)
+    for c, camera in enumerate(mapper.drive.cameras):
+        names = CAMERA_MODELS[camera.model]
+        focal, distortion = (sum(name[0] in begins for name in names) for begins in ("f", "kp"))
+        result[c, [0, 2, 3]] = True
+        result[c, 1] = focal == 2
+        result[c, 4 : 4 + distortion] = True
+    return result
