@@ -178,7 +178,13 @@ class BundleAdjustmentConfig(_Section):
 class GnssConfig(_Section):
     """Use of the receiver's positions."""
 
-    correlation_time_s: Positive = Field(1.0, description="samples closer in time share most of their error")
+    correlation_time_s: Positive = Field(
+        1.0, description="in a map, samples of one drive closer in time share most of their error"
+    )
+    wander_time_s: Positive = Field(
+        60.0,
+        description="time for which a receiver's error stays the same, as far as its positions do not scatter by it",
+    )
     outlier_sigmas: Positive = Field(
         4.0, description="samples whose residual after alignment exceeds this are rejected, in standard deviations"
     )

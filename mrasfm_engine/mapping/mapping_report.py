@@ -14,6 +14,7 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import voted_out
+from mrasfm_engine.mapping.placement import shared_error_factor
 from mrasfm_engine.mapping.refinement import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
@@ -116,8 +117,9 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
         result["gnss"] = {
             "units_used": int(placement.inlier.sum()),
             "outliers_at_us": [int(t) for t in times],
-            "residual_rms_m": float(np.sqrt((placement.residual_m[placement.inlier] ** 2).mean())),
+            "residual_rms_m": float(np.sqrt((placement.off_m[placement.inlier] ** 2).sum(1).mean())),
             "noise_factor": placement.noise_factor,
+            "shared_error_factor": shared_error_factor(mapper, placement),
             "scale_of_rig_against_gnss": alignment.scale,
         }
     elif placement is not None:

@@ -22,6 +22,7 @@ MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receive
 SCALE_DISAGREEMENT_SIGMAS = 3.0
 MIN_ROUGH_POSES = 2
 MIN_POSITIONS = 3
+MOST_TIMES = 1000  # compared with one another
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
 
@@ -37,7 +38,8 @@ class Placement:
     measured_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) positions of these
     sigma_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3)
     inlier: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (n,)
-    residual_m: Floats = field(default_factory=lambda: np.zeros(0))  # (n,) of the scene as it was judged last
+    off_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) scene minus measured, as assessed last
+    interval_us: float = 0.0  # of the receiver's samples
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
@@ -63,20 +65,21 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> 
         return Placement(reason=alignment)
     _move(mapper, alignment.world_from_model)
     good = units[alignment.inlier]
-    correlated = _samples_per_correlation_time(times[good], settings.correlation_time_s)
-    findings = []
-    if not single:
-        findings = _findings(mapper, alignment, measured[good], sigma[good], good, antenna_in_rig_m, correlated)
+    antenna_m = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ antenna_in_rig_m
     placement = Placement(
         alignment=alignment,
         units=units,
         measured_m=measured[units],
         sigma_m=sigma[units],
         inlier=alignment.inlier,
-        residual_m=alignment.residual_m,
+        off_m=antenna_m - measured[units],
+        interval_us=float(np.median(np.diff(gnss.timestamps_us[gnss.good]))) if gnss.good.sum() > 1 else 0.0,
         noise_factor=alignment.noise_factor,
-        findings=findings,
     )
+    if not single:
+        inflation = shared_error_factor(mapper, placement)
+        found = _findings(mapper, alignment, measured[good], sigma[good], good, antenna_in_rig_m, inflation)
+        placement = replace(placement, findings=found)
     return _with_prior(mapper, placement, np.asarray(antenna_in_rig_m))
 
 
@@ -93,20 +96,17 @@ def reassess_positions(mapper: Mapper, placement: Placement) -> Placement:
     inlier &= mapper.registered[units]
     if inlier.sum() < MIN_POSITIONS:
         return placement
-    residual_m = np.linalg.norm(off_m, axis=1)
-    judged = replace(placement, inlier=inlier, residual_m=residual_m, noise_factor=factor)
-    return _with_prior(mapper, judged, arm_m)
+    return _with_prior(mapper, replace(placement, inlier=inlier, off_m=off_m, noise_factor=factor), arm_m)
 
 
 def _with_prior(mapper: Mapper, placement: Placement, antenna_in_rig_m: Floats) -> Placement:
     """The placement with its positions that are no outliers as a term of the adjustment."""
     good = placement.inlier
     units = placement.units[good]
-    correlated = _samples_per_correlation_time(mapper.drive.timestamps_us[units], mapper.config.gnss.correlation_time_s)
     prior = PositionPrior(
         unit=units,
         position_m=placement.measured_m[good],
-        sigma_m=placement.sigma_m[good] * placement.noise_factor * np.sqrt(correlated),
+        sigma_m=placement.sigma_m[good] * placement.noise_factor * shared_error_factor(mapper, placement),
         lever_arm_m=antenna_in_rig_m,
     )
     return replace(placement, prior=prior)
@@ -160,11 +160,34 @@ def _move(mapper: Mapper, world_from_model: Floats) -> None:
     state.points_m[:] = se3.apply(world_from_model, state.points_m)
 
 
-def _samples_per_correlation_time(times_us: Ints, correlation_time_s: float) -> float:
-    """Number of samples that share one error, as errors of a receiver change slowly: their information counts once."""
-    if len(times_us) < 2:
+def shared_error_factor(mapper: Mapper, placement: Placement) -> float:
+    """Factor on the sigmas of positions under which, taken as independent, they say no more than they do together.
+
+    What positions scatter by from one to the next is white, and averages out; the rest of the declared variance wanders
+    and is the same for as long as `gnss.wander_time_s`. With a white share q^2 of n samples' variance their mean has
+
+        q^2 / n + (1 - q^2) mean of exp(-|t_i - t_j| / time)
+
+    of the variance of one. Scatter that is not clearly less than declared is all of it.
+    """
+    good = placement.inlier
+    times_s = mapper.drive.timestamps_us[placement.units[good]] / 1e6
+    if len(times_s) < MIN_POSITIONS:
         return 1.0
-    return max(1.0, correlation_time_s / (float(np.median(np.diff(times_us))) / 1e6))
+    # Positions between two samples are a blend of both.
+    apart = max(1, round(placement.interval_us / 1e6 / float(np.median(np.diff(times_s)))))
+    whitened = placement.off_m[good] / (placement.sigma_m[good] * placement.noise_factor)
+    steps = (whitened[apart:] - whitened[:-apart]).ravel() / np.sqrt(2.0)
+    white = 0.0
+    if len(steps):
+        white = min(1.0, float((np.median(np.abs(steps)) / 0.6745) ** 2))
+        # A variance from the median of n normal numbers is uncertain by 2.3 / sqrt(n) of itself; neighbouring steps
+        # share a sample, which makes n half of them.
+        if white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * len(steps)):
+            white = 1.0
+    some = times_s[:: 1 + len(times_s) // MOST_TIMES]
+    alike = float(np.exp(-np.abs(some[:, None] - some[None]) / mapper.config.gnss.wander_time_s).mean())
+    return float(np.sqrt(apart * white + len(times_s) * alike * (1.0 - white)))
 
 
 def _findings(
@@ -174,7 +197,7 @@ def _findings(
     sigma_m: Floats,
     units: Ints,
     antenna_in_rig_m: Floats,
-    correlated: float,
+    inflation: float,
 ) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
     findings = []
@@ -183,8 +206,7 @@ def _findings(
     fitted = centre + alignment.scale * (antenna - centre)
     times = mapper.drive.timestamps_us[units]
     offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, times)
-    # The receiver's errors change slowly, so its samples know less of the clock than independent ones would.
-    inflation = float(np.sqrt(correlated))
+    # Where the receiver's errors change slowly, its samples know less of the clock than independent ones would.
     if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * inflation * offset[1]):
         direction = "ahead of" if offset[0] > 0 else "behind"
         findings.append(

@@ -50,7 +50,8 @@ def test_the_road_is_found(surround_scene: Path) -> None:
     assert road["source"] == "masks"
     assert road["kept"] + road["dropped"] == road["points"] > 100
     assert 0 < road["thickness_after_m"] < 0.15
-    assert abs(road["rig_height_above_road_m"]) < 0.1  # the rig's origin is on the ground below the rear axle
+    # The rig's origin is on the ground below the rear axle, the cameras 1.6 m above; scale is known to 10 %.
+    assert abs(road["rig_height_above_road_m"]) < 0.2
     document = json.loads((surround_scene / "road.json").read_text())
     assert len(document["patches"]) == road["patches"] > 1
     normals = np.array([patch["normal"] for patch in document["patches"]])
