@@ -179,7 +179,7 @@ class GnssConfig(_Section):
     """Use of the receiver's positions."""
 
     correlation_time_s: Positive = Field(
-        1.0, description="in a map, samples of one drive closer in time share most of their error"
+        1.0, description="samples closer in time share what they do not scatter by; in a map, most of their error"
     )
     wander_time_s: Positive = Field(
         60.0,

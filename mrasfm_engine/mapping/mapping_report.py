@@ -14,7 +14,7 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import voted_out
-from mrasfm_engine.mapping.placement import shared_error_factor
+from mrasfm_engine.mapping.placement import receiver_errors
 from mrasfm_engine.mapping.refinement import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
@@ -119,7 +119,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "outliers_at_us": [int(t) for t in times],
             "residual_rms_m": float(np.sqrt((placement.off_m[placement.inlier] ** 2).sum(1).mean())),
             "noise_factor": placement.noise_factor,
-            "shared_error_factor": shared_error_factor(mapper, placement),
+            "common_error_share": receiver_errors(mapper, placement).common,
             "scale_of_rig_against_gnss": alignment.scale,
         }
     elif placement is not None:

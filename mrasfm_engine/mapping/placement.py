@@ -77,7 +77,7 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> 
         noise_factor=alignment.noise_factor,
     )
     if not single:
-        inflation = shared_error_factor(mapper, placement)
+        inflation = receiver_errors(mapper, placement).factor
         found = _findings(mapper, alignment, measured[good], sigma[good], good, antenna_in_rig_m, inflation)
         placement = replace(placement, findings=found)
     return _with_prior(mapper, placement, np.asarray(antenna_in_rig_m))
@@ -106,7 +106,7 @@ def _with_prior(mapper: Mapper, placement: Placement, antenna_in_rig_m: Floats) 
     prior = PositionPrior(
         unit=units,
         position_m=placement.measured_m[good],
-        sigma_m=placement.sigma_m[good] * placement.noise_factor * shared_error_factor(mapper, placement),
+        sigma_m=placement.sigma_m[good] * placement.noise_factor * receiver_errors(mapper, placement).factor,
         lever_arm_m=antenna_in_rig_m,
     )
     return replace(placement, prior=prior)
@@ -160,22 +160,41 @@ def _move(mapper: Mapper, world_from_model: Floats) -> None:
     state.points_m[:] = se3.apply(world_from_model, state.points_m)
 
 
-def shared_error_factor(mapper: Mapper, placement: Placement) -> float:
-    """Factor on the sigmas of positions under which, taken as independent, they say no more than they do together.
+@dataclass(frozen=True, kw_only=True)
+class ReceiverErrors:
+    """Errors of a receiver's positions, of which some scatter and some wander.
 
-    What positions scatter by from one to the next is white, and averages out; the rest of the declared variance wanders
-    and is the same for as long as `gnss.wander_time_s`. With a white share q^2 of n samples' variance their mean has
+    Attributes
+    ----------
+    factor
+        On the sigmas of positions: taken as independent, they then say no more of the trajectory's shape than they do.
+    common
+        Share of the declared sigmas that all positions have in common: it moves the scene, but does not bend it.
+    """
 
-        q^2 / n + (1 - q^2) mean of exp(-|t_i - t_j| / time)
+    factor: float
+    common: float
 
-    of the variance of one. Scatter that is not clearly less than declared is all of it.
+
+def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
+    """Tell white errors from wandering ones by how positions scatter about the scene from one to the next.
+
+    The scatter q^2 of the declared variance is white, and averages out. The rest wanders as a Gauss-Markov process of
+    `gnss.wander_time_s`, with correlations K = exp(-|t_i - t_j| / time) between samples. With times u from their mean a
+    slope over n samples then has the variance of that over independent ones of
+
+        q^2 + (1 - q^2) u' K u / u' u
+
+    of theirs. Scatter that is not clearly less than declared is all of it. A receiver's filter holds the rest back for
+    `gnss.correlation_time_s` at least, so that samples closer in time count once.
     """
     good = placement.inlier
     times_s = mapper.drive.timestamps_us[placement.units[good]] / 1e6
     if len(times_s) < MIN_POSITIONS:
-        return 1.0
+        return ReceiverErrors(factor=1.0, common=1.0)
     # Positions between two samples are a blend of both.
-    apart = max(1, round(placement.interval_us / 1e6 / float(np.median(np.diff(times_s)))))
+    step_s = float(np.median(np.diff(times_s)))
+    apart = max(1, round(placement.interval_us / 1e6 / step_s))
     whitened = placement.off_m[good] / (placement.sigma_m[good] * placement.noise_factor)
     steps = (whitened[apart:] - whitened[:-apart]).ravel() / np.sqrt(2.0)
     white = 0.0
@@ -186,8 +205,14 @@ def shared_error_factor(mapper: Mapper, placement: Placement) -> float:
         if white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * len(steps)):
             white = 1.0
     some = times_s[:: 1 + len(times_s) // MOST_TIMES]
-    alike = float(np.exp(-np.abs(some[:, None] - some[None]) / mapper.config.gnss.wander_time_s).mean())
-    return float(np.sqrt(apart * white + len(times_s) * alike * (1.0 - white)))
+    alike = np.exp(-np.abs(some[:, None] - some[None]) / mapper.config.gnss.wander_time_s)
+    slope = some - some.mean()
+    wander = float(slope @ alike @ slope / (slope @ slope)) * len(times_s) / len(some)
+    wander = max(wander, mapper.config.gnss.correlation_time_s / step_s, 1.0)
+    return ReceiverErrors(
+        factor=float(np.sqrt(apart * white + wander * (1.0 - white))),
+        common=float(np.sqrt((1.0 - white) * alike.mean())),
+    )
 
 
 def _findings(

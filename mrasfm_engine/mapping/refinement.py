@@ -33,7 +33,13 @@ from mrasfm_engine.mapping.miscalibration import (
     find_miscalibrations,
     find_wrong_pair,
 )
-from mrasfm_engine.mapping.placement import Placement, place_by_gnss, place_by_rough_poses, reassess_positions
+from mrasfm_engine.mapping.placement import (
+    Placement,
+    place_by_gnss,
+    place_by_rough_poses,
+    reassess_positions,
+    receiver_errors,
+)
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
@@ -151,7 +157,7 @@ def refine(
         if progress is not None:
             progress(done + 1, ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
-    result.certainty = _certainty(mapper, positions, result)
+    result.certainty = _with_common_error(mapper, result, _certainty(mapper, positions, result))
     result.directions = _directions(mapper, result.certainty)
     if result.recalibrated.any() and result.directions is not None:
         if result.calibration.free and result.directions.to_hold.any():
@@ -353,6 +359,16 @@ def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) 
             ),
         ]
     return terms
+
+
+def _with_common_error(mapper: Mapper, result: Refinement, certainty: Covariances | None) -> Covariances | None:
+    """The certainty with what the receiver's positions are off by together, which no image shows."""
+    if certainty is None or result.placement is None or result.placement.prior is None:
+        return certainty
+    good = result.placement.inlier
+    sigma_m = np.sqrt((result.placement.sigma_m[good] ** 2).mean(0)) * result.placement.noise_factor
+    common_m = receiver_errors(mapper, result.placement).common * sigma_m
+    return replace(certainty, sigma_unit_position_m=np.hypot(certainty.sigma_unit_position_m, common_m))
 
 
 def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> Covariances | None:

@@ -113,10 +113,10 @@ def contradiction(names: Sequence[str], given: Floats, rig: RigEstimate) -> Find
         return None
     turned = rig.rig_from_cam[:, :3, :3] @ np.swapaxes(given[:, :3, :3], 1, 2)
     between_deg = np.degrees(np.linalg.norm(se3.log_so3(np.swapaxes(turned, 1, 2)[:, None] @ turned[None]), axis=-1))
-    a, b = np.unravel_index(int(between_deg.argmax()), between_deg.shape)
+    a, b = sorted(int(k) for k in np.unravel_index(int(between_deg.argmax()), between_deg.shape))
     return warning(
         "calibration-contradicted",
-        f"simultaneous images show cameras {names[min(a, b)]} and {names[max(a, b)]} turned by "
+        f"simultaneous images show cameras {names[a]} and {names[b]} turned by "
         f"{between_deg[a, b]:.2f} deg against each other from where rig.cameras says: of {rig.matches} matches "
         f"{rig.fitted_as_given:.0%} fit the calibration as given, {rig.fitted:.0%} as corrected",
         "Mapping begins with the corrected rotations; take the result from calibration.json, and check the mounting.",

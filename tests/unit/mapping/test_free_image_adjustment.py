@@ -158,7 +158,9 @@ def refined(adjustment: BundleAdjustmentConfig, *, bent: bool) -> tuple[Mapper, 
     """A turning drive refined with GNSS whose positions bend away from the truth, or with none."""
     simulated = make_simulated_drive(units=20, cameras=4, points=1200)
     # Errors that are independent from sample to sample weigh most.
-    config = EngineConfig(threads=1, bundle_adjustment=adjustment, gnss=GnssConfig(wander_time_s=0.01))
+    config = EngineConfig(
+        threads=1, bundle_adjustment=adjustment, gnss=GnssConfig(wander_time_s=0.01, correlation_time_s=0.01)
+    )
     mapper = make_model(simulated, config=config)
     with_true_poses(mapper, simulated, range(20))
     position = simulated.world_from_rig[:, :3, 3].copy()

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.bundle_adjustment.priors import PositionPrior
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions
+from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.refinement import refine
+from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+from tests.unit.mapping.test_placement import ARM_M, received
+
+SIGMA_FOCAL = 0.02
+CONFIG = EngineConfig(threads=1, bundle_adjustment=BundleAdjustmentConfig(refine_focal=True, sigma_focal=SIGMA_FOCAL))
+
+
+def model(*, straight: bool, focal: float = 1.0, cameras: int = 4) -> tuple[Mapper, SimulatedDrive]:
+    """A drive at its true poses; its cameras are given with focal lengths so many times as long."""
+    simulated = make_simulated_drive(units=30, cameras=cameras, points=2500, straight=straight)
+    rig = simulated.drive.manifest.rig
+    given = [
+        c.model_copy(update={"params": [focal * c.params[0], focal * c.params[1], *c.params[2:]]}) for c in rig.cameras
+    ]
+    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": given})})
+    simulated = replace(simulated, drive=replace(simulated.drive, manifest=manifest))
+    return with_true_poses(make_model(simulated, config=CONFIG), simulated, range(30)), simulated
+
+
+def decide(mapper: Mapper, simulated: SimulatedDrive) -> IntrinsicsDecision:
+    gnss = received(simulated, 0.05)
+    positions = PositionPrior(unit=np.arange(30), position_m=gnss.position_m, sigma_m=gnss.sigma_m, lever_arm_m=ARM_M)
+    return assess_intrinsics(
+        mapper,
+        free_units=mapper.registered,
+        terms=[calibration_prior(mapper), positions],
+        options=SolverOptions(),
+    )
+
+
+def test_a_turn_observes_focal_lengths_and_frees_what_the_model_has() -> None:
+    mapper, simulated = model(straight=False)
+    found = decide(mapper, simulated)
+    assert (found.sigma_focal < 0.003).all()
+    np.testing.assert_array_equal(found.free, np.tile(np.arange(8) < 4, (4, 1)))  # PINHOLE: no distortion
+    assert found.findings(mapper) == []
+
+
+def test_what_is_not_observed_is_held_and_said() -> None:
+    mapper, simulated = model(straight=True)
+    turning = decide(*model(straight=False))
+    good = mapper.config.bundle_adjustment.model_copy(update={"sigma_focal": 0.001})
+    mapper.config = mapper.config.model_copy(update={"bundle_adjustment": good})
+    found = decide(mapper, simulated)
+    assert (found.sigma_focal > 1.1 * turning.sigma_focal).all()
+    assert not found.free.any()
+    said = found.findings(mapper)
+    assert [f.code for f in said] == ["focal-not-observed"] * 4
+    assert "prior says 0.10%" in said[0].what
+
+
+def test_focal_lengths_that_are_given_too_long_are_found() -> None:
+    mapper, simulated = model(straight=False, focal=1.01)
+    result = refine(mapper, gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M, rough_world_from_rig=None)
+    assert result.intrinsics is not None
+    assert result.intrinsics.free[:, :4].all()
+    error = mapper.state.camera_params[:, 0] / simulated.truth.camera_params[:, 0] - 1
+    assert np.abs(error).max() < 0.003
+    assert result.certainty is not None
+    assert (np.abs(error) < 3 * result.certainty.sigma_camera[:, 6]).all()
+
+
+def test_leaving_the_prior_is_a_finding() -> None:
+    mapper, _ = model(straight=False, cameras=2)
+    mapper.state.camera_params[0, :2] *= 1.1
+    decision = IntrinsicsDecision(
+        free=np.ones((2, 8), dtype=np.bool_), sigma_focal=np.full(2, 1e-3), prior_sigma_focal=np.full(2, SIGMA_FOCAL)
+    )
+    said = decision.findings(mapper)
+    assert [f.code for f in said] == ["focal-beyond-prior"]
+    assert "+9.53% off what is given, 5 sigmas" in said[0].what
+    assert held_intrinsics(mapper).findings(mapper) == []
+
+
+def test_the_prior_is_the_manifests_where_it_says_one() -> None:
+    mapper, simulated = model(straight=False, cameras=2)
+    rig = simulated.drive.manifest.rig
+    cameras = [rig.cameras[0].model_copy(update={"sigma_focal_px": 3.0}), rig.cameras[1]]
+    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
+    mapper.drive = replace(simulated.drive, manifest=manifest)
+    prior = intrinsics_prior(mapper)
+    assert prior.sigma[0, 0] == pytest.approx(3.0 / prior.params[0, 0])
+    assert prior.sigma[1, 0] == SIGMA_FOCAL
+    assert (prior.sigma > 0).all()
