@@ -13,7 +13,7 @@ from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes
 
 SMALLEST_DESCRIPTOR_SUM = 1e-3
-CANDIDATES = 4  # times the number wanted, of which those are chosen that cover the image
+CANDIDATES = 2  # times the number wanted, of which those are chosen that cover the image
 
 
 class SiftExtractor:
