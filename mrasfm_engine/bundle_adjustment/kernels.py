@@ -96,12 +96,16 @@ class Observed(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Slots of units and cameras in the reduced vector, -1 where held; number of free units, unknowns of a camera."""
+    """Slots of units and cameras in the reduced vector, -1 where held; number of free units.
+
+    `intrinsics` is as long as a camera has places for intrinsics: a length that is part of the type, so that loops over
+    them are compiled for it.
+    """
 
     unit: Ints
     camera: Ints
     num_units: int
-    camera_dof: int
+    intrinsics: tuple[int, ...]
 
 
 class Sums(NamedTuple):
@@ -278,8 +282,9 @@ def accumulate(
     """
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
-    unit_slot, camera_slot, num_units, dof = free_slots
-    intrinsics = dof - 6
+    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
+    intrinsics = len(places_of_intrinsics)
+    dof = 6 + intrinsics
     own, own_gradient = UNIT_SUMS + 6 * intrinsics, image_sums_gradient(intrinsics)
     order, first_point, blocks, first_block, places, first_place = groups
     images, s_units, s_border, s_cameras, g, v_inverse, v_gradient = sums
@@ -414,7 +419,7 @@ def accumulate(
             for a in range(rows):
                 g[o + a] -= w[i, 0, a] * x0 + w[i, 1, a] * x1 + w[i, 2, a] * x2
         _subtract_products(
-            w, inv, tiled, repeated, blocks, b0, b1, num_units, dof,
+            w, inv, tiled, repeated, blocks, b0, b1, num_units, places_of_intrinsics,
             places, first_place[group], s_units, s_border, s_cameras,
         )  # fmt: skip
 
@@ -447,14 +452,15 @@ def _add_unit(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _subtract_products(
-    w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int, dof: int, places: Any,
-    place: int, s_units: Any, s_border: Any, s_cameras: Any,
+    w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int,
+    places_of_intrinsics: Any, places: Any, place: int, s_units: Any, s_border: Any, s_cameras: Any,
 ) -> None:  # fmt: skip
     """S_ij -= W_i V^-1 W_j' for all pairs of a point's blocks.
 
     Entry (a, b) of a product needs row a of W_i V^-1 and row b of W_j. Both are first spread over the 6 columns of a
     block, so that one loop without gaps runs over all of its entries.
     """
+    dof = 6 + len(places_of_intrinsics)
     count, wide = b1 - b0, 6 * dof
     for i in range(count):
         block = blocks[b0 + i]
@@ -506,8 +512,9 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
-    unit_slot, camera_slot, num_units, dof = free_slots
-    intrinsics = dof - 6
+    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
+    intrinsics = len(places_of_intrinsics)
+    dof = 6 + intrinsics
     own, own_gradient = UNIT_SUMS + 6 * intrinsics, image_sums_gradient(intrinsics)
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
@@ -627,7 +634,8 @@ def substitute(
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
-    unit_slot, camera_slot, num_units, dof = free_slots
+    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
+    dof = 6 + len(places_of_intrinsics)
     jx, jc, e = np.empty((2, 3)), np.empty((2, dof)), np.empty(3)
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, _ = observed

@@ -125,7 +125,7 @@ class Problem:
     @property
     def _slots(self) -> Slots:
         layout = self.layout
-        return Slots(layout.unit_slot, layout.camera_slot, layout.num_units, layout.camera_dof)
+        return Slots(layout.unit_slot, layout.camera_slot, layout.num_units, (0,) * (layout.camera_dof - 6))
 
     def retract(self, state: State, step: Floats, points_m: Floats) -> State:
         """The state after a step of the reduced vector, with new points."""
