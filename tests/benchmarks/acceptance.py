@@ -19,6 +19,7 @@
 | 15 | how time, memory and error grow with the length of simulated routes |
 | 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
 | 17 | the service while its processes are killed: nothing lost, twice, stuck, wrong or left |
+| 18 | a real drive whose manifest is wrong: a camera pitched by 1 deg, focal lengths 1 % long |
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
@@ -60,6 +61,7 @@ from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.table import Figure, failed, save, show
+from tests.benchmarks.wrong_manifests import wrong_manifests
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 THOROUGH_REPEAT = 3
@@ -93,6 +95,7 @@ LINES = {
     "15": Line(timed=(long_routes,)),
     "16": Line(repeated=(correspondence,)),
     "17": Line(timed=(kills,)),
+    "18": Line(untimed=(wrong_manifests,)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
 }
 

@@ -1,0 +1,137 @@
+"""Line 18: a real drive whose manifest is wrong about the cameras, with receivers of different quality."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.read_scene import read_calibration
+from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from mrasfm_engine.synthetic.gnss import Origin
+from mrasfm_engine.types import Floats
+from schemas import Pose
+from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.real_drives import imported
+from tests.benchmarks.table import Figure, exactly
+
+TURNED = 1  # of the rig's two cameras
+PITCH_DEG = 1.0
+FOCAL, SIGMA_FOCAL = 1.01, 0.02
+RTK_SIGMA_M = 0.02
+ARM_M = np.array([0.5, 0.1, 1.5])
+
+Edit = Callable[[dict[str, Any]], None]
+
+
+def wrong_manifests(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 18."""
+    drive = imported(data, "kitti06", work)
+    rtk = _rtk(drive)
+    for pitch_deg in (PITCH_DEG, -PITCH_DEG):
+        pitched = _pitched(pitch_deg)
+        title = f"kitti06, a camera pitched by {pitch_deg:+.0f} deg"
+        for receiver, edits, options, most_m in (
+            ("without GNSS", [pitched], ("--no-gnss",), 0.20),
+            ("GNSS", [pitched], (), 0.04),
+            ("RTK of 2 cm", [pitched, rtk], (), 0.04),
+        ):
+            scene = _reconstructed(drive, work / f"{title}, {receiver}", edits, *options)
+            errors = evaluate(scene, drive)
+            yield exactly("18", f"{title}, {receiver}: images registered", errors["registered_images"], 102)
+            yield _rmse(f"{title}, {receiver}", errors, most_m)
+            yield Figure(
+                line="18",
+                what=f"{title}, {receiver}: error of the relative rotation",
+                value=_relative_error_deg(drive, scene),
+                unit="deg",
+                most=0.1,
+            )
+    settings = work / "refine_focal.toml"
+    settings.write_text(f"[bundle_adjustment]\nrefine_focal = true\nsigma_focal = {SIGMA_FOCAL}\n", encoding="utf-8")
+    title = "kitti06, focal lengths 1 % long, GNSS"
+    scene = _reconstructed(drive, work / title, [_long_focal_lengths], "--config", settings)
+    yield _rmse(title, evaluate(scene, drive), 0.03)
+    held = sum(finding["code"] == "focal-not-observed" for finding in read_report(scene)["findings"])
+    yield exactly("18", f"{title}: cameras whose focal length is held, with a finding", held, 2)
+
+
+def _rmse(title: str, errors: dict[str, Any], most_m: float) -> Figure:
+    return Figure(
+        line="18", what=f"{title}: position, metric RMSE", value=errors["metric"]["rmse_m"], unit="m", most=most_m
+    )
+
+
+def _reconstructed(drive: Path, out: Path, edits: list[Edit], *options: object) -> Path:
+    """The scene of a copy of the drive whose manifest is edited."""
+    copy = out.with_name(out.name + ", drive")
+    shutil.copytree(drive, copy)
+    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+    for edit in edits:
+        edit(manifest)
+    (copy / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
+    mrasfm("reconstruct", copy, "--out", out, *options)
+    return out
+
+
+def _pitched(by_deg: float) -> Edit:
+    def edit(manifest: dict[str, Any]) -> None:
+        camera = manifest["rig"]["cameras"][TURNED]
+        pose = matrix_from_pose(Pose(**camera["rig_from_cam"]))
+        pose[:3, :3] = pose[:3, :3] @ se3.exp_so3([np.radians(by_deg), 0.0, 0.0])
+        camera["rig_from_cam"] = pose_from_matrix(pose).model_dump()
+
+    return edit
+
+
+def _long_focal_lengths(manifest: dict[str, Any]) -> None:
+    for camera in manifest["rig"]["cameras"]:
+        camera["params"][:2] = [FOCAL * focal_px for focal_px in camera["params"][:2]]
+
+
+def _rtk(drive: Path) -> Edit:
+    """A receiver of white noise of 2 cm, declared so."""
+    truth = read_tum(drive / "truth.tum").world_from_rig
+    rng = np.random.default_rng(1)
+    # The truth's frame is the first vehicle's: forward is east, left is north.
+    antenna_m = se3.apply(truth, ARM_M[None])[:, 0] + RTK_SIGMA_M * rng.normal(size=(len(truth), 3))
+    places = Origin().geodetic(antenna_m)
+
+    def edit(manifest: dict[str, Any]) -> None:
+        manifest["gnss"] = {
+            "height_datum": "ellipsoidal",
+            "antenna_in_rig_m": ARM_M.tolist(),
+            "samples": [
+                {
+                    "timestamp_us": frame["timestamp_us"],
+                    "latitude_deg": latitude,
+                    "longitude_deg": longitude,
+                    "height_m": height,
+                    "sigma_horizontal_m": RTK_SIGMA_M,
+                    "sigma_vertical_m": RTK_SIGMA_M,
+                }
+                for frame, (latitude, longitude, height) in zip(manifest["frames"], places.tolist(), strict=True)
+            ],
+        }
+
+    return edit
+
+
+def _relative_error_deg(drive: Path, scene: Path) -> float:
+    """Pitch of the turned camera against the other, refined against what the recording says."""
+    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+    given = np.stack([matrix_from_pose(Pose(**camera["rig_from_cam"])) for camera in manifest["rig"]["cameras"]])
+    refined = read_calibration(scene / "calibration.json")
+    found = np.stack([refined[camera["name"]] for camera in manifest["rig"]["cameras"]])
+    return abs(_pitch_deg(found) - _pitch_deg(given))
+
+
+def _pitch_deg(rig_from_cam: Floats) -> float:
+    turn = se3.log_so3(rig_from_cam[0, :3, :3].T @ rig_from_cam[TURNED, :3, :3])
+    return float(np.degrees(turn[0]))
