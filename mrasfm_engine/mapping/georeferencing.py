@@ -26,6 +26,7 @@ MIN_CONSENSUS = 0.3  # of the positions
 BENDS = (0.01, 0.03, 0.1)
 MOST = 0.7
 MIRRORED = (1, 0, 2)  # axes of measured positions whose latitude and longitude are swapped
+MIRRORED_SHARE = 0.5  # of the residuals as measured: a bend by chance agrees with the mirror image less often
 LOSS_SCALE = 2.0
 MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
 
@@ -151,18 +152,26 @@ def _bent(
 ) -> tuple[Floats, Bools] | None:
     """The similarity and its inliers under the least bend with which most positions agree.
 
-    None where there is none, or where the positions' mirror image, of no rigid motion, agrees better.
+    None where there is none, or where the positions' mirror image, of no rigid motion, agrees clearly better. Along a
+    straight line it agrees just as well.
     """
     extent_m = float(np.sqrt(((a[:, :2] - np.median(a[:, :2], axis=0)) ** 2).sum(1).mean()))
     for bend in BENDS:
         wide_m = np.hypot(sigma, bend * extent_m)
         start, inlier = _best_yaw(a, measured, wide_m, outlier_sigmas, rng, scale_range)
-        mirrored = _best_yaw(a, measured[:, MIRRORED], wide_m, outlier_sigmas, rng, scale_range)[1]
-        if mirrored.mean() >= MOST and mirrored.sum() >= inlier.sum():
+        mirrored = measured[:, MIRRORED]
+        image, image_inlier = _best_yaw(a, mirrored, wide_m, outlier_sigmas, rng, scale_range)
+        closer = _median_residual_m(image, a, mirrored) < MIRRORED_SHARE * _median_residual_m(start, a, measured)
+        if image_inlier.mean() >= MOST and closer:
             return None
         if inlier.mean() >= MOST:
             return start, inlier
     return None
+
+
+def _median_residual_m(similarity: Floats, a: Floats, measured: Floats) -> float:
+    """Median horizontal distance after a similarity."""
+    return float(np.median(np.linalg.norm((_apply(similarity, a) - measured)[:, :2], axis=1)))
 
 
 def _scale_is_off(scale: float) -> str:

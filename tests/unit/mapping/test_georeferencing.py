@@ -150,6 +150,15 @@ def test_a_scene_that_bends_is_aligned_however_good_the_receiver_is(sigma_m: flo
     assert found.noise_factor > 5 if sigma_m < 0.1 else found.noise_factor < 5
 
 
+@pytest.mark.parametrize("pitch_deg", [-1.0, -0.5, 0.5, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_straight_street_that_climbs_is_not_taken_for_its_mirror_image(pitch_deg: float, seed: int) -> None:
+    t = track(straight=True, sigma_m=0.02, seed=seed)
+    # The model's cameras look up or down by more than the manifest says, and the vehicle with them.
+    t.model_from_rig[:, :3, :3] = t.model_from_rig[:, :3, :3] @ se3.exp_so3([0.0, np.radians(pitch_deg), 0.0])
+    assert isinstance(t.align(), GnssAlignment)
+
+
 def test_what_a_bend_made_an_outlier_comes_back_and_a_jump_does_not() -> None:
     rng = np.random.default_rng(0)
     sigma_m = np.full((100, 3), 0.05)
