@@ -683,3 +683,77 @@ def substitute(
         out[p, 0] = points[p, 0] - (inv[0] * e[0] + inv[1] * e[1] + inv[2] * e[2])
         out[p, 1] = points[p, 1] - (inv[1] * e[0] + inv[3] * e[1] + inv[4] * e[2])
         out[p, 2] = points[p, 2] - (inv[2] * e[0] + inv[4] * e[1] + inv[5] * e[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def add_scores(
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
+    sigma: float, loss2: float, columns: Any, v_inverse: Any, image: Any, most: int, lo: int, hi: int, out: Any,
+) -> None:  # fmt: skip
+    """Add r' (J_poses x + J_point y) of the observations of points lo..hi, y = -V^-1 W' x, to their images' scores."""
+    d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
+    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
+    dof, count = 6 + len(places_of_intrinsics), columns.shape[1]
+    jx, jc, inv = np.empty((2, 3)), np.empty((2, dof)), np.empty((3, 3))
+    unit_r, unit_t, cam_r, cam_t, kind, params = views
+    along, normal = np.empty((2, count)), np.empty((most, 3))  # of an observation; J_point' r of each
+    e, shift = np.empty((3, count)), np.empty((3, count))
+    for p in range(lo, hi):
+        begin, end = observed.first[p], observed.first[p + 1]
+        e[:] = 0.0
+        for n in range(begin, end):
+            u, c = observed.unit[n], observed.camera[n]
+            band = 0 if bands is None else bands.of_observation[n]
+            follows = False if motion is None else motion.weight[band, 0] != 1.0
+            normal[n - begin] = 0.0
+            if not linearise(
+                unit_r[u], unit_t[u], bands, band, follows, cam_r[c], cam_t[c], kind[c], params[c],
+                points[p], observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
+            ):  # fmt: skip
+                continue
+            # A unit's step moves the residual as moving the point by (X - t_u) x omega - tau does.
+            shift[:] = 0.0
+            for a in range(3):
+                if motion is None:
+                    if a > 0:
+                        break
+                    weight, slot = 1.0, unit_slot[u]
+                else:
+                    weight = motion.weight[band, a]
+                    slot = -1 if weight == 0.0 else unit_slot[motion.support[band, a]]
+                if slot >= 0:
+                    o = 6 * slot
+                    for k in range(count):
+                        w0, w1, w2 = columns[o, k], columns[o + 1, k], columns[o + 2, k]
+                        shift[0, k] += weight * (d[1] * w2 - d[2] * w1 - columns[o + 3, k])
+                        shift[1, k] += weight * (d[2] * w0 - d[0] * w2 - columns[o + 4, k])
+                        shift[2, k] += weight * (d[0] * w1 - d[1] * w0 - columns[o + 5, k])
+            for i in range(2):
+                for k in range(count):
+                    along[i, k] = jx[i, 0] * shift[0, k] + jx[i, 1] * shift[1, k] + jx[i, 2] * shift[2, k]
+            if camera_slot[c] >= 0:
+                o = 6 * num_units + dof * camera_slot[c]
+                for i in range(2):
+                    for j in range(dof):
+                        for k in range(count):
+                            along[i, k] += jc[i, j] * columns[o + j, k]
+            for k in range(count):
+                out[image[n], k] += res[0] * along[0, k] + res[1] * along[1, k]
+            for j in range(3):
+                normal[n - begin, j] = jx[0, j] * res[0] + jx[1, j] * res[1]
+                for k in range(count):
+                    e[j, k] += jx[0, j] * along[0, k] + jx[1, j] * along[1, k]
+        if observed.fixed[p]:
+            continue
+        v = v_inverse[p]
+        inv[0, 0], inv[1, 1], inv[2, 2] = v[0], v[3], v[5]
+        inv[0, 1] = inv[1, 0] = v[1]
+        inv[0, 2] = inv[2, 0] = v[2]
+        inv[1, 2] = inv[2, 1] = v[4]
+        for i in range(3):
+            for k in range(count):
+                shift[i, k] = inv[i, 0] * e[0, k] + inv[i, 1] * e[1, k] + inv[i, 2] * e[2, k]
+        for n in range(begin, end):
+            q = normal[n - begin]
+            for k in range(count):
+                out[image[n], k] -= q[0] * shift[0, k] + q[1] * shift[1, k] + q[2] * shift[2, k]

@@ -8,7 +8,8 @@ import numpy as np
 import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, UNIT_DOF
-from mrasfm_engine.bundle_adjustment.reduced_camera_system import ReducedCameraSystem
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Eliminated, ReducedCameraSystem
+from mrasfm_engine.bundle_adjustment.shared_errors import shared_error_covariance
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats
@@ -31,16 +32,18 @@ class Covariances:
 def covariances(problem: Problem, state: State) -> Covariances:
     """Marginals at a solution, from the inverse of the reduced normal equations (Gauss-Newton, robust weights).
 
+    Those of the cameras and of the scale have what errors add that the observations of an image share, see
+    `shared_errors`.
+
     Scale is the functional sum (p_i - mean)' dp_i / sum |p_i - mean|^2 of the free units' positions: it does not change
     when the scene is moved or turned. What nothing determines has an infinite sigma; which unknowns share in that is
     told up to `LARGEST_DENSE` unknowns, beyond that all have one.
     """
     layout = problem.layout
     system = problem.normal_equations(state, 0.0)
-    position = state.unit_position_m[layout.unit_slot >= 0]
-    found = _regular_marginals(system, position)
+    found = _regular_marginals(problem, state, system)
     if found is None:
-        found = _dense_marginals(system, position)
+        found = _dense_marginals(system, state.unit_position_m[layout.unit_slot >= 0])
     per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
     per_unit[layout.unit_slot >= 0] = np.sqrt(found.units)
     dof = layout.camera_dof
@@ -63,9 +66,9 @@ class _Marginals:
     sigma_scale: float
 
 
-def _regular_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals | None:
+def _regular_marginals(problem: Problem, state: State, system: ReducedCameraSystem) -> _Marginals | None:
     """Marginals by eliminating units and cameras; None where something besides single unknowns is not determined."""
-    layout = system.layout
+    layout = problem.layout
     split = UNIT_DOF * layout.num_units
     unseen = ~(system.matrix_diagonal() > 0.0)
     solved = system.eliminate(unseen.astype(np.float64))
@@ -74,17 +77,31 @@ def _regular_marginals(system: ReducedCameraSystem, position: Floats) -> _Margin
     units, cameras = solved.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
+    joint = _with_scale(problem, state, system, solved, cameras)
     covariance = np.zeros((layout.camera_dof * layout.num_cameras,) * 2)
-    covariance[np.ix_(solved.free, solved.free)] = cameras
+    covariance[np.ix_(solved.free, solved.free)] = joint[:-1, :-1]
     loose = solved.free[unseen[split:][solved.free]]
     covariance[loose, loose] = np.inf
     scale = float("nan")
     if np.isinf(variance[:, 3:]).any():
         scale = np.inf
-    elif len(position) >= 2:
-        functional = _scale_functional(position)
-        scale = float(np.sqrt(max(solved.inverse_form(functional), 0.0)))
+    elif layout.num_units >= 2:
+        scale = float(np.sqrt(max(joint[-1, -1], 0.0)))
     return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
+
+
+def _with_scale(
+    problem: Problem, state: State, system: ReducedCameraSystem, solved: Eliminated, cameras: Floats
+) -> Floats:
+    """Joint covariance (f + 1, f + 1) of the cameras' unknowns that vary and the scale, shared errors included."""
+    split, free = UNIT_DOF * problem.layout.num_units, UNIT_DOF * problem.layout.num_units + solved.free
+    functional = _scale_functional(state.unit_position_m[problem.layout.unit_slot >= 0])
+    along = cameras @ (solved.coupled.T @ functional)
+    columns = np.zeros((problem.layout.size, len(free) + 1))  # of the inverse
+    columns[:split, :-1], columns[free, :-1] = -solved.coupled @ cameras, cameras
+    columns[:split, -1], columns[free, -1] = solved.units_of(functional) + solved.coupled @ along, -along
+    joint = np.block([[cameras, -along[:, None]], [-along, functional @ columns[:split, -1]]])
+    return joint + shared_error_covariance(problem, state, system, columns, joint)
 
 
 def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:

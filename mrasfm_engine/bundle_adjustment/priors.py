@@ -73,6 +73,16 @@ class CalibrationPrior:
         w = np.ones(len(self.rotation)) if self.gauge_weights is None else self.gauge_weights
         return np.repeat((w / w.sum() * np.sqrt(len(w)))[:, None], 6, axis=1)
 
+    def without_gauge(self, covariance: Floats) -> Floats:
+        """A covariance of all cameras' poses (6 c, 6 c) without what the gauge leaves of a common motion."""
+        cameras = len(self.rotation)
+        weights = np.full(cameras, 1.0 / cameras) if self.gauge_weights is None else self.gauge_weights
+        sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1).ravel()
+        mean = np.kron(np.tile(weights / weights.sum(), (cameras, 1)), np.eye(6))
+        own = np.eye(6 * cameras) - mean * sigma[:, None] / sigma
+        result: Floats = own @ covariance @ own.T
+        return result
+
     def cost(self, state: State) -> float:
         """See `Term`."""
         return _cost_of_rig(self._whitened(state)[0], self._held(), self._gauge(), self.loss_scale)

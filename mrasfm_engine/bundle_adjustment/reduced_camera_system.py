@@ -206,11 +206,3 @@ class Eliminated:
         cameras = scipy.linalg.cho_solve(self.cameras, np.eye(len(self.free)))
         coupled = self.coupled.reshape(-1, UNIT_DOF, len(self.free))
         return units + coupled @ cameras @ np.swapaxes(coupled, 1, 2), cameras
-
-    def inverse_form(self, functional: Floats) -> float:
-        """f' M^-1 f for a functional f (6 units,) of the units, M the whole matrix."""
-        value = float(functional @ self.units_of(functional))
-        if self.cameras is not None:
-            along = self.coupled.T @ functional
-            value += float(along @ scipy.linalg.cho_solve(self.cameras, along))
-        return value

@@ -19,6 +19,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     Views,
     accumulate,
     add_images,
+    add_scores,
     image_sums,
     squared_errors,
     substitute,
@@ -255,6 +256,31 @@ class Problem:
             ),
         )  # fmt: skip
         return out
+
+    def scores(self, state: State, system: ReducedCameraSystem, columns: Floats, group: Ints) -> Floats:
+        """Sums (groups, k) of J' w r over the observations of each group, along k steps of everything but points.
+
+        Parameters
+        ----------
+        columns
+            (n, k) steps of the reduced vector; the points follow them.
+        group
+            Of each observation.
+        """
+        o = self.observations
+        parts = np.zeros((self.options.threads, int(group.max(initial=-1)) + 1, columns.shape[1]))
+        views, motion, observed, free_slots = self._views(state), self._motion, self._observed, self._slots
+        most, along = int(np.diff(o.first_of_point).max(initial=0)), np.ascontiguousarray(columns)
+        in_ranges(
+            self.options.threads,
+            o.num_points,
+            lambda lo, hi, part: add_scores(
+                *views, motion, state.points_m, observed, free_slots, self.options.sigma_px,
+                self.options.loss_scale**2, along, system.v_inverse, group, most, lo, hi, parts[part],
+            ),
+        )  # fmt: skip
+        result: Floats = parts.sum(0)
+        return result
 
 
 _THREADS = ThreadpoolController()

@@ -52,7 +52,7 @@ TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 3e-2  # of the last step of the last round: a quarter of a standard deviation
 ROUGH_DECREMENT_TOLERANCE = 0.5  # in those before, after which observations change anyway
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
-SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show: no drive is better than half a pixel
+SIGMA_PX_RANGE = (0.1, 2.0)  # below, keypoints are hardly localised; above, most are wrong
 
 
 @dataclass(kw_only=True)
@@ -401,4 +401,15 @@ def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refineme
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return None
-    return covariances(problem, problem.state)
+    return _of_cameras_alone(mapper, covariances(problem, problem.state))
+
+
+def _of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
+    """The certainty of the cameras' poses among one another; the gauge is as soft as it has to be to be solved."""
+    cameras = len(mapper.camera_kind)
+    if certainty.calibration.shape != (6 * cameras, 6 * cameras) or not np.isfinite(certainty.calibration).all():
+        return certainty
+    calibration = calibration_prior(mapper).without_gauge(certainty.calibration)
+    sigma_camera = certainty.sigma_camera.copy()
+    sigma_camera[:, :6] = np.sqrt(np.maximum(np.diagonal(calibration), 0.0)).reshape(cameras, 6)
+    return replace(certainty, calibration=calibration, sigma_camera=sigma_camera)

@@ -94,7 +94,8 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
     focal = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
-        sigma = refinement.certainty.sigma_camera[:, :6]
+        # A camera that is held is as good as what was given, whatever the drive would know of it.
+        sigma = np.where(refinement.recalibrated[:, None], refinement.certainty.sigma_camera[:, :6], sigma)
         if refinement.intrinsics is not None and refinement.intrinsics.asked:
             focal = refinement.certainty.sigma_camera[:, 6] * mapper.state.camera_params[:, 0]
     if refinement.directions is not None:

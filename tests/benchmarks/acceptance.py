@@ -20,6 +20,7 @@
 | 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
 | 17 | the service while its processes are killed: nothing lost, twice, stuck, wrong or left |
 | 18 | a real drive whose manifest is wrong: a camera pitched by 1 deg, focal lengths 1 % long |
+| 19 | sigmas: halves of real drives against one another, simulated drives against the truth |
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
@@ -59,6 +60,7 @@ from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
+from tests.benchmarks.sigmas import halves, simulated
 from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.table import Figure, failed, save, show
 from tests.benchmarks.wrong_manifests import wrong_manifests
@@ -96,6 +98,7 @@ LINES = {
     "16": Line(repeated=(correspondence,)),
     "17": Line(timed=(kills,)),
     "18": Line(untimed=(wrong_manifests,)),
+    "19": Line(untimed=(halves, simulated)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
 }
 

@@ -371,3 +371,19 @@ def test_a_very_bad_camera_does_not_keep_the_solver_from_converging() -> None:
     case, _, solution, report = solve_with_bad_camera(2, 10.0)
     assert report.termination is Termination.CONVERGED
     assert rotation_errors_deg(solution.camera_rotation, case.truth.camera_rotation)[3] < 1.0
+
+
+def test_a_covariance_without_the_gauge_has_no_common_motion() -> None:
+    truth = free_case()[0].truth
+    weights = np.array([1.0, 2.0, 1.0, 0.5, 0.0])
+    sigma_m = np.linspace(0.01, 0.05, CAMERAS)
+    prior = replace(calibration_prior(truth), gauge_weights=weights, sigma_translation_m=sigma_m)
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1).ravel()
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6 * CAMERAS, 6 * CAMERAS))
+    common = np.tile(np.eye(6), (CAMERAS, 1)) * sigma[:, None]
+    left = prior.without_gauge(root @ root.T)
+    np.testing.assert_allclose(prior.without_gauge(root @ root.T + 100.0 * common @ common.T), left)
+    mean = np.kron(weights / weights.sum(), np.eye(6)) / sigma
+    np.testing.assert_allclose(mean @ left @ mean.T, 0.0, atol=1e-9)
+    assert (np.diagonal(left) > 0).all()

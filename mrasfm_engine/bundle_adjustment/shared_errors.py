@@ -1,0 +1,64 @@
+"""Covariance that errors add which the observations of an image share.
+
+The inverse of the normal equations H is the covariance of an adjustment whose observations err independently. Those of
+an image do not where its pose is not what the model makes of it: the vehicle does not move between units as
+interpolated, the shutter rolls, a lorry fills the view. It shows in the images' scores s = sum J' w r. Of independent
+errors their squares M = sum s s' have the expectation F, the observations' part of H, so that
+
+    H^-1 (M - F) H^-1
+
+is what shared errors add [the sandwich of Huber and White, by clusters: Liang and Zeger, Longitudinal Data Analysis
+Using Generalized Linear Models, Biometrika 1986], in those directions in which they add something. The scores are of
+whole units: a unit's pose has absorbed what its images share.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
+from mrasfm_engine.bundle_adjustment.solver import Problem
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Floats
+
+MIN_UNITS = 10  # beyond those that units and cameras absorb: fewer tell no covariance
+
+
+def shared_error_covariance(
+    problem: Problem, state: State, system: ReducedCameraSystem, columns: Floats, covariance: Floats
+) -> Floats:
+    """What shared errors add to the covariance (k, k) of k functionals f of the reduced vector; not negative.
+
+    Parameters
+    ----------
+    state, system
+        A solution and its normal equations, without damping.
+    columns
+        (n, k) H^-1 f of every functional.
+    covariance
+        (k, k) f' H^-1 f of all pairs of functionals.
+    """
+    _, unit = np.unique(problem.observations.unit, return_inverse=True)
+    units = int(unit.max(initial=-1)) + 1
+    if units < MIN_UNITS or not covariance.any():
+        return np.zeros_like(covariance)
+    scores = problem.scores(state, system, columns, unit)
+    added = units / (units - 1) * scores.T @ scores - (covariance - _of_terms(problem, state, columns))
+    sigma = np.sqrt(np.diagonal(covariance))
+    by_sigma = np.where(sigma > 0.0, 1.0 / np.where(sigma > 0.0, sigma, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(added * by_sigma * by_sigma[:, None])
+    spread = vectors * np.sqrt(np.maximum(values, 0.0)) * sigma[:, None]
+    result: Floats = spread @ spread.T
+    return result
+
+
+def _of_terms(problem: Problem, state: State, columns: Floats) -> Floats:
+    """X' E X (k, k) of the columns X and the information E of all terms that are not image observations."""
+    extra = Extra.none(problem.layout)
+    for term in problem.terms:
+        term.add_to(state, problem.layout, extra)
+    units = columns[: UNIT_DOF * problem.layout.num_units].reshape(-1, UNIT_DOF, columns.shape[1])
+    cameras = columns[UNIT_DOF * problem.layout.num_units :]
+    result: Floats = np.einsum("uik,uij,ujl->kl", units, extra.units, units, optimize=True)
+    return result + cameras.T @ extra.cameras @ cameras

@@ -1,0 +1,218 @@
+"""Line 19: stated sigmas, of halves of real drives against one another and of simulated drives against the truth."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.incremental_mapping import map_units
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.scene.drive import matrix_from_pose
+from mrasfm_engine.scene.row_bands import RowBands
+from mrasfm_engine.triangulation.tracks import Keypoints
+from schemas import Pose
+from tests.benchmarks.commands import mrasfm
+from tests.benchmarks.real_drives import DRIVES, imported
+from tests.benchmarks.table import Figure
+from tests.benchmarks.true_information import SIGMA_PX, ExactScene, camera_information
+from tests.helpers.simulated_drive import SimulatedDrive, make_simulated_drive, true_matches
+
+LEAST_RMS, MOST_RMS = 0.5, 1.5  # of halves
+MANY_CAMERAS, LEAST_DIRECTIONS = 6, 6
+
+SIMULATED, UNITS, POINTS, NOISE_PX = 50, 24, 2500, 0.7
+CAMERAS = (6, 2)  # in turn
+OFF_DEG, OFF_M = 0.3, 0.02  # what the calibration is off by and declared to be, for each axis
+GNSS_M = np.array([0.3, 0.3, 0.45])
+ANTENNA_M = np.array([-0.5, 0.2, 1.5])
+LEAST_SIMULATED, MOST_SIMULATED = 0.7, 1.4
+MOST_OF_EXACT = 1.5
+GAUGE_INFORMATION = 1e9
+
+
+def halves(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 19a: the calibrations that odd and even units of a drive find agree within their sigmas."""
+    for real in DRIVES:
+        drive = imported(data, real.name, work, *real.options)
+        found = [
+            _calibration(_half(drive, which, work), work / f"{real.name}, half {which}, scene") for which in (0, 1)
+        ]
+        settings, manifest = BundleAdjustmentConfig(), json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+        in_sigmas = []
+        for camera in manifest["rig"]["cameras"]:
+            (pose_a, sigma_a), (pose_b, sigma_b) = (of[camera["name"]] for of in found)
+            turn = se3.log_so3(pose_a[:3, :3] @ pose_b[:3, :3].T)
+            off = np.concatenate([np.degrees(turn), pose_a[:3, 3] - pose_b[:3, 3]])
+            prior = np.repeat(
+                [
+                    camera.get("sigma_rotation_deg") or settings.sigma_rotation_deg,
+                    camera.get("sigma_translation_m") or settings.sigma_translation_m,
+                ],
+                3,
+            )
+            known = np.maximum(sigma_a, sigma_b) < 0.5 * prior
+            in_sigmas += (off / np.hypot(sigma_a, sigma_b))[known].tolist()
+        many = len(manifest["rig"]["cameras"]) >= MANY_CAMERAS
+        yield Figure(
+            line="19a",
+            what=f"{real.name}: directions known to half of their prior",
+            value=len(in_sigmas),
+            above=LEAST_DIRECTIONS - 1 if many else 0,
+            most=6 * len(manifest["rig"]["cameras"]),
+        )
+        yield Figure(
+            line="19a",
+            what=f"{real.name}: differences of the halves over their sigmas, RMS",
+            value=float(np.sqrt(np.mean(np.square(in_sigmas)))),
+            above=LEAST_RMS,
+            most=MOST_RMS,
+        )
+
+
+def _half(drive: Path, which: int, work: Path) -> Path:
+    """The drive with every other unit."""
+    half = work / f"{drive.name}, half {which}"
+    shutil.copytree(drive, half, copy_function=os.link)
+    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+    manifest["frames"] = manifest["frames"][which::2]
+    (half / "drive.json").unlink()  # a link to the whole drive's
+    (half / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return half
+
+
+def _calibration(drive: Path, scene: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Refined `rig_from_cam` (4, 4) of each camera with its sigmas (6,) in degrees and metres."""
+    mrasfm("reconstruct", drive, "--out", scene)
+    cameras: dict[str, Any] = json.loads((scene / "calibration.json").read_text(encoding="utf-8"))["cameras"]
+    return {
+        name: (
+            matrix_from_pose(Pose(**camera["refined"]["rig_from_cam"])),
+            np.concatenate([camera["sigma"]["rotation_deg"], camera["sigma"]["translation_m"]]),
+        )
+        for name, camera in cameras.items()
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class InSigmas:
+    """Errors of one simulated drive over their stated sigmas, and these sigmas over the exact ones."""
+
+    scale: float
+    positions: np.ndarray
+    rotations: np.ndarray
+    translations: np.ndarray
+    of_exact: float
+
+
+def simulated(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 19b: errors over sigmas on simulated drives with GNSS, whose calibration is off as it is declared."""
+    del data, work  # there are no files
+    found = [_in_sigmas(seed, CAMERAS[seed % len(CAMERAS)]) for seed in range(SIMULATED)]
+    for what in ("scale", "positions", "rotations", "translations"):
+        values = np.concatenate([np.ravel(getattr(one, what)) for one in found])
+        yield Figure(
+            line="19b",
+            what=f"{SIMULATED} simulated drives: {what}, errors over their sigmas, RMS",
+            value=float(np.sqrt(np.mean(np.square(values)))),
+            above=LEAST_SIMULATED,
+            most=MOST_SIMULATED,
+        )
+    yield Figure(
+        line="19b",
+        what=f"{SIMULATED} simulated drives: sigmas of cameras over those of the exact geometry, worst drive",
+        value=max(one.of_exact for one in found),
+        most=MOST_OF_EXACT,
+    )
+
+
+def _in_sigmas(seed: int, cameras: int) -> InSigmas:
+    rng = np.random.default_rng(seed)
+    given = lambda rig: _moved(rig, rng)  # noqa: E731
+    drive = make_simulated_drive(
+        units=UNITS, cameras=cameras, points=POINTS, noise_px=NOISE_PX, given=given, seed=seed
+    )  # fmt: skip
+    mapper, refinement = _adjusted(drive, rng)
+    certainty, state = refinement.certainty, mapper.state
+    assert certainty is not None
+    truth_m = drive.world_from_rig[:, :3, 3]
+    scale = align_similarity(state.unit_position_m, truth_m).scale
+    off = _camera_errors(mapper, drive) / certainty.sigma_camera[:, :6]
+    return InSigmas(
+        scale=float(np.log(scale)) / certainty.sigma_scale,
+        positions=(state.unit_position_m - truth_m) / certainty.sigma_unit_position_m,
+        rotations=off[:, :3],
+        translations=off[:, 3:],
+        of_exact=float(np.sqrt(np.mean((certainty.sigma_camera[:, :6] / _exact_sigmas(mapper, drive)) ** 2))),
+    )
+
+
+def _moved(rig_from_cam: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    turn = se3.exp_so3(rng.normal(0, np.radians(OFF_DEG), (len(rig_from_cam), 3)))
+    place = rig_from_cam[:, :3, 3] + rng.normal(0, OFF_M, (len(rig_from_cam), 3))
+    return np.asarray(se3.transform(turn @ rig_from_cam[:, :3, :3], place))
+
+
+def _adjusted(drive: SimulatedDrive, rng: np.random.Generator) -> tuple[Mapper, Refinement]:
+    settings = BundleAdjustmentConfig(sigma_rotation_deg=OFF_DEG, sigma_translation_m=OFF_M)
+    bands = RowBands.from_drive(drive.drive, compensate=True)
+    keypoints = Keypoints.from_features(drive.drive, drive.features, bands)
+    mapper, _ = map_units(
+        drive.drive, keypoints, true_matches(drive), None, EngineConfig(bundle_adjustment=settings)
+    )  # fmt: skip
+    antenna_m = se3.apply(drive.world_from_rig, ANTENNA_M[None])[:, 0]
+    track = GnssTrack(
+        timestamps_us=drive.drive.timestamps_us,
+        position_m=antenna_m + rng.normal(size=antenna_m.shape) * GNSS_M,
+        sigma_m=np.tile(GNSS_M, (len(antenna_m), 1)),
+        good=np.ones(len(antenna_m), dtype=np.bool_),
+    )
+    return mapper, refine(mapper, gnss=track, antenna_in_rig_m=ANTENNA_M, rough_world_from_rig=None)
+
+
+def _camera_errors(mapper: Mapper, drive: SimulatedDrive) -> np.ndarray:
+    """Errors (c, 6) of the cameras' rotations (rad) and positions, without a motion that all have in common."""
+    prior, true = calibration_prior(mapper), drive.truth.rig_from_cam
+    assert prior.gauge_weights is not None
+    weights = prior.gauge_weights / prior.gauge_weights.sum()
+    common = se3.exp_so3(-weights @ se3.log_so3(true[:, :3, :3] @ np.swapaxes(prior.rotation, 1, 2)))
+    as_held = replace(
+        mapper.state, camera_rotation=common @ true[:, :3, :3], camera_position_m=true[:, :3, 3] @ common.T
+    )
+    off = prior.corrections(mapper.state) - prior.corrections(as_held)
+    result: np.ndarray = off - weights @ off
+    return result
+
+
+def _exact_sigmas(mapper: Mapper, drive: SimulatedDrive) -> np.ndarray:
+    """Sigmas (c, 6) of the cameras' poses by the exact geometry of all observations, and the priors."""
+    truth = drive.truth
+    scene = ExactScene(
+        world_from_rig=truth.world_from_rig,
+        rig_from_cam=truth.rig_from_cam,
+        focal_px=truth.camera_params[:, :2],
+        centre_px=truth.camera_params[:, 2:],
+        unit=truth.unit,
+        camera=truth.camera,
+        point=truth.point,
+        xy_px=truth.xy_px,
+    )
+    worse = NOISE_PX / SIGMA_PX
+    information = camera_information(scene, ANTENNA_M, GNSS_M / worse) / worse**2
+    sigma = np.tile(np.repeat([np.radians(OFF_DEG), OFF_M], 3), len(truth.rig_from_cam))
+    mean = np.tile(np.eye(6), (1, len(truth.rig_from_cam))) / sigma
+    posterior = np.linalg.inv(information + np.diag(sigma**-2) + GAUGE_INFORMATION * mean.T @ mean)
+    result: np.ndarray = np.sqrt(np.diagonal(calibration_prior(mapper).without_gauge(posterior))).reshape(-1, 6)
+    return result

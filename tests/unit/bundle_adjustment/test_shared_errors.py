@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.bundle_adjustment import shared_errors
+from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
+from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
+from mrasfm_engine.scene.state import State
+from tests.helpers.small_problems import make_case
+
+UNITS, CAMERAS, NOISE_PX, SHARED_PX = 24, 3, 0.5, 1.5
+
+
+def adjusted(seed: int, *, shared_px: float, units: int = UNITS) -> tuple[State, Problem, State]:
+    """Truth, problem and solution of a drive whose images are shifted, each by an error of its own."""
+    case = make_case(
+        units=units,
+        cameras=CAMERAS,
+        points=1500,
+        noise_px=NOISE_PX,
+        free_units=[False] + [True] * (units - 1),
+        free_cameras=[True] * CAMERAS,
+        seed=seed,
+        # Residuals this large are no outliers here.
+        options=SolverOptions(sigma_px=NOISE_PX, loss_scale=1e3),
+    )
+    truth, o = case.truth, case.problem.observations
+    shift_px = np.random.default_rng(seed).normal(scale=shared_px, size=(units, CAMERAS, 2))
+    prior = CalibrationPrior(
+        rotation=truth.camera_rotation,
+        position_m=truth.camera_position_m,
+        sigma_rotation_rad=np.full(CAMERAS, np.radians(2.0)),
+        sigma_translation_m=np.full(CAMERAS, 0.05),
+    )
+    shifted = replace(o, xy_px=o.xy_px + shift_px[o.unit, o.camera])
+    problem = replace(case.problem, observations=shifted, terms=[prior])
+    return truth, problem, solve(problem)[0]
+
+
+def rotation_in_sigmas(truth: State, problem: Problem, solution: State, found: Covariances) -> np.ndarray:
+    prior = problem.terms[0]
+    assert isinstance(prior, CalibrationPrior)
+    sigma = np.sqrt(np.diagonal(prior.without_gauge(found.calibration))).reshape(CAMERAS, 6)
+    error = replace(prior, rotation=truth.camera_rotation, position_m=truth.camera_position_m).corrections(solution)
+    result: np.ndarray = ((error - error.mean(0)) / sigma)[:, :3]
+    return result
+
+
+def test_errors_that_images_share_are_covered(monkeypatch: pytest.MonkeyPatch) -> None:
+    covered, without = [], []
+    for seed in range(8):
+        case = adjusted(seed, shared_px=SHARED_PX)
+        covered.append(rotation_in_sigmas(*case, covariances(*case[1:])))
+        with monkeypatch.context() as patch:
+            patch.setattr(shared_errors, "MIN_UNITS", 1_000)
+            without.append(rotation_in_sigmas(*case, covariances(*case[1:])))
+    assert 0.5 < np.sqrt(np.mean(np.square(covered))) < 1.5
+    assert np.sqrt(np.mean(np.square(without))) > 3.0
+
+
+def test_independent_errors_add_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, problem, solution = adjusted(0, shared_px=0.0)
+    found = covariances(problem, solution)
+    monkeypatch.setattr(shared_errors, "MIN_UNITS", 1_000)
+    independent = covariances(problem, solution)
+    ratio = found.sigma_camera[:, :6] / independent.sigma_camera[:, :6]
+    assert (ratio >= 1.0 - 1e-9).all()
+    assert ratio.max() < 1.5
+    assert 1.0 <= found.sigma_scale / independent.sigma_scale < 1.2
+
+
+def test_few_units_tell_no_covariance_of_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, problem, solution = adjusted(0, shared_px=SHARED_PX, units=5)
+    found = covariances(problem, solution)
+    monkeypatch.setattr(shared_errors, "MIN_UNITS", 1_000)
+    np.testing.assert_array_equal(found.calibration, covariances(problem, solution).calibration)
+
+
+def test_scores_of_all_images_cancel_with_those_of_the_priors() -> None:
+    """At a solution the gradient is zero along every step, also with the points following."""
+    _, problem, solution = adjusted(1, shared_px=SHARED_PX)
+    system = problem.normal_equations(solution, 0.0)
+    rng = np.random.default_rng(0)
+    steps = rng.normal(size=(problem.layout.size, 3))
+    scores = problem.scores(solution, system, steps, problem.observations.unit)
+    assert scores.shape == (UNITS, 3)
+    # The system's gradient has that of the terms, and of points that could still move: they have moved.
+    from_terms = system.gradient - replace(problem, terms=[]).normal_equations(solution, 0.0).gradient
+    np.testing.assert_allclose(scores.sum(0), (system.gradient - from_terms) @ steps, atol=1e-6 * np.abs(scores).max())
