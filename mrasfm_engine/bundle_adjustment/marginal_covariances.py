@@ -29,11 +29,11 @@ class Covariances:
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
 
 
-def covariances(problem: Problem, state: State) -> Covariances:
+def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -> Covariances:
     """Marginals at a solution, from the inverse of the reduced normal equations (Gauss-Newton, robust weights).
 
-    Those of the cameras and of the scale have what errors add that the observations of an image share, see
-    `shared_errors`.
+    With `shared_errors` those of the cameras and of the scale have what errors add that the observations of a unit
+    share, see the module of that name.
 
     Scale is the functional sum (p_i - mean)' dp_i / sum |p_i - mean|^2 of the free units' positions: it does not change
     when the scene is moved or turned. What nothing determines has an infinite sigma; which unknowns share in that is
@@ -41,7 +41,7 @@ def covariances(problem: Problem, state: State) -> Covariances:
     """
     layout = problem.layout
     system = problem.normal_equations(state, 0.0)
-    found = _regular_marginals(problem, state, system)
+    found = _regular_marginals(problem, state, system, shared_errors)
     if found is None:
         found = _dense_marginals(system, state.unit_position_m[layout.unit_slot >= 0])
     per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
@@ -66,7 +66,9 @@ class _Marginals:
     sigma_scale: float
 
 
-def _regular_marginals(problem: Problem, state: State, system: ReducedCameraSystem) -> _Marginals | None:
+def _regular_marginals(
+    problem: Problem, state: State, system: ReducedCameraSystem, shared_errors: bool
+) -> _Marginals | None:
     """Marginals by eliminating units and cameras; None where something besides single unknowns is not determined."""
     layout = problem.layout
     split = UNIT_DOF * layout.num_units
@@ -77,7 +79,9 @@ def _regular_marginals(problem: Problem, state: State, system: ReducedCameraSyst
     units, cameras = solved.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    joint = _with_scale(problem, state, system, solved, cameras)
+    columns, joint = _with_scale(problem, state, solved, cameras)
+    if shared_errors:
+        joint = joint + shared_error_covariance(problem, state, system, columns, joint)
     covariance = np.zeros((layout.camera_dof * layout.num_cameras,) * 2)
     covariance[np.ix_(solved.free, solved.free)] = joint[:-1, :-1]
     loose = solved.free[unseen[split:][solved.free]]
@@ -90,10 +94,8 @@ def _regular_marginals(problem: Problem, state: State, system: ReducedCameraSyst
     return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
 
 
-def _with_scale(
-    problem: Problem, state: State, system: ReducedCameraSystem, solved: Eliminated, cameras: Floats
-) -> Floats:
-    """Joint covariance (f + 1, f + 1) of the cameras' unknowns that vary and the scale, shared errors included."""
+def _with_scale(problem: Problem, state: State, solved: Eliminated, cameras: Floats) -> tuple[Floats, Floats]:
+    """Columns (n, f + 1) of the inverse for the cameras' unknowns that vary and the scale, and their covariance."""
     split, free = UNIT_DOF * problem.layout.num_units, UNIT_DOF * problem.layout.num_units + solved.free
     functional = _scale_functional(state.unit_position_m[problem.layout.unit_slot >= 0])
     along = cameras @ (solved.coupled.T @ functional)
@@ -101,7 +103,7 @@ def _with_scale(
     columns[:split, :-1], columns[free, :-1] = -solved.coupled @ cameras, cameras
     columns[:split, -1], columns[free, -1] = solved.units_of(functional) + solved.coupled @ along, -along
     joint = np.block([[cameras, -along[:, None]], [-along, functional @ columns[:split, -1]]])
-    return joint + shared_error_covariance(problem, state, system, columns, joint)
+    return columns, joint
 
 
 def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:

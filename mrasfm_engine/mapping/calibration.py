@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.simultaneous import calibration_sigmas
 from mrasfm_engine.types import Bools, Floats
 
+STRAIGHT = "held as given: without GNSS a drive this straight does not observe it"
 MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
+LENS_SIGMA_PX = 0.5  # that lens models err by: what calibrations leave at their targets is of this size
+CONTRADICTED_SIGMAS = 3.0
 MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 
 
@@ -56,9 +60,7 @@ class CalibrationDecision:
 def assess_calibration(
     mapper: Mapper, *, free_units: Bools, terms: Sequence[Term], georeferenced: bool, options: SolverOptions
 ) -> CalibrationDecision:
-    """Decide whether the drive observes the calibration: freeing an unobserved one makes everything worse.
-
-    A straight trajectory without GNSS never does. How long the baselines are, images never tell: their prior does, and
+    """Decide whether the calibration may vary. How long the baselines are, images never tell: their prior does, and
     positions.
 
     Parameters
@@ -75,8 +77,8 @@ def assess_calibration(
         )
     if mapper.drive.has_single_camera:
         return CalibrationDecision(False, "a single camera has no calibration to others")
-    if not georeferenced and heading_change_deg(mapper) < settings.min_heading_change_deg:
-        return CalibrationDecision(False, "held as given: without GNSS a drive this straight does not observe it")
+    if not settings.priors and not georeferenced and is_straight(mapper):
+        return CalibrationDecision(False, STRAIGHT)  # nothing would bound what it does not observe
     problem, _ = mapper.problem(
         free_units,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
@@ -84,12 +86,47 @@ def assess_calibration(
         options=options,
     )
     if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
-        sigma = covariances(problem, problem.state).sigma_scale
+        sigma = covariances(problem, problem.state, shared_errors=False).sigma_scale
         if not np.isfinite(sigma):
             return CalibrationDecision(False, "held as given: too few units to tell what freeing it would do")
     return CalibrationDecision(
         True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"
     )
+
+
+def is_straight(mapper: Mapper) -> bool:
+    """True where the drive turns too little to correct a calibration that is nearly right: it leaves the scale open."""
+    return heading_change_deg(mapper) < mapper.config.bundle_adjustment.min_heading_change_deg
+
+
+def contradicted_cameras(mapper: Mapper, directions: Callable[[], Observability | None]) -> Bools:
+    """Cameras (c,) that the images have moved from where they began by more than lens models err.
+
+    Lens models are off by the same in all images, which no residual shows: along a straight street they turn cameras
+    against each other by some hundredths of a degree, and change the scale by per cents. What the drive observes is
+    asked only where a camera has moved by more.
+    """
+    prior, begun = calibration_prior(mapper), mapper.rig_as_begun
+    corrections = replace(prior, rotation=begun[:, :3, :3], position_m=begun[:, :3, 3]).corrections(mapper.state)
+    corrections -= np.median(corrections, axis=0) if len(corrections) > 2 else corrections.mean(0)
+    lens_rad = LENS_SIGMA_PX / mapper.state.camera_params[:, :2].mean(1) * np.sqrt(1.0 - 1.0 / len(corrections))
+    lens = np.repeat(np.stack([lens_rad, lens_rad * _median_depth_m(mapper)], 1), 3, axis=1)
+    beyond = np.asarray(np.abs(corrections) > CONTRADICTED_SIGMAS * lens)
+    found = directions() if beyond.any() else None
+    if found is None:
+        return np.zeros(len(corrections), dtype=np.bool_)
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    posterior = np.nan_to_num(found.ratio, nan=1.0) * sigma
+    beyond = beyond & found.observed & (np.abs(corrections) > CONTRADICTED_SIGMAS * np.hypot(posterior, lens))
+    result: Bools = beyond.any(axis=1)
+    return result
+
+
+def _median_depth_m(mapper: Mapper) -> float:
+    rows = np.flatnonzero(mapper.is_inlier)
+    off_m = mapper.state.points_m[mapper.tracks.of_keypoint[rows]]
+    off_m = off_m - mapper.state.unit_position_m[mapper.keypoints.unit[rows]]
+    return float(np.median(np.linalg.norm(off_m, axis=1))) if len(rows) else 0.0
 
 
 def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:

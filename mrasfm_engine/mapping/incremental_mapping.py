@@ -95,13 +95,13 @@ def register_remaining(
         log.registrations.append(registration)
         mapper.extend(registration.unit)
         since_local += 1
-        if since_local >= config.mapping.local_every:
+        if mapper.registered.sum() >= at_global * (1 + config.mapping.global_growth):
+            adjust_globally(mapper, log, cancel, growing=True)
+            at_global, since_local = int(mapper.registered.sum()), 0
+        elif since_local >= config.mapping.local_every:
             _adjust_locally(mapper, registration.unit)
             log.local_adjustments += 1
             since_local = 0
-        if mapper.registered.sum() >= at_global * (1 + config.mapping.global_growth):
-            adjust_globally(mapper, log, cancel, growing=True)
-            at_global = int(mapper.registered.sum())
         if progress is not None:
             progress(int(mapper.registered.sum()), int(mapper.keyframe.sum()))
     if not config.mapping.camera_set_registration:
@@ -179,7 +179,7 @@ def _registered_anew(
     if len(lost):
         mapper.renew_motion()
         mapper.triangulate()
-    adjust_globally(mapper, log, cancel)
+    adjust_globally(mapper, log, cancel, growing=True)
     return mapper
 
 
@@ -188,7 +188,7 @@ def _with_tracks_of(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
     result = Mapper(mapper.drive, mapper.keypoints, build_tracks(mapper.keypoints, pairs), mapper.config)
     result.state = replace(mapper.state, points_m=result.state.points_m)
     result.registered, result.missing, result.motion = mapper.registered, mapper.missing, mapper.motion
-    result.keyframe = mapper.keyframe
+    result.keyframe, result.rig_as_begun = mapper.keyframe, mapper.rig_as_begun
     result.renew_motion()
     result.triangulate()
     return result

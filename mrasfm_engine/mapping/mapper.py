@@ -27,7 +27,7 @@ from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members,
 from mrasfm_engine.triangulation.triangulate import Triangulator
 from mrasfm_engine.types import Bools, Floats, Ints
 
-_RESULTS = ("registered", "keyframe", "triangulated", "is_inlier", "missing")
+_RESULTS = ("registered", "keyframe", "triangulated", "is_inlier", "missing", "rig_as_begun")
 _STATE = (
     "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
     "band_rotation", "band_position_m",
@@ -41,6 +41,8 @@ class Mapper:
     ----------
     state
         Poses and calibration; `state.points_m` has a row for every track, valid where `triangulated`.
+    rig_as_begun
+        (cameras, 4, 4) `rig_from_cam` before the first adjustment, see `correct_calibration`.
     registered
         (units,) which units have a pose.
     keyframe
@@ -72,6 +74,7 @@ class Mapper:
             camera_params=params,
             points_m=np.zeros((len(tracks), 3)),
         )
+        self.rig_as_begun = drive.rig_from_cam
         self.registered = np.zeros(units, dtype=np.bool_)
         self.keyframe = np.ones(units, dtype=np.bool_)
         self.triangulated = np.zeros(len(tracks), dtype=np.bool_)
@@ -143,10 +146,16 @@ class Mapper:
             return self.keypoints.rays[a[pair.inliers]], self.keypoints.rays[b[pair.inliers]]
 
         rig = rig_of_drive(self.drive, pairs, rays_of, self.config.matching, self.config.bundle_adjustment)
+        self.rig_as_begun = rig.rig_from_cam
+        self.begin_anew(np.ones(len(self.camera_kind), dtype=np.bool_))
+
+    def begin_anew(self, cameras: Bools) -> None:
+        """Put cameras (c,) back to where they were before the first adjustment."""
+        begun, state = self.rig_as_begun, self.state
         self.state = replace(
-            self.state,
-            camera_rotation=np.ascontiguousarray(rig.rig_from_cam[:, :3, :3]),
-            camera_position_m=np.ascontiguousarray(rig.rig_from_cam[:, :3, 3]),
+            state,
+            camera_rotation=np.where(cameras[:, None, None], begun[:, :3, :3], state.camera_rotation),
+            camera_position_m=np.where(cameras[:, None], begun[:, :3, 3], state.camera_position_m),
         )
 
     def with_points_of(self, units: Bools) -> Mapper:

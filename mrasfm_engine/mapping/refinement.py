@@ -11,14 +11,17 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, co
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions, solve
+from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
+    STRAIGHT,
     CalibrationDecision,
     assess_calibration,
     calibration_prior,
+    contradicted_cameras,
+    is_straight,
     resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
@@ -127,8 +130,8 @@ def refine(
         options=_options(mapper, result.sigma_px),
     )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    if not result.calibration.free:
-        result.recalibrated = _wrong_although_held(mapper, free_units, positions, result, cancel)
+    if result.calibration.free and positions is None and is_straight(mapper):
+        _hold_unless_contradicted(mapper, free_units, result)
     result.intrinsics = held_intrinsics(mapper)
     if mapper.config.bundle_adjustment.refine_focal and result.calibration.free:
         result.intrinsics = assess_intrinsics(
@@ -189,6 +192,7 @@ def _adjust(
             free_intrinsics=None if result.intrinsics is None else result.intrinsics.free,
             terms=terms,
             options=_options(mapper, result.sigma_px, rough=rough),
+            an_image=mapper.config.mapping.pose_observations if rough else 0,
             cancel=cancel,
         )
     )
@@ -227,40 +231,29 @@ def _reassessed(mapper: Mapper, positions: PositionPrior | None, result: Refinem
     return result.placement.prior
 
 
-def _wrong_although_held(
-    mapper: Mapper,
-    free_units: Bools,
-    positions: PositionPrior | None,
-    result: Refinement,
-    cancel: Cancel | None,
-) -> Bools:
-    """Cameras (c,) that are clearly wrong although the drive may not change the calibration as a whole.
+def _hold_unless_contradicted(mapper: Mapper, free_units: Bools, result: Refinement) -> None:
+    """Put cameras that mapping has moved by no more than lens models err back to where they were.
 
-    A straight street leaves the scale to the calibration, but shows very well that one camera looks elsewhere than the
-    others say. It is tried with all cameras free; the result is used for nothing else.
+    A straight street leaves the scale to the calibration, but shows very well that a camera looks elsewhere than the
+    others say.
     """
-    cameras = len(mapper.camera_kind)
-    wrong = np.zeros(cameras, dtype=np.bool_)
-    if (
-        cameras <= MIN_OTHERS
-        or not mapper.config.bundle_adjustment.refine_calibration
-        or mapper.drive.has_single_camera
-    ):
-        return wrong
-    problem, _ = mapper.problem(
-        free_units,
-        free_cameras=np.ones(cameras, dtype=np.bool_),
-        terms=[calibration_prior(mapper), *_terms(mapper, positions, result)],
-        options=_options(mapper, result.sigma_px, rough=True),
-    )
-    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
-        return wrong
-    solution, _ = solve(problem, cancel=cancel)
-    directions = _directions(mapper, covariances(problem, solution))
-    if directions is not None:
-        for found in find_miscalibrations(calibration_prior(mapper), solution, directions):
-            wrong[found.camera] = True
-    return wrong if (~wrong).sum() >= MIN_OTHERS else np.zeros_like(wrong)
+
+    def directions() -> Observability | None:
+        problem, _ = mapper.problem(
+            free_units,
+            free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
+            terms=_terms(mapper, None, result),
+            options=_options(mapper, result.sigma_px),
+        )
+        return _directions(mapper, covariances(problem, problem.state))
+
+    wrong = contradicted_cameras(mapper, directions)
+    if wrong.any() and (~wrong).sum() < MIN_OTHERS:
+        result.calibration = CalibrationDecision(True, "images contradict what was given")
+        return
+    result.calibration = CalibrationDecision(False, STRAIGHT)
+    result.recalibrated = wrong
+    mapper.begin_anew(~wrong)
 
 
 def _directions(mapper: Mapper, certainty: Covariances | None) -> Observability | None:

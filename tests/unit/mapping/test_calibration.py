@@ -10,6 +10,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import (
     assess_calibration,
     calibration_prior,
+    is_straight,
     resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
@@ -76,11 +77,23 @@ def judge(mapper: Mapper, *, georeferenced: bool = False) -> str:
     return ("free: " if verdict.free else "held: ") + verdict.reason
 
 
-def test_calibration_is_freed_only_where_it_is_observed() -> None:
-    assert "straight" in judge(true_model(straight=True))
-    assert judge(true_model(straight=True)).startswith("held")
+def test_calibration_varies_where_there_is_one() -> None:
+    assert judge(true_model(straight=True)).startswith("free")
     assert judge(true_model(units=40)).startswith("free")
     assert "single camera" in judge(true_model(cameras=1))
+
+
+def test_without_priors_nothing_bounds_the_calibration_on_a_straight_street() -> None:
+    mapper = true_model(straight=True)
+    without = mapper.config.bundle_adjustment.model_copy(update={"priors": False})
+    mapper.config = mapper.config.model_copy(update={"bundle_adjustment": without})
+    assert judge(mapper).startswith("held")
+    assert judge(mapper, georeferenced=True).startswith("free")
+
+
+def test_a_curve_is_not_straight() -> None:
+    assert is_straight(true_model(straight=True))
+    assert not is_straight(true_model(units=40))
 
 
 def test_a_cancelled_adjustment_is_no_result() -> None:
