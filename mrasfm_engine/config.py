@@ -217,7 +217,9 @@ class AggregationConfig(_Section):
     )
     min_units: Count = Field(3, description="units of a scene that must agree on the transform of a seam")
     min_unit_inliers: Count = Field(12, description="image points of a unit for its pose in the other scene")
-    min_inliers: Count = Field(60, description="points that two scenes share at a seam")
+    min_inliers: Count = Field(
+        36, description="points that two scenes share at a seam: as many as `min_units` units see at least"
+    )
     max_scale_error: Positive = Field(
         0.05, description="largest difference of the scales of two scenes, beyond their uncertainty"
     )

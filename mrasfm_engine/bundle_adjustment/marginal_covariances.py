@@ -73,18 +73,18 @@ def _regular_marginals(
     layout = problem.layout
     split = UNIT_DOF * layout.num_units
     unseen = ~(system.matrix_diagonal() > 0.0)
-    solved = system.eliminate(unseen.astype(np.float64))
-    if solved is None or solved.smallest_pivot(system, unseen) < SINGULAR:
+    eliminated = system.eliminate(unseen.astype(np.float64))
+    if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
         return None
-    units, cameras = solved.inverse()
+    units, cameras = eliminated.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    columns, joint = _with_scale(problem, state, solved, cameras)
+    columns, joint = _with_scale(problem, state, eliminated, cameras)
     if shared_errors:
         joint = joint + shared_error_covariance(problem, state, system, columns, joint)
     covariance = np.zeros((layout.camera_dof * layout.num_cameras,) * 2)
-    covariance[np.ix_(solved.free, solved.free)] = joint[:-1, :-1]
-    loose = solved.free[unseen[split:][solved.free]]
+    covariance[np.ix_(eliminated.free, eliminated.free)] = joint[:-1, :-1]
+    loose = eliminated.free[unseen[split:][eliminated.free]]
     covariance[loose, loose] = np.inf
     scale = float("nan")
     if np.isinf(variance[:, 3:]).any():
@@ -94,14 +94,14 @@ def _regular_marginals(
     return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
 
 
-def _with_scale(problem: Problem, state: State, solved: Eliminated, cameras: Floats) -> tuple[Floats, Floats]:
+def _with_scale(problem: Problem, state: State, eliminated: Eliminated, cameras: Floats) -> tuple[Floats, Floats]:
     """Columns (n, f + 1) of the inverse for the cameras' unknowns that vary and the scale, and their covariance."""
-    split, free = UNIT_DOF * problem.layout.num_units, UNIT_DOF * problem.layout.num_units + solved.free
+    split, free = UNIT_DOF * problem.layout.num_units, UNIT_DOF * problem.layout.num_units + eliminated.free
     functional = _scale_functional(state.unit_position_m[problem.layout.unit_slot >= 0])
-    along = cameras @ (solved.coupled.T @ functional)
+    along = cameras @ (eliminated.coupled.T @ functional)
     columns = np.zeros((problem.layout.size, len(free) + 1))  # of the inverse
-    columns[:split, :-1], columns[free, :-1] = -solved.coupled @ cameras, cameras
-    columns[:split, -1], columns[free, -1] = solved.units_of(functional) + solved.coupled @ along, -along
+    columns[:split, :-1], columns[free, :-1] = -eliminated.coupled @ cameras, cameras
+    columns[:split, -1], columns[free, -1] = eliminated.units_of(functional) + eliminated.coupled @ along, -along
     joint = np.block([[cameras, -along[:, None]], [-along, functional @ columns[:split, -1]]])
     return columns, joint
 

@@ -28,7 +28,7 @@ MIN_UNITS = 10  # beyond those that units and cameras absorb: fewer tell no cova
 def shared_error_covariance(
     problem: Problem, state: State, system: ReducedCameraSystem, columns: Floats, covariance: Floats
 ) -> Floats:
-    """What shared errors add to the covariance (k, k) of k functionals f of the reduced vector; not negative.
+    """Covariance (k, k) that shared errors add to that of k functionals f of the reduced vector; not negative.
 
     Parameters
     ----------

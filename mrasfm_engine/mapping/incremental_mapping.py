@@ -179,7 +179,7 @@ def _registered_anew(
     if len(lost):
         mapper.renew_motion()
         mapper.triangulate()
-    adjust_globally(mapper, log, cancel, growing=True)
+    adjust_globally(mapper, log, cancel)
     return mapper
 
 
