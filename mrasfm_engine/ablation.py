@@ -55,6 +55,7 @@ SWITCHES = (
     Switch("mapping", "semantic_triangulation", "no road surface"),
     Switch("pairs", "selection", "all pairs"),
     Switch("bundle_adjustment", "priors", "no priors"),
+    Switch("bundle_adjustment", "reassessment", "gates"),
 )
 
 

@@ -166,13 +166,21 @@ class BundleAdjustmentConfig(_Section):
     sigma_distortion: Positive = Field(
         0.005, description="prior of a radial term of distortion, where intrinsics vary; of a tangential one a fifth"
     )
+    reassessment: bool = Field(
+        True,
+        description="every adjustment judges calibration and positions anew; `false` judges them once, before (by "
+        "gates), for comparison",
+    )
     refine_calibration: bool = Field(True, description="`rig_from_cam` varies where motion or GNSS make it observable")
     refine_focal: bool = Field(
         False,
         description="the intrinsics of each camera's model vary with their priors, where `rig_from_cam` varies too and "
         "the drive observes the focal length",
     )
-    min_heading_change_deg: Positive = Field(15.0, description="without GNSS, calibration is held on straighter drives")
+    min_heading_change_deg: Positive = Field(
+        15.0,
+        description="without GNSS, straighter drives put back cameras that moved by no more than lens models err",
+    )
 
 
 class GnssConfig(_Section):

@@ -77,8 +77,9 @@ def assess_calibration(
         )
     if mapper.drive.has_single_camera:
         return CalibrationDecision(False, "a single camera has no calibration to others")
-    if not settings.priors and not georeferenced and is_straight(mapper):
-        return CalibrationDecision(False, STRAIGHT)  # nothing would bound what it does not observe
+    # Without priors nothing bounds what the drive does not observe, without reassessment nothing takes it back.
+    if not (settings.priors and settings.reassessment) and not georeferenced and is_straight(mapper):
+        return CalibrationDecision(False, STRAIGHT)
     problem, _ = mapper.problem(
         free_units,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),

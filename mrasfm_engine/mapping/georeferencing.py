@@ -56,6 +56,7 @@ def align_with_gnss(
     *,
     outlier_sigmas: float,
     sigma_rig_scale: float,
+    may_bend: bool = True,
     rng: np.random.Generator,
 ) -> GnssAlignment | str:
     """Rigid transform from the reconstruction's frame to the receiver's.
@@ -75,6 +76,8 @@ def align_with_gnss(
         Residuals beyond so many sigmas are outliers.
     sigma_rig_scale
         Of the reconstruction's scale, relative, by what is known of the rig's baselines.
+    may_bend
+        Whether positions will be judged again, so that a bent reconstruction may be aligned.
     rng
         Draws the hypotheses.
 
@@ -93,7 +96,7 @@ def align_with_gnss(
     most = max(LEAST_SCALE_RANGE, float(np.exp(min(SCALE_SIGMAS * sigma_rig_scale, 1.0))))
     scale_range = (1.0 / most, most)
     start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)
-    if inlier.mean() < MOST:
+    if may_bend and inlier.mean() < MOST:
         bent = _bent(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)
         if bent is not None:
             start, inlier = bent

@@ -133,7 +133,8 @@ def map_units(
     still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, near)
     sound = without_keypoints(near, keypoints.first, still) if still.any() else near
     mapper = Mapper(drive, keypoints, build_tracks(keypoints, sound), config)
-    mapper.correct_calibration(sound)
+    if config.bundle_adjustment.reassessment:
+        mapper.correct_calibration(sound)
     mapper.keyframe = select_keyframes(mapper)
     if prior_world_from_rig is not None:
         mapper.motion.follow_prior(prior_world_from_rig)

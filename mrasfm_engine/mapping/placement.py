@@ -124,6 +124,7 @@ def _align(
         sigma[units],
         outlier_sigmas=mapper.config.gnss.outlier_sigmas,
         sigma_rig_scale=sigma_rig_scale,
+        may_bend=mapper.config.bundle_adjustment.reassessment,
         rng=np.random.default_rng(mapper.config.seed),
     )
 

@@ -211,7 +211,7 @@ def _unbend(
     They begin with the weight that the bend leaves them; what the adjustment has straightened makes the next more
     certain [graduated non-convexity].
     """
-    for _ in range(MAX_UNBENDING if positions is not None and mapper.config.bundle_adjustment.priors else 0):
+    for _ in range(MAX_UNBENDING if positions is not None and _reassesses(mapper) else 0):
         assert result.placement is not None
         before = result.placement.noise_factor
         if before < BENT:
@@ -225,10 +225,15 @@ def _unbend(
 
 def _reassessed(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> PositionPrior | None:
     """The positions as a prior, judged by the adjusted scene; as they are where they took no part in it."""
-    if positions is None or result.placement is None or not mapper.config.bundle_adjustment.priors:
+    if positions is None or result.placement is None or not _reassesses(mapper):
         return positions
     result.placement = reassess_positions(mapper, result.placement)
     return result.placement.prior
+
+
+def _reassesses(mapper: Mapper) -> bool:
+    settings = mapper.config.bundle_adjustment
+    return settings.priors and settings.reassessment
 
 
 def _hold_unless_contradicted(mapper: Mapper, free_units: Bools, result: Refinement) -> None:

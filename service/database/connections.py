@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +24,8 @@ Result = TypeVar("Result")
 MIGRATIONS = Path(__file__).parent / "migrations"
 # PostgreSQL ended this transaction for another one's sake: a serialization failure, a deadlock.
 _TRY_AGAIN = frozenset({"40001", "40P01"})
+MAX_ATTEMPTS = 5  # of one transaction
+WAIT_S = 0.05  # at most, before the second; twice as long before each later one
 # An error tells its statement, and not what was given to it: that is the users', and may be a hundred thousand names.
 _ENGINE: dict[str, Any] = {"pool_size": 10, "max_overflow": 30, "hide_parameters": True}
 
@@ -81,17 +84,18 @@ class Database:
     def transact(self, work: Callable[[Session], Result], *, durable: bool = True) -> Result:
         """The result of `work` in a transaction of its own: see `write`.
 
-        Where the database ends the transaction for another one's sake, it is done once more: nothing of it was kept,
-        and the other one is done.
+        Where the database ends the transaction for another one's sake, it is done again: nothing of it was kept. Two
+        that ended each other would do so again if both began at once, so each waits for a moment of its own.
         """
-        try:
-            with self.write(durable=durable) as session:
-                return work(session)
-        except OperationalError as error:
-            if getattr(error.orig, "sqlstate", None) not in _TRY_AGAIN:
-                raise
-        with self.write(durable=durable) as session:
-            return work(session)
+        for attempt in range(MAX_ATTEMPTS):
+            try:
+                with self.write(durable=durable) as session:
+                    return work(session)
+            except OperationalError as error:
+                if getattr(error.orig, "sqlstate", None) not in _TRY_AGAIN or attempt == MAX_ATTEMPTS - 1:
+                    raise
+            time.sleep(random.uniform(0.0, WAIT_S * 2**attempt))
+        raise AssertionError("the last attempt returns or raises")
 
     def close(self) -> None:
         """Give all connections back."""

@@ -262,6 +262,17 @@ def test_a_camera_that_looks_aside_does_not_decide_the_scale(off_deg: float) -> 
     assert 0 < se3.rotation_angle_deg(between @ true.T) < 0.05
 
 
+def test_gates_hold_a_camera_that_looks_aside_and_lose_the_scale() -> None:
+    simulated = make_simulated_drive(units=24, cameras=2, points=1500, straight=True, given=turned_away(0.5))
+    settings = EngineConfig().bundle_adjustment.model_copy(update={"reassessment": False})
+    mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1, bundle_adjustment=settings))
+    result = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    assert not result.calibration.free
+    np.testing.assert_array_equal(mapper.state.rig_from_cam, simulated.drive.rig_from_cam)
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 0.05 < abs(scale - 1) < 1.0
+
+
 def turned_away(off_deg: float):  # type: ignore[no-untyped-def]
     """What the manifest says of the cameras: the last one turned about the vertical."""
 
