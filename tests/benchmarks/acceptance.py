@@ -22,6 +22,7 @@
 | 18 | a real drive whose manifest is wrong: a camera pitched by 1 deg, focal lengths 1 % long |
 | 19 | sigmas: halves of real drives against one another, simulated drives against the truth |
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
+| 21 | real drives with poorer receivers than theirs, and with cameras left out |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -57,6 +58,7 @@ from tests.benchmarks.motion import motion
 from tests.benchmarks.occlusion import occlusion
 from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
+from tests.benchmarks.receivers import receivers
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
@@ -100,6 +102,7 @@ LINES = {
     "18": Line(untimed=(wrong_manifests,)),
     "19": Line(untimed=(halves, simulated)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
+    "21": Line(untimed=(receivers,)),
 }
 
 

@@ -1,0 +1,150 @@
+"""Line 21: real drives with poorer receivers than theirs, and with cameras left out."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import align_rigid
+from mrasfm_engine.io.read_scene import read_poses
+from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.synthetic.gnss import Origin
+from tests.benchmarks.commands import evaluate, mrasfm
+from tests.benchmarks.real_drives import DRIVES, imported
+from tests.benchmarks.table import Figure, exactly
+
+SEEDS = 5
+WHITE_M, WANDER_M, WANDER_TIME_S = 0.3, 0.5, 60.0
+EVERY, POOR_M = 5, 1.0
+METRES_A_DEGREE = 111_320.0
+
+Edit = Callable[[dict[str, Any]], None]
+
+
+def receivers(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 21."""
+    yield from _wandering(data, work)
+    yield from _sparse(data, work)
+
+
+def _wandering(data: Path, work: Path) -> Iterator[Figure]:
+    """PandaSet with positions that scatter and wander, declared so."""
+    real = next(real for real in DRIVES if real.name == "pandaset_002")
+    drive = imported(data, real.name, work, *real.options)
+    errors = []
+    for seed in range(SEEDS):
+        edited = _edited(drive, work / f"{real.name}, receiver {seed}", _wander(drive, seed))
+        mrasfm("reconstruct", edited, "--out", edited.with_name(edited.name + ", scene"))
+        found = evaluate(edited.with_name(edited.name + ", scene"), edited)
+        yield exactly("21", f"{real.name}, receiver {seed}: images registered", found["registered_images"], real.images)
+        yield Figure(
+            line="21", what=f"{real.name}, receiver {seed}: metric RMSE", value=found["metric"]["rmse_m"], unit="m"
+        )
+        errors.append(found["metric"]["rmse_m"])
+    what = f"{real.name}, {SEEDS} receivers of {WHITE_M} m that wander by {WANDER_M} m: metric RMSE, median"
+    yield Figure(line="21", what=what, value=float(np.median(errors)), unit="m", most=0.10)
+
+
+def _sparse(data: Path, work: Path) -> Iterator[Figure]:
+    """KITTI raw with few poor positions, and with the good ones but without each pair of cameras."""
+    real = next(real for real in DRIVES if real.name == "kitti_raw_0001")
+    drive = imported(data, real.name, work, *real.options)
+    poor = _edited(drive, work / f"{real.name}, poor", _poor)
+    mrasfm("reconstruct", poor, "--out", work / "poor scene")
+    found = evaluate(work / "poor scene", poor)
+    title = f"{real.name}, every {EVERY}th position, {POOR_M:.0f} m of noise"
+    yield exactly("21", f"{title}: images registered", found["registered_images"], real.images)
+    yield Figure(line="21", what=f"{title}: similarity RMSE", value=found["similarity"]["rmse_m"], unit="m", most=0.08)
+    yield Figure(line="21", what=f"{title}: metric RMSE", value=found["metric"]["rmse_m"], unit="m")
+    mrasfm("reconstruct", drive, "--out", work / "whole scene")
+    whole_m = read_poses(work / "whole scene").trajectory.world_from_rig[:, :3, 3]
+    cameras = [c["name"] for c in json.loads((drive / "drive.json").read_text(encoding="utf-8"))["rig"]["cameras"]]
+    for pair in (cameras[:2], cameras[2:]):
+        less = _edited(drive, work / f"{real.name} without {pair}", _without(pair))
+        mrasfm("reconstruct", less, "--out", less.with_name(less.name + ", scene"))
+        less_m = read_poses(less.with_name(less.name + ", scene")).trajectory.world_from_rig[:, :3, 3]
+        off_m = se3.apply(align_rigid(less_m, whole_m).a_from_b, whole_m) - less_m
+        yield Figure(
+            line="21",
+            what=f"{real.name} without {' and '.join(pair)}: positions, difference to those with all cameras, RMS",
+            value=float(np.sqrt((off_m**2).sum(1).mean())),
+            unit="m",
+            most=0.02,
+        )
+
+
+def _edited(drive: Path, copy: Path, edit: Edit) -> Path:
+    """A copy of the drive whose manifest is edited."""
+    shutil.copytree(drive, copy, copy_function=os.link)
+    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+    edit(manifest)
+    (copy / "drive.json").unlink()  # a link to the other drive's
+    (copy / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return copy
+
+
+def _wander(drive: Path, seed: int) -> Edit:
+    """Positions of the rig's origin with white noise and a Gauss-Markov error."""
+    truth = read_tum(drive / "truth.tum")
+    rng = np.random.default_rng(seed)
+    # The truth's first pose may be tilted: the receiver's frame stands upright.
+    up = truth.world_from_rig[:, :3, 2].mean(0)
+    level = se3.exp_so3(np.cross(up, [0.0, 0.0, 1.0]))
+    position_m = truth.world_from_rig[:, :3, 3] @ level.T
+    position_m += rng.normal(0, WHITE_M, position_m.shape)
+    error_m = rng.normal(0, WANDER_M, 3)
+    for i, elapsed_s in enumerate(np.diff(truth.timestamps_us, prepend=truth.timestamps_us[0]) / 1e6):
+        kept = np.exp(-elapsed_s / WANDER_TIME_S)
+        error_m = kept * error_m + rng.normal(0, WANDER_M, 3) * np.sqrt(1.0 - kept**2)
+        position_m[i] += error_m
+    sigma_m = float(np.hypot(WHITE_M, WANDER_M))
+
+    def edit(manifest: dict[str, Any]) -> None:
+        manifest["gnss"] = {
+            "height_datum": "ellipsoidal",
+            "antenna_in_rig_m": [0.0, 0.0, 0.0],
+            "samples": [
+                {
+                    "timestamp_us": int(time_us),
+                    "latitude_deg": latitude,
+                    "longitude_deg": longitude,
+                    "height_m": height,
+                    "sigma_horizontal_m": sigma_m,
+                    "sigma_vertical_m": sigma_m,
+                }
+                for time_us, (latitude, longitude, height) in zip(
+                    truth.timestamps_us, Origin().geodetic(position_m).tolist(), strict=True
+                )
+            ],
+        }
+
+    return edit
+
+
+def _poor(manifest: dict[str, Any]) -> None:
+    rng = np.random.default_rng(0)
+    samples = manifest["gnss"]["samples"][::EVERY]
+    for sample in samples:
+        east_m, north_m, up_m = rng.normal(0, POOR_M, 3)
+        around = METRES_A_DEGREE * np.cos(np.radians(sample["latitude_deg"]))
+        sample["latitude_deg"] += north_m / METRES_A_DEGREE
+        sample["longitude_deg"] += east_m / around
+        sample["height_m"] += up_m
+        sample["sigma_horizontal_m"] = sample["sigma_vertical_m"] = POOR_M
+    manifest["gnss"]["samples"] = samples
+
+
+def _without(cameras: list[str]) -> Edit:
+    def edit(manifest: dict[str, Any]) -> None:
+        manifest["rig"]["cameras"] = [c for c in manifest["rig"]["cameras"] if c["name"] not in cameras]
+        for frame in manifest["frames"]:
+            frame["images"] = {name: image for name, image in frame["images"].items() if name not in cameras}
+
+    return edit
