@@ -11,6 +11,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, co
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
+from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
@@ -252,7 +253,13 @@ def _hold_unless_contradicted(mapper: Mapper, free_units: Bools, result: Refinem
         )
         return _directions(mapper, covariances(problem, problem.state))
 
-    wrong = contradicted_cameras(mapper, directions)
+    if mapper.registered.sum() >= MIN_UNITS:
+        wrong = contradicted_cameras(mapper, directions)
+    else:
+        # So few units do not tell what they err by as a whole: only what is far off is believed.
+        found, wrong = directions(), np.zeros(len(mapper.camera_kind), dtype=np.bool_)
+        known = [] if found is None else find_miscalibrations(calibration_prior(mapper), mapper.state, found)
+        wrong[[miscalibrated.camera for miscalibrated in known]] = True
     if wrong.any() and (~wrong).sum() < MIN_OTHERS:
         result.calibration = CalibrationDecision(True, "images contradict what was given")
         return
