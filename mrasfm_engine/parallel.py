@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -19,15 +20,28 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 FEW = 512  # items that one thread has done before others have heard of them
+RANGES = 4  # a thread: items take unequal times, and starting on a range takes some, too
 BATCH = 128  # items whose results are held at one time
 
 
-def in_ranges(threads: int, count: int, work: Callable[[int, int, int], None]) -> None:
-    """Run `work(lo, hi, part)` over `count` items in so many threads."""
+def in_ranges(threads: int, count: int, work: Callable[[int, int], None]) -> None:
+    """Run `work(lo, hi)` over `count` items in so many threads; each takes the next range when it is done with one."""
     if threads <= 1 or count < FEW:
-        work(0, count, 0)
+        work(0, count)
         return
-    in_parts(np.linspace(0, count, threads + 1).astype(np.int64), work)
+    ranges = iter(list(pairwise(even_bounds(count, threads * RANGES).tolist())))  # a list's iterator is thread-safe
+
+    def run(_: int) -> None:
+        for lo, hi in ranges:
+            work(lo, hi)
+
+    list(_pool(threads).map(run, range(threads)))
+
+
+def even_bounds(count: int, parts: int) -> Ints:
+    """Bounds (parts + 1,) of even parts of `count` items."""
+    bounds: Ints = np.linspace(0, count, parts + 1).astype(np.int64)
+    return bounds
 
 
 def in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:

@@ -30,7 +30,7 @@ from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout, Observatio
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.schur_structure import SchurStructure
-from mrasfm_engine.parallel import in_parts, in_ranges
+from mrasfm_engine.parallel import even_bounds, in_parts, in_ranges
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
@@ -95,7 +95,7 @@ class Problem:
         in_ranges(
             self.options.threads,
             len(out),
-            lambda lo, hi, _: squared_errors(*views, state.points_m, self._observed, lo, hi, out),
+            lambda lo, hi: squared_errors(*views, state.points_m, self._observed, lo, hi, out),
         )
         return out
 
@@ -149,7 +149,7 @@ class Problem:
         in_ranges(
             self.options.threads,
             len(out),
-            lambda lo, hi, _: point_costs(*views, state.points_m, observed, scale2, lo, hi, out),
+            lambda lo, hi: point_costs(*views, state.points_m, observed, scale2, lo, hi, out),
         )
         return out
 
@@ -187,7 +187,7 @@ class Problem:
         in_ranges(
             options.threads,
             len(costs),
-            lambda lo, hi, _: refine_points(
+            lambda lo, hi: refine_points(
                 *views, state.points_m, observed, options.sigma_px, options.loss_scale**2,
                 before.points_m, costs_before, steps, lo, hi, costs,
             ),
@@ -250,7 +250,7 @@ class Problem:
         in_ranges(
             options.threads,
             len(out),
-            lambda lo, hi, _: substitute(
+            lambda lo, hi: substitute(
                 *views, motion, state.points_m, observed, free_slots, options.sigma_px, options.loss_scale**2,
                 step, system.v_inverse, system.v_gradient, lo, hi, out,
             ),
@@ -271,9 +271,8 @@ class Problem:
         parts = np.zeros((self.options.threads, int(group.max(initial=-1)) + 1, columns.shape[1]))
         views, motion, observed, free_slots = self._views(state), self._motion, self._observed, self._slots
         most, along = int(np.diff(o.first_of_point).max(initial=0)), np.ascontiguousarray(columns)
-        in_ranges(
-            self.options.threads,
-            o.num_points,
+        in_parts(
+            even_bounds(o.num_points, self.options.threads),
             lambda lo, hi, part: add_scores(
                 *views, motion, state.points_m, observed, free_slots, self.options.sigma_px,
                 self.options.loss_scale**2, along, system.v_inverse, group, most, lo, hi, parts[part],

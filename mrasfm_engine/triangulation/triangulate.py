@@ -337,7 +337,7 @@ class Triangulator:
         in_ranges(
             self._threads,
             len(which),
-            lambda lo, hi, _: _triangulate(
+            lambda lo, hi: _triangulate(
                 which[lo:hi], tracks.first, tracks.keypoints, k.band, k.camera, k.xy_px, k.rays, usable, r, t,
                 self._kind, state.camera_params, self.max_error_px**2, self._min_angle, points_m, triangulated,
                 is_inlier,
@@ -353,7 +353,7 @@ class Triangulator:
         in_ranges(
             self._threads,
             len(which),
-            lambda lo, hi, _: _has_angle(
+            lambda lo, hi: _has_angle(
                 which[lo:hi], tracks.first, tracks.keypoints, is_inlier, k.band, k.rays, r, math.cos(self._min_angle),
                 out[lo:hi],
             ),
@@ -367,7 +367,7 @@ class Triangulator:
         in_ranges(
             self._threads,
             len(rows),
-            lambda lo, hi, _: _errors(
+            lambda lo, hi: _errors(
                 rows[lo:hi], point[lo:hi], k.band, k.camera, k.xy_px, r, t, self._kind, state.camera_params, points_m,
                 out[lo:hi],
             ),
