@@ -27,6 +27,7 @@ class Covariances:
     sigma_camera: Floats
     sigma_scale: float  # relative, of the trajectory's size
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
+    calibration_of_independent_errors: Floats  # (6 c, 6 c) the same as the adjustment weighs it: without shared errors
 
 
 def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -> Covariances:
@@ -56,6 +57,7 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
         sigma_camera=per_camera,
         sigma_scale=found.sigma_scale,
         calibration=found.cameras[np.ix_(poses, poses)],
+        calibration_of_independent_errors=found.cameras_of_independent_errors[np.ix_(poses, poses)],
     )
 
 
@@ -63,6 +65,7 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
 class _Marginals:
     units: Floats  # (free units, 6) variances
     cameras: Floats  # (d c, d c) covariance of the free cameras; zero where held
+    cameras_of_independent_errors: Floats  # (d c, d c)
     sigma_scale: float
 
 
@@ -82,16 +85,22 @@ def _regular_marginals(
     columns, joint = _with_scale(problem, state, eliminated, cameras)
     if shared_errors:
         joint = joint + shared_error_covariance(problem, state, system, columns, joint)
-    covariance = np.zeros((layout.camera_dof * layout.num_cameras,) * 2)
-    covariance[np.ix_(eliminated.free, eliminated.free)] = joint[:-1, :-1]
     loose = eliminated.free[unseen[split:][eliminated.free]]
-    covariance[loose, loose] = np.inf
+    covariances_of_cameras = np.zeros((2, *(layout.camera_dof * layout.num_cameras,) * 2))
+    for covariance, found in zip(covariances_of_cameras, (joint[:-1, :-1], cameras), strict=True):
+        covariance[np.ix_(eliminated.free, eliminated.free)] = found
+        covariance[loose, loose] = np.inf
     scale = float("nan")
     if np.isinf(variance[:, 3:]).any():
         scale = np.inf
     elif layout.num_units >= 2:
         scale = float(np.sqrt(max(joint[-1, -1], 0.0)))
-    return _Marginals(units=np.maximum(variance, 0.0), cameras=covariance, sigma_scale=scale)
+    return _Marginals(
+        units=np.maximum(variance, 0.0),
+        cameras=covariances_of_cameras[0],
+        cameras_of_independent_errors=covariances_of_cameras[1],
+        sigma_scale=scale,
+    )
 
 
 def _with_scale(problem: Problem, state: State, eliminated: Eliminated, cameras: Floats) -> tuple[Floats, Floats]:
@@ -112,7 +121,8 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     size, split = layout.size, UNIT_DOF * layout.num_units
     if size > LARGEST_DENSE:
         cameras = np.diag(np.full(size - split, np.inf))
-        return _Marginals(units=np.full((layout.num_units, UNIT_DOF), np.inf), cameras=cameras, sigma_scale=np.inf)
+        units = np.full((layout.num_units, UNIT_DOF), np.inf)
+        return _Marginals(units=units, cameras=cameras, cameras_of_independent_errors=cameras, sigma_scale=np.inf)
     matrix = system.matrix
     free = np.setdiff1d(np.arange(size), layout.held())
     free = free[np.diagonal(matrix)[free] > 0.0]
@@ -130,7 +140,8 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     elif len(position) >= 2:
         functional = _scale_functional(position)
         scale = float(np.sqrt(max(float(functional @ covariance[:split, :split] @ functional), 0.0)))
-    return _Marginals(units=units, cameras=covariance[split:, split:], sigma_scale=scale)
+    cameras = covariance[split:, split:]
+    return _Marginals(units=units, cameras=cameras, cameras_of_independent_errors=cameras, sigma_scale=scale)
 
 
 def _inverse(matrix: Floats) -> tuple[Floats, Bools]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from mrasfm_engine.types import Bools, Floats
 
-ONLY_PRIOR_RATIO = 0.9  # of the scale: above, positions say nothing that its prior does not
+ONLY_PRIOR_RATIO = 0.9  # above, a drive says nothing of a direction, or positions of the scale, that the prior does not
 OBSERVED_RATIO = 0.5  # a direction counts as observed when its posterior sigma is below this share of the prior's
 MIN_OWN_SHARE = 0.1  # of a direction's prior variance that is left when the motions that no image shows are held
 
@@ -37,8 +37,14 @@ class Observability:
 
     @property
     def to_hold(self) -> Bools:
-        """Directions (c, 6) to leave as given; what is nothing but scale only where positions say nothing of that."""
-        result: Bools = ~self.observed & (np.isfinite(self.ratio) | self.scale_only_prior)
+        """Directions (c, 6) to leave as given: of which the drive says nothing that the prior does not.
+
+        Of one of which it says a little the adjustment's mean of both is kept: held elsewhere, it would draw the
+        others along. What is nothing but scale is held only where positions say nothing of that.
+        """
+        result: Bools = (np.nan_to_num(self.ratio, nan=np.inf) > ONLY_PRIOR_RATIO) & (
+            np.isfinite(self.ratio) | self.scale_only_prior
+        )
         return result
 
     @property

@@ -164,10 +164,7 @@ def refine(
     result.certainty = _with_common_error(mapper, result, _certainty(mapper, positions, result))
     result.directions = _directions(mapper, result.certainty)
     if result.recalibrated.any() and result.directions is not None:
-        if result.calibration.free and result.directions.to_hold.any():
-            _hold_unobserved(mapper, positions, result, free_units & mapper.registered, cancel)
-        if result.georeferenced and result.directions.scale_only_prior:
-            scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
+        _hold_unobserved(mapper, positions, result, free_units & mapper.registered, cancel)
         known = calibration_prior(mapper), mapper.state, result.directions
         result.miscalibrations = find_miscalibrations(*known)
         result.wrong_pair = find_wrong_pair(*known)
@@ -268,13 +265,16 @@ def _hold_unless_contradicted(mapper: Mapper, free_units: Bools, result: Refinem
     mapper.begin_anew(~wrong)
 
 
-def _directions(mapper: Mapper, certainty: Covariances | None) -> Observability | None:
+def _directions(
+    mapper: Mapper, certainty: Covariances | None, covariance: Floats | None = None
+) -> Observability | None:
+    """Directions that the drive observes by its certainty, or by another `covariance` of the calibration."""
     cameras = len(mapper.camera_kind)
     if certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
         return None
     prior = calibration_prior(mapper)
     return assess_directions(
-        certainty.calibration,
+        certainty.calibration if covariance is None else covariance,
         position_m=mapper.state.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
@@ -288,14 +288,20 @@ def _hold_unobserved(
     free_units: Bools,
     cancel: Cancel | None,
 ) -> None:
-    """Adjust once more with what the drive does not observe held as given.
+    """Adjust once more with that held as given of which the drive says nothing.
 
-    A direction of which the drive knows a little would else carry a correction that is mostly noise, and pass for a
-    finding.
+    It would else carry a correction that is mostly noise, and pass for a finding. A direction that shared errors alone
+    make uncertain is not held: the adjustment is sure of it, and the whole scene would follow.
     """
-    assert result.directions is not None
-    result.held = result.directions.to_hold
-    _adjust(mapper, positions, result, free_units, rough=False, cancel=cancel)
+    assert result.certainty is not None
+    weighed = _directions(mapper, result.certainty, result.certainty.calibration_of_independent_errors)
+    if weighed is None:
+        return
+    if result.calibration.free and weighed.to_hold.any():
+        result.held = weighed.to_hold
+        _adjust(mapper, positions, result, free_units, rough=False, cancel=cancel)
+    if result.georeferenced and weighed.scale_only_prior:
+        scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
 
 
 def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:
@@ -414,7 +420,13 @@ def _of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
     cameras = len(mapper.camera_kind)
     if certainty.calibration.shape != (6 * cameras, 6 * cameras) or not np.isfinite(certainty.calibration).all():
         return certainty
-    calibration = calibration_prior(mapper).without_gauge(certainty.calibration)
+    prior = calibration_prior(mapper)
+    calibration = prior.without_gauge(certainty.calibration)
     sigma_camera = certainty.sigma_camera.copy()
     sigma_camera[:, :6] = np.sqrt(np.maximum(np.diagonal(calibration), 0.0)).reshape(cameras, 6)
-    return replace(certainty, calibration=calibration, sigma_camera=sigma_camera)
+    return replace(
+        certainty,
+        calibration=calibration,
+        calibration_of_independent_errors=prior.without_gauge(certainty.calibration_of_independent_errors),
+        sigma_camera=sigma_camera,
+    )

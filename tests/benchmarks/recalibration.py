@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +35,7 @@ GNSS_NOISE_M, VERTICAL = 0.8, 1.5
 GNSS = ("--gnss-noise-m", GNSS_NOISE_M, "--gnss-drift-m", 0, "--gnss-bias-m", 0, "--gnss-outliers", 0.05)
 MAX_METRIC_RMSE_M = 0.2
 MAX_HELD_SHARE = 0.1  # of the prior's sigma
+LIKELY_SIGMAS = 3.0
 COMMON_MOTIONS = 7  # all cameras by one transform, and their scale
 HIDDEN, SEEN = 0.9, 0.5  # of the prior's sigma: more is left in what images do not show, less in what they do
 
@@ -148,12 +150,17 @@ def verdicts(drive: Path, scene: Path, title: str) -> Iterator[Figure]:
         value=len(right) - sum(map(bool, reported)),
     )
     corrections = np.array([_correction(document["cameras"][name]) for name in names]) / sigma
-    left_alone = [np.abs(corrections.mean(0)).max()]
-    if not common["scale"]["observed"]:
-        size = np.stack([np.array(document["cameras"][n]["given"]["rig_from_cam"]["translation_m"]) for n in names])
-        size = (size - size.mean(0)).ravel() / SIGMA_M
-        left_alone.append(abs(float(size @ corrections[:, 3:].ravel())) / float(np.linalg.norm(size)))
-    left_alone += list(np.abs(corrections[~observed]))
+    # Positions say a little of the scale, and it moves as far as they and its prior have it: no more than is likely.
+    size = np.stack([np.array(document["cameras"][n]["given"]["rig_from_cam"]["translation_m"]) for n in names])
+    size = (size - size.mean(0)).ravel() / SIGMA_M
+    grown = abs(float(size @ corrections[:, 3:].ravel())) / float(np.linalg.norm(size))
+    yield Figure(
+        line="8b",
+        what=f"{title}: correction of the scale, in sigmas of what positions may move it by",
+        value=grown / math.sqrt(1.0 - expected.scale_ratio**2),
+        most=LIKELY_SIGMAS,
+    )
+    left_alone = [np.abs(corrections.mean(0)).max(), *np.abs(corrections[~observed])]
     yield Figure(
         line="8b",
         what=f"{title}: largest correction where nothing is observed, of the prior's sigma",

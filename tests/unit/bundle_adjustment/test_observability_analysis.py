@@ -80,6 +80,18 @@ def test_the_one_direction_that_is_not_observed_is_named(camera: int, direction:
     np.testing.assert_array_equal(found.observed, expected)
 
 
+@pytest.mark.parametrize(("sigma", "held"), [(10.0, True), (1.0, False)])
+def test_only_what_the_drive_says_nothing_of_is_held(sigma: float, held: bool) -> None:
+    """One camera's height, measured ten times worse than the prior knows it, or as well; neither is observed."""
+    information = np.linalg.inv(posterior(everything_but(growth(PLACES), axis(1, 5))))
+    direction = axis(1, 5) / np.tile(np.r_[[SIGMA_RAD[0]] * 3, [SIGMA_M[0]] * 3], 4)
+    found = judge(np.linalg.inv(information + np.outer(direction, direction) / sigma**2))
+    assert not found.observed[1, 5]
+    expected = np.zeros((4, 6), dtype=np.bool_)
+    expected[1, 5] = held
+    np.testing.assert_array_equal(found.to_hold, expected)
+
+
 def test_the_baseline_of_two_cameras_is_their_scale() -> None:
     hidden = growth(PLACES[[1, 2]])
     covariance = posterior(everything_but(hidden, cameras=2), cameras=2)

@@ -80,6 +80,15 @@ def test_few_units_tell_no_covariance_of_their_errors(monkeypatch: pytest.Monkey
     np.testing.assert_array_equal(found.calibration, covariances(problem, solution).calibration)
 
 
+def test_what_the_adjustment_weighs_has_no_shared_errors() -> None:
+    """Directions are held by it: shared errors make one uncertain that the adjustment is sure of all the same."""
+    _, problem, solution = adjusted(0, shared_px=SHARED_PX)
+    found, independent = covariances(problem, solution), covariances(problem, solution, shared_errors=False)
+    np.testing.assert_array_equal(found.calibration_of_independent_errors, independent.calibration)
+    np.testing.assert_array_equal(independent.calibration_of_independent_errors, independent.calibration)
+    assert (np.diagonal(found.calibration) > 1.5**2 * np.diagonal(independent.calibration)).any()
+
+
 def test_scores_of_all_images_cancel_with_those_of_the_priors() -> None:
     """At a solution the gradient is zero along every step, also with the points following."""
     _, problem, solution = adjusted(1, shared_px=SHARED_PX)
