@@ -130,7 +130,7 @@ class MappingConfig(_Section):
     local_units: Count = Field(6, description="units that vary in local adjustment")
     local_every: Count = Field(2, description="registered units between two local adjustments")
     pose_observations: Annotated[int, Field(ge=0)] = Field(
-        400, description="observations of an image that its pose uses while the scene grows; 0 uses all"
+        250, description="observations of an image that its pose uses while the scene grows; 0 uses all"
     )
     semantic_triangulation: bool = Field(True, description="points of the road that are off its surface are dropped")
     road_patch_m: Positive = Field(8.0, description="radius of a plane patch of the road's surface")

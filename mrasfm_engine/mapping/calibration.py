@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
+from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.simultaneous import calibration_sigmas
@@ -21,7 +22,6 @@ MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
 LENS_SIGMA_PX = 0.5  # that lens models err by: what calibrations leave at their targets is of this size
 CONTRADICTED_SIGMAS = 3.0
-MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 
 
 def calibration_prior(mapper: Mapper, held: Bools | None = None) -> CalibrationPrior:
@@ -80,15 +80,15 @@ def assess_calibration(
     # Without priors nothing bounds what the drive does not observe, without reassessment nothing takes it back.
     if not (settings.priors and settings.reassessment) and not georeferenced and is_straight(mapper):
         return CalibrationDecision(False, STRAIGHT)
-    problem, _ = mapper.problem(
-        free_units,
-        free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-        terms=[calibration_prior(mapper), *terms],
-        options=options,
-    )
-    if problem.layout.size <= MAX_UNKNOWNS_FOR_COVARIANCE:
-        sigma = covariances(problem, problem.state, shared_errors=False).sigma_scale
-        if not np.isfinite(sigma):
+    # Many units leave nothing open but what the prior knows.
+    if mapper.registered.sum() < MIN_UNITS:
+        problem, _ = mapper.problem(
+            free_units,
+            free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
+            terms=[calibration_prior(mapper), *terms],
+            options=options,
+        )
+        if not np.isfinite(covariances(problem, problem.state, shared_errors=False).sigma_scale):
             return CalibrationDecision(False, "held as given: too few units to tell what freeing it would do")
     return CalibrationDecision(
         True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"

@@ -101,9 +101,9 @@ def _share_that_moves(mapper: Mapper, pair: PairMatches) -> float:
 def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_rig: Floats | None) -> Initialisation:
     """Register the two best-connected units.
 
-    For each of the best pairs of units by verified matches inside and between them, every source of a relative pose is
-    tried: the prior poses, points triangulated inside the first unit, and the generalised relative pose. Each is
-    adjusted; the pair with the most points of good angle is kept.
+    For each of the best pairs of units by verified matches inside and between them, the sources of a relative pose are
+    tried: points triangulated inside the first unit, and where these give no good start the prior poses and the
+    generalised relative pose. Each is adjusted; the pair with the most points of good angle is kept.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
         u, v = scores.best_of_gap(gap)
         anchor = np.eye(4) if prior is None or not known[u] else prior[u]
         for method, pose in _proposals(mapper, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
-            points = _evaluate(mapper, u, v, anchor, pose)
+            points = _evaluate(mapper, u, v, anchor, pose, is_guess=method != INSIDE)
             if best is None or points > best[0]:
                 best = (
                     points,
@@ -128,7 +128,7 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
                     mapper.state.world_from_rig[v],
                 )
             if method == INSIDE and points >= GOOD_START_POINTS:
-                break  # the relative pose from images alone costs most; it is for cameras that share no view
+                break  # the others are for cameras that share no view; that from images alone costs most
     mapper.clear()
     if best is None or best[0] < MIN_POINTS:
         raise ReconstructionError(
@@ -155,8 +155,6 @@ def _proposals(
     prior_world_from_rig: Floats | None,
 ) -> Iterator[tuple[str, Floats]]:
     """Poses of unit v, given that of u, and where they come from."""
-    if prior_world_from_rig is not None:
-        yield "prior poses", anchor @ se3.inverse(prior_world_from_rig[u]) @ prior_world_from_rig[v]
     mapper.clear()
     mapper.set_pose(u, anchor)
     mapper.renew_motion()
@@ -165,6 +163,8 @@ def _proposals(
         registration = register_unit(mapper, v)
         if registration.world_from_rig is not None:
             yield INSIDE, registration.world_from_rig
+    if prior_world_from_rig is not None:
+        yield "prior poses", anchor @ se3.inverse(prior_world_from_rig[u]) @ prior_world_from_rig[v]
     relative = (
         _single_camera_relative_pose(mapper, pairs, u, v, prior_world_from_rig)
         if mapper.drive.has_single_camera
@@ -237,7 +237,7 @@ def _matches_between(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: in
     return a[keep], b[keep]
 
 
-def _evaluate(mapper: Mapper, u: int, v: int, anchor: Floats, pose: Floats) -> int:
+def _evaluate(mapper: Mapper, u: int, v: int, anchor: Floats, pose: Floats, *, is_guess: bool) -> int:
     """Points of the two units after adjusting the second; the mapper is left in that state."""
     mapper.clear()
     mapper.set_pose(u, anchor)
@@ -249,7 +249,7 @@ def _evaluate(mapper: Mapper, u: int, v: int, anchor: Floats, pose: Floats) -> i
     options = SolverOptions(max_iterations=30, function_tolerance=1e-3, threads=mapper.config.threads)
     threshold = mapper.triangulator.max_error_px
     # Baselines between cameras that are not simultaneous follow from the pose that is sought: it takes some turns.
-    rough_rounds = 1 if mapper.state.simultaneous else MOTION_ROUNDS
+    rough_rounds = int(is_guess) if mapper.state.simultaneous else MOTION_ROUNDS
     try:
         for error_px in (*([ROUGH_ERROR_PX] * rough_rounds), ROUGH_ERROR_PX / 2, threshold):
             mapper.triangulator.max_error_px = max(error_px, threshold)

@@ -16,7 +16,6 @@ from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import (
-    MAX_UNKNOWNS_FOR_COVARIANCE,
     STRAIGHT,
     CalibrationDecision,
     assess_calibration,
@@ -53,8 +52,9 @@ MAX_UNBENDING = 6  # adjustments before them while positions contradict the scen
 BENT = 1.5  # by such a factor on their sigmas,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
 TOLERANCE = 1e-6
-DECREMENT_TOLERANCE = 3e-2  # of the last step of the last round: a quarter of a standard deviation
-ROUGH_DECREMENT_TOLERANCE = 0.5  # in those before, after which observations change anyway
+DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
+ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
+MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
 SIGMA_PX_RANGE = (0.1, 2.0)  # below, keypoints are hardly localised; above, most are wrong
 

@@ -143,8 +143,8 @@ def height_sigmas_m(mapper: Mapper, tracks: Ints, world_from_rig: Floats) -> Flo
 
 def _all_images_are_masked(mapper: Mapper) -> bool:
     """Return whether every image with keypoints has some of a known class: an image without a mask has none."""
-    image, classes = mapper.keypoints.image, mapper.keypoints.classes
-    return len(np.unique(image[classes != UNKNOWN])) == len(np.unique(image))
+    image, masked = mapper.keypoints.image, mapper.keypoints.classes != UNKNOWN
+    return bool(masked.any()) and len(np.unique(image[masked])) == len(np.unique(image))
 
 
 def _lowest_camera_m(mapper: Mapper) -> float:
