@@ -96,7 +96,7 @@ def register_remaining(
         mapper.extend(registration.unit)
         since_local += 1
         if mapper.registered.sum() >= at_global * (1 + config.mapping.global_growth):
-            adjust_globally(mapper, log, cancel, growing=True)
+            adjust_globally(mapper, log, cancel)
             at_global, since_local = int(mapper.registered.sum()), 0
         elif since_local >= config.mapping.local_every:
             _adjust_locally(mapper, registration.unit)
@@ -244,10 +244,10 @@ def _adjust_locally(mapper: Mapper, unit: int) -> None:
     )
 
 
-def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None, *, growing: bool = False) -> None:
+def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> None:
     """Adjust all units, the calibration where it is observed, and all points; then triangulate anew and filter.
 
-    Once while the scene is still `growing`: the next time is near. Else once more, with what is clearly wrong left out.
+    Once: the next adjustment is near while the scene grows, and the refinement when it has.
     """
     free_units = mapper.registered.copy()
     free_units[np.flatnonzero(mapper.registered)[0]] = False
@@ -264,23 +264,19 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None, *, g
         or assess_calibration(mapper, free_units=free_units, terms=(), georeferenced=False, options=options).free
     )
     free, priors = log.calibration_free, mapper.config.bundle_adjustment.priors
-    limits_px = (mapper.config.mapping.max_error_px, mapper.config.mapping.filter_error_px)
-    for error_px in limits_px[:1] if growing else limits_px:
-        report = adjust_poses(
-            mapper,
-            free_units,
-            free_cameras=np.full(len(mapper.camera_kind), free),
-            terms=[calibration_prior(mapper)] if free and priors else (),
-            options=options,
-            an_image=mapper.config.mapping.pose_observations,
-            cancel=cancel,
-        )
-        log.global_adjustments.append(report)
-        if free and priors:
-            # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
-            scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
-        mapper.complete()  # filters, too
-        if error_px < mapper.config.mapping.max_error_px:
-            mapper.filter(error_px)
-        if mapper.config.mapping.semantic_triangulation:
-            log.roads.append(drop_off_road(mapper))
+    report = adjust_poses(
+        mapper,
+        free_units,
+        free_cameras=np.full(len(mapper.camera_kind), free),
+        terms=[calibration_prior(mapper)] if free and priors else (),
+        options=options,
+        an_image=mapper.config.mapping.pose_observations,
+        cancel=cancel,
+    )
+    log.global_adjustments.append(report)
+    if free and priors:
+        # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
+        scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
+    mapper.complete()  # filters, too
+    if mapper.config.mapping.semantic_triangulation:
+        log.roads.append(drop_off_road(mapper))
