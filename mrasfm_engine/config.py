@@ -128,7 +128,7 @@ class MappingConfig(_Section):
     min_pnp_inliers: Count = Field(20, description="of a unit, over all its cameras")
     min_pnp_inlier_ratio: Share = Field(0.2, description="of a unit, over all its cameras")
     local_units: Count = Field(6, description="units that vary in local adjustment")
-    local_every: Count = Field(2, description="registered units between two local adjustments")
+    local_every: Count = Field(3, description="registered units between two local adjustments")
     pose_observations: Annotated[int, Field(ge=0)] = Field(
         250, description="observations of an image that its pose uses while the scene grows; 0 uses all"
     )
