@@ -23,6 +23,7 @@
 | 19 | sigmas: halves of real drives against one another, simulated drives against the truth |
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
 | 21 | real drives with poorer receivers than theirs, and with cameras left out |
+| 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -64,6 +65,7 @@ from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.sigmas import halves, simulated
 from tests.benchmarks.speed import long_routes, speed, surround_speed
+from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
 from tests.benchmarks.wrong_manifests import wrong_manifests
 
@@ -103,6 +105,7 @@ LINES = {
     "19": Line(untimed=(halves, simulated)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
     "21": Line(untimed=(receivers,)),
+    "22": Line(timed=(surround_peers,)),
 }
 
 
