@@ -6,7 +6,7 @@ import math
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -79,6 +79,7 @@ def run_baseline(
     mapper: Baseline,
     *,
     threads: int,
+    unit_of_image: Mapping[str, int] | None = None,
     timeout_s: float = 3600.0,
     cancel: Callable[[], bool] = lambda: False,
 ) -> PeerResult:
@@ -87,7 +88,10 @@ def run_baseline(
     Parameters
     ----------
     database
-        As `export.scene` writes it: with the rig, and verified matches. Every frame must be a unit.
+        As `export.scene` writes it: with the rig, and verified matches.
+    unit_of_image
+        By image name. Without, every frame of the database is a unit; images that are not simultaneous have frames of
+        their own there, and are taken as simultaneous here.
 
     Raises
     ------
@@ -101,7 +105,7 @@ def run_baseline(
     with tempfile.TemporaryDirectory(prefix="mrasfm-baseline-") as name:
         folder = Path(name)
         shutil.copyfile(database, folder / "features.db")  # COLMAP writes into databases that it only reads
-        ran = run_in_subprocess(_map, folder, mapper, threads, timeout_s=timeout_s, cancel=cancel)
+        ran = run_in_subprocess(_map, folder, mapper, threads, unit_of_image, timeout_s=timeout_s, cancel=cancel)
     if ran.result is None:
         return PeerResult(
             mapper=mapper, seconds=math.nan, registered_images=0, world_from_rig=np.zeros((0, 4, 4)),
@@ -110,12 +114,14 @@ def run_baseline(
     return replace(ran.result, peak_memory_bytes=ran.peak_memory_bytes)
 
 
-def _map(progress: StageProgress, folder: Path, mapper: Baseline, threads: int) -> PeerResult:
+def _map(
+    progress: StageProgress, folder: Path, mapper: Baseline, threads: int, unit_of_image: Mapping[str, int] | None
+) -> PeerResult:
     pycolmap.logging.minloglevel = 3
     out = folder / "models"
     out.mkdir()
     database = str(folder / "baseline.db")
-    reference_from_rig, units = _rewrite(folder / "features.db", folder / "baseline.db")
+    reference_from_rig, units = _rewrite(folder / "features.db", folder / "baseline.db", unit_of_image)
     start_memory_bytes = memory_bytes()
     started = time.perf_counter()
     if mapper in (Baseline.GLOBAL, Baseline.GLOBAL_FIXED_CALIBRATION):
@@ -139,7 +145,7 @@ def _map(progress: StageProgress, folder: Path, mapper: Baseline, threads: int) 
     )
 
 
-def _rewrite(source: Path, target: Path) -> tuple[Floats, int]:
+def _rewrite(source: Path, target: Path, unit_of_image: Mapping[str, int] | None) -> tuple[Floats, int]:
     """Copy a scene's database with the first camera as the rig's reference, without descriptors.
 
     The scene's own reference is the vehicle, on which the incremental mapper finds no initial pair.
@@ -161,7 +167,7 @@ def _rewrite(source: Path, target: Path) -> tuple[Floats, int]:
             rig.add_sensor(sensor, vehicle.sensor_from_rig(sensor) * reference_from_rig.inverse())
         new.write_rig(rig, use_rig_id=True)
         _copy_images(old, new)
-        units = _copy_frames(old, new)
+        units = _copy_frames(old, new, unit_of_image)
         for pair, geometry in zip(*old.read_two_view_geometries(), strict=True):
             images = pycolmap.pair_id_to_image_pair(pair)
             new.write_matches(*images, geometry.inlier_matches)
@@ -177,14 +183,18 @@ def _copy_images(old: Any, new: Any) -> None:
         new.write_keypoints(image.image_id, old.read_keypoints(image.image_id))
 
 
-def _copy_frames(old: Any, new: Any) -> int:
-    frames = old.read_all_frames()
-    for frame in frames:
-        copy = pycolmap.Frame(frame_id=frame.frame_id, rig_id=frame.rig_id)
+def _copy_frames(old: Any, new: Any, unit_of_image: Mapping[str, int] | None) -> int:
+    """Write the frames, numbered from 1 as units are from 0, and return how many units these are."""
+    copies: dict[int, Any] = {}
+    name_of_image = {image.image_id: image.name for image in old.read_all_images()}
+    for frame in old.read_all_frames():
         for item in frame.data_ids:
+            number = int(frame.frame_id) if unit_of_image is None else unit_of_image[name_of_image[item.id]] + 1
+            copy = copies.setdefault(number, pycolmap.Frame(frame_id=number, rig_id=frame.rig_id))
             copy.add_data_id(item)
+    for _, copy in sorted(copies.items()):
         new.write_frame(copy, use_frame_id=True)
-    return max(int(frame.frame_id) for frame in frames)
+    return max(copies)
 
 
 def _global_options(mapper: Baseline, threads: int) -> Any:

@@ -11,6 +11,7 @@ import pycolmap
 
 from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
 from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.preflight.drive_reader import read_drive
 from tests.benchmarks.commands import evaluate
 from tests.benchmarks.real_drives import DRIVES, imported, reconstructed
 from tests.benchmarks.table import Figure, exactly
@@ -31,9 +32,10 @@ def surround_peers(data: Path, work: Path) -> Iterator[Figure]:
     yield Figure(line="22", what=f"{NAME} without GNSS: images' reprojection errors, median", value=ours, unit="px")
     yield Figure(line="22", what=f"{NAME}: the same with GNSS, of that", value=theirs / ours, most=MAX_GROWTH)
     truth = read_tum(drive / "truth.tum").world_from_rig
+    units = {image.file: image.unit for image in read_drive(drive).images}
     best_m = np.inf
     for mapper in Baseline:
-        result = run_baseline(scene / "features.db", mapper, threads=os.cpu_count() or 1)
+        result = run_baseline(scene / "features.db", mapper, unit_of_image=units, threads=os.cpu_count() or 1)
         title = f"{NAME}, COLMAP {mapper}"
         yield Figure(line="22", what=f"{title}: mapping", value=result.seconds, unit="s", remark=result.failure)
         found = result.errors(truth)
