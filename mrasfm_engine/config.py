@@ -171,7 +171,16 @@ class BundleAdjustmentConfig(_Section):
         description="every adjustment judges calibration and positions anew; `false` judges them once, before (by "
         "gates), for comparison",
     )
+    sigma_time_offset_us: Positive = Field(
+        2000.0,
+        description="prior of a camera's time offset where the manifest declares none: clocks that software reads",
+    )
     refine_calibration: bool = Field(True, description="`rig_from_cam` varies where motion or GNSS make it observable")
+    refine_time_offsets: bool = Field(
+        True,
+        description="each camera's constant offset of its timestamps varies with its prior where `rig_from_cam` varies "
+        "and cameras are not simultaneous, or the manifest declares how well their times are known",
+    )
     refine_focal: bool = Field(
         False,
         description="the intrinsics of each camera's model vary with their priors, where `rig_from_cam` varies too and "

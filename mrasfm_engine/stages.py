@@ -48,7 +48,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 4}
+VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 5}
 
 
 @dataclass
@@ -369,6 +369,7 @@ def scene(
         as_json(miscalibration.finding(run.drive.cameras[wrong.camera].name, wrong))
         for wrong in refinement.miscalibrations
     ]
+    run.report["findings"] += [as_json(finding) for finding in refinement.late_cameras]
     if refinement.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
         run.report["findings"].append(as_json(miscalibration.pair_finding(names, refinement.wrong_pair)))

@@ -1,4 +1,6 @@
-"""The drive manifest, `drive.json`, version 1: one recording of one vehicle, ready to be reconstructed.
+"""The drive manifest, `drive.json`, version 2: one recording of one vehicle, ready to be reconstructed.
+
+Version 1 is read as well: it has none of `FIELDS_OF_VERSION_2`.
 
 Conventions: a transform is named `a_from_b` and maps coordinates of frame b into frame a; rotations are unit
 quaternions in the order x, y, z, w; lengths are metres, angles degrees, times integer microseconds.
@@ -35,6 +37,8 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 
+FIELDS_OF_VERSION_2 = frozenset({"sigma_principal_point_px", "sigma_distortion", "sigma_time_offset_us"})  # of Camera
+
 MAX_CAMERAS = 64
 MAX_FRAMES = 100_000
 MAX_GNSS_SAMPLES = 1_000_000  # 100 Hz for 2.7 hours
@@ -42,6 +46,7 @@ MAX_IMAGE_SIDE_PX = 20_000
 MAX_PATH_CHARACTERS = 512
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
 MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
+MAX_SIGMA_TIME_OFFSET_US = 1_000_000
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
 UNIT_ROUNDING = 1e-14  # of a quaternion's norm
 
@@ -127,10 +132,21 @@ class Camera(_Model):
     sigma_rotation_deg: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
     sigma_translation_m: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
     sigma_focal_px: Positive | None = Field(None, description="how well the focal length is known")
+    sigma_principal_point_px: Positive | None = Field(
+        None, description="since version 2: how well the principal point is known, per axis"
+    )
+    sigma_distortion: Positive | None = Field(
+        None, description="since version 2: how well the radial terms of distortion are known"
+    )
+    sigma_time_offset_us: Annotated[Positive, Field(le=MAX_SIGMA_TIME_OFFSET_US)] | None = Field(
+        None,
+        description="since version 2: how well the camera's timestamps are known as a whole, microseconds; with it the "
+        "offset is estimated also where the timestamps of all cameras agree",
+    )
     readout_us: Annotated[int, Field(ge=0, le=MAX_READOUT_US, strict=True)] | None = Field(
         None,
         description="rolling shutter: time from the first row to the last, microseconds; an image's timestamp is then "
-        "that of its middle row. Absent or 0: all rows at once",
+        "that of its middle row. 0: all rows at once; absent: so it is assumed",
     )
 
     @field_validator("model")
@@ -332,7 +348,7 @@ class DriveManifest(_Model):
 
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_MANIFEST]})
 
-    version: Literal[1] = Field(1, description="of this contract")
+    version: Literal[1, 2] = Field(1, description="of this contract")
     name: Annotated[str, Field(min_length=1, max_length=200)] = Field(description="what results are called")
     rig: Rig = Field(description="the vehicle's cameras")
     frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()] = Field(
@@ -351,6 +367,9 @@ class DriveManifest(_Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> DriveManifest:
+        for i, camera in enumerate(self.rig.cameras if self.version == 1 else ()):
+            for name in sorted(FIELDS_OF_VERSION_2 & camera.model_fields_set):
+                raise ValueError(f"rig.cameras.{i}.{name} is of version 2 of the contract: set version to 2")
         cameras = {camera.name for camera in self.rig.cameras}
         last_us = -1
         files: set[str] = set()

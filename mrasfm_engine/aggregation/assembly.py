@@ -133,6 +133,7 @@ class Assembly:
             camera_position_m=np.ascontiguousarray(cameras[:, :3, 3]),
             camera_params=np.concatenate([pack_cameras(s.drive.cameras)[1] for s in self.scenes]),
             points_m=np.concatenate(points),
+            camera_time_offset_s=np.zeros(len(cameras)),
         )
         if self.simultaneous:
             return state
@@ -150,7 +151,10 @@ class Assembly:
     @property
     def motion(self) -> RowBandMotion | None:
         """Images at times of their own stay where they are relative to their units."""
-        return None if self.simultaneous else RowBandMotion.held(self.image_unit)
+        if self.simultaneous:
+            return None
+        height_px = np.array([camera.height for scene in self.scenes for camera in scene.drive.cameras], dtype=float)
+        return RowBandMotion.held(self.image_unit, height_px)
 
     def observations(self, rows: Ints, point: Ints, num_points: int) -> Observations:
         """Keypoints `rows` (n,) as observations of points `point` (n,), which ascend."""

@@ -12,6 +12,8 @@ row by row,
     d/dX     =  N                       d/dtau_u = -N            d/domega_u = N x (X - t_u)
     d/dtau_c = -M                       d/domega_c = M x (x_band - t_c)
     d/dphi   =  pixel - principal point      d/dintrinsics: see `intrinsics_derivatives`
+    d/ddelta = -M (omega x x_band + v)       (omega, v) the rig's velocity at the row band, in its own axes there
+    d/drho   =  d/ddelta (y / height - 1/2)
 
 because R' exp(-omega) v = R' v + R' [v]x omega and n' [v]x omega = (n x v)' omega. The Cauchy loss enters by
 reweighting: an observation counts w = 1 / (1 + r^2 / s^2) (its Gauss-Newton approximation).
@@ -53,9 +55,9 @@ MIN_DEPTH_M = 1e-3
 UNIT_SUMS = 27  # of an image: its unit's block by its lower triangle, and gradient
 
 
-def image_sums(intrinsics: int) -> int:
-    """Number of an image's sums: its unit's, then of so many intrinsics with the unit, with one another, gradient."""
-    return UNIT_SUMS + 6 * intrinsics + intrinsics * (intrinsics + 1) // 2 + intrinsics
+def image_sums(inner: int) -> int:
+    """Number of an image's sums: its unit's, then of so many `inner` with the unit, with one another, gradient."""
+    return UNIT_SUMS + 6 * inner + inner * (inner + 1) // 2 + inner
 
 
 class Views(NamedTuple):
@@ -70,11 +72,16 @@ class Views(NamedTuple):
 
 
 class Bands(NamedTuple):
-    """Poses (s, 3, 3) and (s, 3) of row bands in their units, and the row band (n,) of every observation."""
+    """Poses (s, 3, 3) and (s, 3) of row bands in their units, the row band (n,) of every observation, velocities.
+
+    Of these (s, 6) and the heights (c,) of images see `problem.RowBandMotion`.
+    """
 
     r: Floats
     t: Floats
     of_observation: Ints
+    velocity: Floats
+    height_px: Floats
 
 
 class Motion(NamedTuple):
@@ -98,14 +105,14 @@ class Observed(NamedTuple):
 class Slots(NamedTuple):
     """Slots of units and cameras in the reduced vector, -1 where held; number of free units.
 
-    `intrinsics` is as long as a camera has places for intrinsics: a length that is part of the type, so that loops over
-    them are compiled for it.
+    `inner` is as long as a camera has places besides its pose, for intrinsics and its time offset: a length that is
+    part of the type, so that loops over them are compiled for it.
     """
 
     unit: Ints
     camera: Ints
     num_units: int
-    intrinsics: tuple[int, ...]
+    inner: tuple[int, ...]
 
 
 class Sums(NamedTuple):
@@ -170,7 +177,7 @@ def squared_errors(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def linearise(
-    unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, cam_r: Any, cam_t: Any,
+    unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, c: int, cam_r: Any, cam_t: Any,
     kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
 ) -> bool:  # fmt: skip
@@ -204,42 +211,54 @@ def linearise(
         jc[i, 0], jc[i, 1], jc[i, 2] = m1 * rig[2] - m2 * rig[1], m2 * rig[0] - m0 * rig[2], m0 * rig[1] - m1 * rig[0]
         jc[i, 3], jc[i, 4], jc[i, 5] = -m0, -m1, -m2
         jc[i, 6] = (proj[i] - k[2 + i]) * s
-    if jc.shape[1] > 7:
+        if jc.shape[1] > 7:
+            if bands is None:
+                jc[i, 7], jc[i, 8] = 0.0, 0.0
+            else:
+                w0, w1, w2 = bands.velocity[band, 0], bands.velocity[band, 1], bands.velocity[band, 2]
+                x0, x1, x2 = rig[0] + cam_t[0], rig[1] + cam_t[1], rig[2] + cam_t[2]
+                jc[i, 7] = -(
+                    m0 * (w1 * x2 - w2 * x1 + bands.velocity[band, 3])
+                    + m1 * (w2 * x0 - w0 * x2 + bands.velocity[band, 4])
+                    + m2 * (w0 * x1 - w1 * x0 + bands.velocity[band, 5])
+                )
+                jc[i, 8] = jc[i, 7] * (xy[1] / bands.height_px[c] - 0.5)
+    if jc.shape[1] > 9:
         intrinsics_derivatives(kind, k, cam, proj, s, jc)
     return True
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def intrinsics_derivatives(kind: int, k: Any, cam: Any, proj: Any, s: float, jc: Any) -> None:
-    """Derivatives, times s, of a pixel in log(fy / fx), cx, cy and the four terms of distortion into jc[:, 7:14].
+    """Derivatives, times s, of a pixel in log(fy / fx), cx, cy and the four terms of distortion into jc[:, 9:16].
 
     A perspective camera's distortion is the radial one's, of which it has none: how far it may be off is asked all the
     same.
     """
     a, b = cam[0] / cam[2], cam[1] / cam[2]
     r2 = a * a + b * b
-    jc[0, 7], jc[1, 7] = 0.0, (proj[1] - k[3]) * s
-    jc[0, 8], jc[1, 8] = s, 0.0
-    jc[0, 9], jc[1, 9] = 0.0, s
+    jc[0, 9], jc[1, 9] = 0.0, (proj[1] - k[3]) * s
+    jc[0, 10], jc[1, 10] = s, 0.0
+    jc[0, 11], jc[1, 11] = 0.0, s
     fx, fy = k[0] * s, k[1] * s
     if kind == 2:
         r = math.sqrt(r2)
         theta = math.atan(r)
         power = theta**3 / max(r, 1e-12)
         for i in range(4):
-            jc[0, 10 + i], jc[1, 10 + i] = fx * a * power, fy * b * power
+            jc[0, 12 + i], jc[1, 12 + i] = fx * a * power, fy * b * power
             power *= theta * theta
     else:
-        jc[0, 10], jc[1, 10] = fx * a * r2, fy * b * r2
-        jc[0, 11], jc[1, 11] = fx * a * r2 * r2, fy * b * r2 * r2
-        jc[0, 12], jc[1, 12] = fx * 2.0 * a * b, fy * (r2 + 2.0 * b * b)
-        jc[0, 13], jc[1, 13] = fx * (r2 + 2.0 * a * a), fy * 2.0 * a * b
+        jc[0, 12], jc[1, 12] = fx * a * r2, fy * b * r2
+        jc[0, 13], jc[1, 13] = fx * a * r2 * r2, fy * b * r2 * r2
+        jc[0, 14], jc[1, 14] = fx * 2.0 * a * b, fy * (r2 + 2.0 * b * b)
+        jc[0, 15], jc[1, 15] = fx * (r2 + 2.0 * a * a), fy * 2.0 * a * b
 
 
 @njit(cache=True, inline="always")
-def image_sums_gradient(intrinsics: int) -> int:
-    """Place of the intrinsics' gradient among an image's sums."""
-    return UNIT_SUMS + 6 * intrinsics + intrinsics * (intrinsics + 1) // 2
+def image_sums_gradient(inner: int) -> int:
+    """Place of the gradient of a camera's `inner` unknowns among an image's sums."""
+    return UNIT_SUMS + 6 * inner + inner * (inner + 1) // 2
 
 
 @njit(cache=True, inline="always")
@@ -282,10 +301,10 @@ def accumulate(
     """
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
-    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
-    intrinsics = len(places_of_intrinsics)
-    dof = 6 + intrinsics
-    own, own_gradient = UNIT_SUMS + 6 * intrinsics, image_sums_gradient(intrinsics)
+    unit_slot, camera_slot, num_units, inner_places = free_slots
+    inner = len(inner_places)
+    dof = 6 + inner
+    own, own_gradient = UNIT_SUMS + 6 * inner, image_sums_gradient(inner)
     order, first_point, blocks, first_block, places, first_place = groups
     images, s_units, s_border, s_cameras, g, v_inverse, v_gradient = sums
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
@@ -308,7 +327,7 @@ def accumulate(
             band = 0 if bands is None else bands.of_observation[n]
             follows = False if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
-                unit_r[u], unit_t[u], bands, band, follows, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
@@ -377,7 +396,7 @@ def accumulate(
                         )  # fmt: skip
             sc = camera_slot[c]
             if sc >= 0:
-                for k in range(intrinsics):
+                for k in range(inner):
                     f0, f1 = jc[0, 6 + k], jc[1, 6 + k]
                     n0, n1, n2 = f0 * a0 + f1 * c0, f0 * a1 + f1 * c1, f0 * a2 + f1 * c2
                     o = UNIT_SUMS + 6 * k
@@ -419,7 +438,7 @@ def accumulate(
             for a in range(rows):
                 g[o + a] -= w[i, 0, a] * x0 + w[i, 1, a] * x1 + w[i, 2, a] * x2
         _subtract_products(
-            w, inv, tiled, repeated, blocks, b0, b1, num_units, places_of_intrinsics,
+            w, inv, tiled, repeated, blocks, b0, b1, num_units, inner_places,
             places, first_place[group], s_units, s_border, s_cameras,
         )  # fmt: skip
 
@@ -453,14 +472,14 @@ def _add_unit(
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _subtract_products(
     w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int,
-    places_of_intrinsics: Any, places: Any, place: int, s_units: Any, s_border: Any, s_cameras: Any,
+    inner_places: Any, places: Any, place: int, s_units: Any, s_border: Any, s_cameras: Any,
 ) -> None:  # fmt: skip
     """S_ij -= W_i V^-1 W_j' for all pairs of a point's blocks.
 
     Entry (a, b) of a product needs row a of W_i V^-1 and row b of W_j. Both are first spread over the 6 columns of a
     block, so that one loop without gaps runs over all of its entries.
     """
-    dof = 6 + len(places_of_intrinsics)
+    dof = 6 + len(inner_places)
     count, wide = b1 - b0, 6 * dof
     for i in range(count):
         block = blocks[b0 + i]
@@ -512,10 +531,10 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
-    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
-    intrinsics = len(places_of_intrinsics)
-    dof = 6 + intrinsics
-    own, own_gradient = UNIT_SUMS + 6 * intrinsics, image_sums_gradient(intrinsics)
+    unit_slot, camera_slot, num_units, inner_places = free_slots
+    inner = len(inner_places)
+    dof = 6 + inner
+    own, own_gradient = UNIT_SUMS + 6 * inner, image_sums_gradient(inner)
     h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
         u, c, band = image_unit[image], image_camera[image], image_band[image]
@@ -541,7 +560,7 @@ def add_images(
                 for k in range(6):
                     x += t[k, i] * s[21 + k]
                 g[o + i] += x
-                for f in range(intrinsics):
+                for f in range(inner):
                     y = 0.0
                     for k in range(6):
                         y += t[k, i] * s[UNIT_SUMS + 6 * f + k]
@@ -553,7 +572,7 @@ def add_images(
                     square[dof * i + j] += z
                     if i == j:
                         diagonal[o + i] += z
-            for f in range(intrinsics):
+            for f in range(inner):
                 g[o + 6 + f] += s[own_gradient + f]
                 for other in range(f + 1):
                     square[dof * (6 + f) + 6 + other] += s[own + f * (f + 1) // 2 + other]
@@ -576,7 +595,7 @@ def add_images(
                 for j in range(6):
                     for i in range(6):
                         border[6 * i + j] += wa * th[i, j]
-                    for f in range(intrinsics):
+                    for f in range(inner):
                         border[36 + 6 * f + j] += wa * s[UNIT_SUMS + 6 * f + j]
             for b in range(3):
                 if motion is None:
@@ -634,8 +653,8 @@ def substitute(
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
-    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
-    dof = 6 + len(places_of_intrinsics)
+    unit_slot, camera_slot, num_units, inner_places = free_slots
+    dof = 6 + len(inner_places)
     jx, jc, e = np.empty((2, 3)), np.empty((2, dof)), np.empty(3)
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, _ = observed
@@ -650,7 +669,7 @@ def substitute(
             band = 0 if bands is None else bands.of_observation[n]
             follows = False if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
-                unit_r[u], unit_t[u], bands, band, follows, cam_r[c], cam_t[c],
+                unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
@@ -692,8 +711,8 @@ def add_scores(
 ) -> None:  # fmt: skip
     """Add r' (J_poses x + J_point y) of the observations of points lo..hi, y = -V^-1 W' x, to their images' scores."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
-    unit_slot, camera_slot, num_units, places_of_intrinsics = free_slots
-    dof, count = 6 + len(places_of_intrinsics), columns.shape[1]
+    unit_slot, camera_slot, num_units, inner_places = free_slots
+    dof, count = 6 + len(inner_places), columns.shape[1]
     jx, jc, inv = np.empty((2, 3)), np.empty((2, dof)), np.empty((3, 3))
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     along, normal = np.empty((2, count)), np.empty((most, 3))  # of an observation; J_point' r of each
@@ -707,7 +726,7 @@ def add_scores(
             follows = False if motion is None else motion.weight[band, 0] != 1.0
             normal[n - begin] = 0.0
             if not linearise(
-                unit_r[u], unit_t[u], bands, band, follows, cam_r[c], cam_t[c], kind[c], params[c],
+                unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c], kind[c], params[c],
                 points[p], observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue

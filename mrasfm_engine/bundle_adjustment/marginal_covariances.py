@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, UNIT_DOF
+from mrasfm_engine.bundle_adjustment.priors import ReadoutPrior
+from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, READOUT, TIME, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Eliminated, ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.shared_errors import shared_error_covariance
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.types import Bools, Floats
+from mrasfm_engine.types import Bools, Floats, Ints
 
 LARGEST_DENSE = 4000  # unknowns
 SINGULAR = 1e-11  # pivots and eigenvalues of the scaled matrix below this are rounding
@@ -23,11 +24,12 @@ class Covariances:
     """Marginal standard deviations; infinite where nothing determines an unknown."""
 
     sigma_unit_position_m: Floats  # (u, 3), NaN for fixed units
-    # (c, 14) rotation (rad), translation (m), intrinsics as in `problem`; NaN for fixed cameras, 0 for what is held
-    sigma_camera: Floats
+    sigma_camera: Floats  # (c, CAMERA_DOF) in the order of `problem`; NaN for fixed cameras, 0 for what is held
     sigma_scale: float  # relative, of the trajectory's size
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
     calibration_of_independent_errors: Floats  # (6 c, 6 c) the same as the adjustment weighs it: without shared errors
+    times_s2: Floats  # (c, c) of the free cameras' time offsets, (0, 0) where none has a place
+    times_of_independent_errors_s2: Floats  # (c, c) the same as the adjustment weighs them
 
 
 def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -> Covariances:
@@ -48,16 +50,20 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
     per_unit = np.full((len(layout.unit_slot), UNIT_DOF), np.nan)
     per_unit[layout.unit_slot >= 0] = np.sqrt(found.units)
     dof = layout.camera_dof
-    per_camera = np.full((len(layout.camera_slot), 6 + INTRINSICS), np.nan)
+    per_camera = np.full((len(layout.camera_slot), CAMERA_DOF), np.nan)
     per_camera[layout.camera_slot >= 0] = 0.0
     per_camera[layout.camera_slot >= 0, :dof] = np.sqrt(np.diagonal(found.cameras)).reshape(-1, dof)
-    poses = (dof * np.arange(layout.num_cameras)[:, None] + np.arange(6)).ravel()
+    places = dof * np.arange(layout.num_cameras)
+    poses = np.ix_(*[(places[:, None] + np.arange(6)).ravel()] * 2)
+    times = np.ix_(*[places[: len(places) if dof > TIME else 0] + TIME] * 2)
     return Covariances(
         sigma_unit_position_m=per_unit[:, 3:],
         sigma_camera=per_camera,
         sigma_scale=found.sigma_scale,
-        calibration=found.cameras[np.ix_(poses, poses)],
-        calibration_of_independent_errors=found.cameras_of_independent_errors[np.ix_(poses, poses)],
+        calibration=found.cameras[poses],
+        calibration_of_independent_errors=found.cameras_of_independent_errors[poses],
+        times_s2=found.cameras[times],
+        times_of_independent_errors_s2=found.cameras_of_independent_errors[times],
     )
 
 
@@ -83,8 +89,11 @@ def _regular_marginals(
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
     columns, joint = _with_scale(problem, state, eliminated, cameras)
+    columns, joint, of_readouts = _with_readouts_as_declared(problem, columns, joint, eliminated.free)
+    cameras = joint[:-1, :-1]
     if shared_errors:
         joint = joint + shared_error_covariance(problem, state, system, columns, joint)
+    joint = joint + of_readouts
     loose = eliminated.free[unseen[split:][eliminated.free]]
     covariances_of_cameras = np.zeros((2, *(layout.camera_dof * layout.num_cameras,) * 2))
     for covariance, found in zip(covariances_of_cameras, (joint[:-1, :-1], cameras), strict=True):
@@ -113,6 +122,28 @@ def _with_scale(problem: Problem, state: State, eliminated: Eliminated, cameras:
     columns[:split, -1], columns[free, -1] = eliminated.units_of(functional) + eliminated.coupled @ along, -along
     joint = np.block([[cameras, -along[:, None]], [-along, functional @ columns[:split, -1]]])
     return columns, joint
+
+
+def _with_readouts_as_declared(
+    problem: Problem, columns: Floats, joint: Floats, free: Ints
+) -> tuple[Floats, Floats, Floats]:
+    """Columns and covariance as `_with_scale` has them where readouts vary, for readouts that stay as they are.
+
+    And the covariance that it adds to time offsets that readouts are not what was declared [a consider covariance:
+    Bierman, Factorization Methods for Discrete Sequential Estimation, 1977]: rows of another time pass for one.
+    """
+    dof = problem.layout.camera_dof
+    of_readouts = np.zeros_like(joint)
+    at = np.flatnonzero(free % dof == READOUT) if problem.layout.free_readouts.any() else np.zeros(0, dtype=np.int64)
+    if not len(at):
+        return columns, joint, of_readouts
+    known = next(term for term in problem.terms if isinstance(term, ReadoutPrior))
+    gain = joint[:, at] @ np.linalg.inv(joint[np.ix_(at, at)])
+    times = np.flatnonzero(free % dof == TIME)
+    of_readouts[np.ix_(times, times)] = known.sigma_s**2 * gain[times] @ gain[times].T
+    columns, joint = columns - columns[:, at] @ gain.T, joint - gain @ joint[at]
+    columns[:, at] = joint[at] = joint[:, at] = 0.0
+    return columns, joint, of_readouts
 
 
 def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:

@@ -67,8 +67,8 @@ def _point_system(
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]
         if not linearise(
-            views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c], views.kind[c],
-            views.params[c], x, observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
+            views.unit_r[u], views.unit_t[u], bands, band, False, c, views.cam_r[c], views.cam_t[c],
+            views.kind[c], views.params[c], x, observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
         ):  # fmt: skip
             continue
         a0, a1, a2 = jx[0, 0], jx[0, 1], jx[0, 2]

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.problem import Layout
+from mrasfm_engine.bundle_adjustment.problem import PLACES_OF_INTRINSICS, READOUT, TIME, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
@@ -214,9 +214,72 @@ class IntrinsicsPrior:
         for camera in np.flatnonzero(layout.camera_slot >= 0).tolist():
             slot = layout.camera_slot[camera]
             varies = np.flatnonzero(layout.free_intrinsics[slot])
-            rows = dof * slot + 6 + varies
+            rows = dof * slot + PLACES_OF_INTRINSICS[varies]
             extra.cameras[rows, rows] += 1.0 / self.sigma[camera, varies] ** 2
             extra.camera_gradient[rows] += self._residuals(state)[camera, varies] / self.sigma[camera, varies]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimePrior:
+    """Keeps the cameras' time offsets near zero: residuals are these over sigma, with a Cauchy loss.
+
+    Unless positions tell when they were taken, images later by the same time are a trajectory with other timestamps:
+    the weighted mean of all offsets is then held at zero.
+    """
+
+    sigma_s: Floats  # (c,)
+    held: Bools  # (c,) offsets that stay at zero, as the drive does not observe them
+    gauge_weights: Floats | None  # (c,) of the mean; None where it is not held
+    loss_scale: float = 3.0
+
+    def without_gauge(self, covariance_s2: Floats) -> Floats:
+        """A covariance of all offsets (c, c) without what the gauge leaves of their mean."""
+        if self.gauge_weights is None:
+            return covariance_s2
+        own = np.eye(len(self.sigma_s)) - self.gauge_weights / self.gauge_weights.sum()
+        result: Floats = own @ covariance_s2 @ own.T
+        return result
+
+    def _gauge(self) -> Floats:
+        """Derivative (c,) of the mean's residual by the offsets."""
+        weights = np.zeros(len(self.sigma_s)) if self.gauge_weights is None else self.gauge_weights
+        shares = weights / max(float(weights.sum()), 1e-12)
+        result: Floats = shares * np.sqrt(GAUGE_STIFFNESS * len(shares)) / self.sigma_s.mean()
+        return result
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        r2, s2 = (state.camera_time_offset_s / self.sigma_s) ** 2, self.loss_scale**2
+        own = np.where(self.held, r2 / HELD_SHARE**2, s2 * np.log1p(r2 / s2)).sum()
+        return float(0.5 * own + 0.5 * (self._gauge() @ state.camera_time_offset_s) ** 2)
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        cameras = np.flatnonzero(layout.camera_slot >= 0)
+        cameras = cameras[layout.free_times[layout.camera_slot[cameras]]]
+        rows = layout.camera_dof * layout.camera_slot[cameras] + TIME
+        r, gauge = state.camera_time_offset_s / self.sigma_s, self._gauge()
+        weights = np.where(self.held, HELD_SHARE**-2, 1.0 / (1.0 + r**2 / self.loss_scale**2))
+        extra.cameras[rows, rows] += (weights / self.sigma_s**2)[cameras]
+        extra.camera_gradient[rows] += (weights * r / self.sigma_s)[cameras]
+        extra.cameras[np.ix_(rows, rows)] += np.outer(gauge[cameras], gauge[cameras])
+        extra.camera_gradient[rows] += gauge[cameras] * (gauge @ state.camera_time_offset_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadoutPrior:
+    """Knowledge of readouts that are not declared. As these are not estimated, it costs nothing."""
+
+    sigma_s: float
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return 0.0
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        rows = layout.camera_dof * np.flatnonzero(layout.free_readouts) + READOUT
+        extra.cameras[rows, rows] += self.sigma_s**-2
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,8 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
 
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
     A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
+    Where time offsets varied, `refined` has `time_offset_us`: images were taken so much later than their timestamps
+    say, each camera's against the mean of all unless positions tell that too.
     `common` are the motions of all cameras together, of which no direction says anything: `observed` of a camera is
     always among the others.
     """
@@ -95,6 +97,12 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         "translation_m": refined.sigma_translation_m,
         "focal_px": np.array(refined.sigma_focal_px),
     }
+    time: dict[str, dict[str, Any]] = {"refined": {}, "observed": {}, "verdict": {}}
+    if refined.time_offset_s is not None:
+        time["refined"] = {"time_offset_us": 1e6 * refined.time_offset_s}
+        time["observed"] = {"time_offset": refined.time_offset_observed}
+        time["verdict"] = {"time_offset": OBSERVED if refined.time_offset_observed else ONLY_PRIOR}
+        sigma["time_offset_us"] = np.array(1e6 * refined.sigma_time_offset_s)
     return {
         "model": camera.model,
         "width": camera.width,
@@ -104,13 +112,15 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         "refined": {
             "rig_from_cam": pose_from_matrix(refined.rig_from_cam).model_dump(),
             "params": refined.params.tolist(),
+            **time["refined"],
         },
         "difference": _difference(given, refined.rig_from_cam)
         | {
             "focal_px": float(np.mean([refined.params[k] - camera.params[k] for k in focal])),
         },
         "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},
-        "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()},
-        "verdict": {"rotation": words[:3], "translation": words[3:]},
+        "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()}
+        | time["observed"],
+        "verdict": {"rotation": words[:3], "translation": words[3:]} | time["verdict"],
         "wrong": refined.is_wrong,
     }

@@ -45,6 +45,15 @@ class LocalMotion:
         t = self._clipped(unit, offset_s)[:, None]
         return moved(t * (self.velocity[unit] + t * self.bend[unit]))
 
+    def velocity_at(self, unit: Ints, offset_s: Floats) -> Floats:
+        """Velocities (n, 6) at such times, in the axes that the vehicle has then; zero where it is taken to stand."""
+        t = self._clipped(unit, offset_s)
+        rates = self.velocity[unit] + 2.0 * t[:, None] * self.bend[unit]
+        rates[t != offset_s] = 0.0
+        then_from_unit = np.swapaxes(self.at(unit, offset_s)[:, :3, :3], 1, 2)
+        result: Floats = np.concatenate([(then_from_unit @ rates[:, k : k + 3, None])[..., 0] for k in (0, 3)], axis=1)
+        return result
+
     def weights(self, unit: Ints, offset_s: Floats) -> Floats:
         """Derivatives (n, 3) of interpolated poses by those of the `support` units: Lagrange's polynomials."""
         t, (a, b) = self._clipped(unit, offset_s), self.support_s[unit].T
@@ -110,6 +119,27 @@ def local_motion(world_from_rig: Floats, time_s: Floats, known: Bools) -> LocalM
         support=support,
         support_s=np.stack(gaps, axis=1),
     )
+
+
+def third_differences(world_from_rig: Floats, time_s: Floats, motion: LocalMotion) -> Floats:
+    """What a parabola leaves out, (u, 6): the vehicle is t (t - a) (t - b) times that from where `motion` says.
+
+    It is the mean of the divided differences with the units beyond the neighbours at a and b; zero at the drive's ends.
+    """
+    result, count = np.zeros((len(time_s), 6)), np.zeros(len(time_s))
+    units, (_, before, after) = np.arange(len(time_s)), motion.support.T
+    inside = np.flatnonzero((before >= 0) & (before < units) & (after > units))
+    for beside, side in ((before, 1), (after, 2)):
+        beyond = motion.support[beside[inside], side]
+        there = (beyond >= 0) & ((beyond < before[inside]) | (beyond > after[inside]))
+        unit, beyond = inside[there], beyond[there]
+        unit_from_beyond = se3.inverse(world_from_rig[unit]) @ world_from_rig[beyond]
+        t, (a, b) = time_s[beyond] - time_s[unit], motion.support_s[unit].T
+        parabola = t[:, None] * (motion.velocity[unit] + t[:, None] * motion.bend[unit])
+        moved = np.concatenate([se3.log_so3(unit_from_beyond[:, :3, :3]), unit_from_beyond[:, :3, 3]], axis=1)
+        result[unit] += (moved - parabola) / (t * (t - a) * (t - b))[:, None]
+        count[unit] += 1.0
+    return result / np.maximum(count, 1.0)[:, None]
 
 
 def _neighbours(time_s: Floats, known: Bools) -> tuple[Ints, Ints]:

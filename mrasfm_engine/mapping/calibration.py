@@ -111,7 +111,7 @@ def contradicted_cameras(mapper: Mapper, directions: Callable[[], Observability 
     corrections = replace(prior, rotation=begun[:, :3, :3], position_m=begun[:, :3, 3]).corrections(mapper.state)
     corrections -= np.median(corrections, axis=0) if len(corrections) > 2 else corrections.mean(0)
     lens_rad = LENS_SIGMA_PX / mapper.state.camera_params[:, :2].mean(1) * np.sqrt(1.0 - 1.0 / len(corrections))
-    lens = np.repeat(np.stack([lens_rad, lens_rad * _median_depth_m(mapper)], 1), 3, axis=1)
+    lens = np.repeat(np.stack([lens_rad, lens_rad * median_depth_m(mapper)], 1), 3, axis=1)
     beyond = np.asarray(np.abs(corrections) > CONTRADICTED_SIGMAS * lens)
     found = directions() if beyond.any() else None
     if found is None:
@@ -123,7 +123,8 @@ def contradicted_cameras(mapper: Mapper, directions: Callable[[], Observability 
     return result
 
 
-def _median_depth_m(mapper: Mapper) -> float:
+def median_depth_m(mapper: Mapper) -> float:
+    """Median distance of points from the units that see them."""
     rows = np.flatnonzero(mapper.is_inlier)
     off_m = mapper.state.points_m[mapper.tracks.of_keypoint[rows]]
     off_m = off_m - mapper.state.unit_position_m[mapper.keypoints.unit[rows]]

@@ -118,8 +118,8 @@ def intrinsics_prior(mapper: Mapper) -> IntrinsicsPrior:
         focal_px = params[c, 0]
         sigma[c, 0] = settings.sigma_focal if camera.sigma_focal_px is None else camera.sigma_focal_px / focal_px
         sigma[c, 1] = SIGMA_ASPECT
-        sigma[c, 2:4] = settings.sigma_principal_point * focal_px
-        sigma[c, 4:] = settings.sigma_distortion
+        sigma[c, 2:4] = camera.sigma_principal_point_px or settings.sigma_principal_point * focal_px
+        sigma[c, 4:] = camera.sigma_distortion or settings.sigma_distortion
         if mapper.camera_kind[c] != FISHEYE:
             sigma[c, 6:] *= TANGENTIAL_SHARE
     return IntrinsicsPrior(params=params, sigma=sigma)

@@ -29,8 +29,8 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 _RESULTS = ("registered", "keyframe", "triangulated", "is_inlier", "missing", "rig_as_begun")
 _STATE = (
-    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params", "points_m",
-    "band_rotation", "band_position_m",
+    "unit_rotation", "unit_position_m", "camera_rotation", "camera_position_m", "camera_params",
+    "camera_time_offset_s", "points_m", "band_rotation", "band_position_m",
 )  # fmt: skip
 
 
@@ -73,6 +73,7 @@ class Mapper:
             camera_position_m=np.ascontiguousarray(drive.rig_from_cam[:, :3, 3]),
             camera_params=params,
             points_m=np.zeros((len(tracks), 3)),
+            camera_time_offset_s=np.zeros(len(drive.cameras)),
         )
         self.rig_as_begun = drive.rig_from_cam
         self.registered = np.zeros(units, dtype=np.bool_)
@@ -343,6 +344,8 @@ class Mapper:
         *,
         free_cameras: Bools | None = None,
         free_intrinsics: Bools | None = None,
+        free_times: Bools | None = None,
+        free_readouts: Bools | None = None,
         terms: Sequence[Term] = (),
         options: SolverOptions,
     ) -> tuple[Problem, Ints]:
@@ -363,6 +366,8 @@ class Mapper:
                 free_units & self.registered,
                 np.zeros(len(self.camera_kind), dtype=np.bool_) if free_cameras is None else free_cameras,
                 free_intrinsics=free_intrinsics,
+                free_times=free_times,
+                free_readouts=free_readouts,
             ),
             terms=terms,
             options=options,

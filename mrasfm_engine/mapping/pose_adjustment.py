@@ -22,6 +22,7 @@ def adjust_poses(
     *,
     free_cameras: Bools | None = None,
     free_intrinsics: Bools | None = None,
+    free_times: Bools | None = None,
     terms: Sequence[Term] = (),
     options: SolverOptions,
     an_image: int = 0,
@@ -35,7 +36,12 @@ def adjust_poses(
         return adjust_images(mapper, free_units, terms=terms, options=options, an_image=an_image, cancel=cancel)
     mapper.renew_motion(np.flatnonzero(free_units & mapper.registered))
     problem, tracks = mapper.problem(
-        free_units, free_cameras=free_cameras, free_intrinsics=free_intrinsics, terms=terms, options=options
+        free_units,
+        free_cameras=free_cameras,
+        free_intrinsics=free_intrinsics,
+        free_times=free_times,
+        terms=terms,
+        options=options,
     )
     solution, report = solve_with_chosen_points(problem, mapper.image_size_px, an_image=an_image, cancel=cancel)
     if cancel is not None and cancel():

@@ -9,7 +9,7 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, ReadoutPrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
@@ -45,7 +45,20 @@ from mrasfm_engine.mapping.placement import (
 )
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
+from mrasfm_engine.mapping.time_offsets import (
+    SIGMA_READOUT_S,
+    TimeCertainty,
+    assess_times,
+    interpolation_error_s,
+    positions_may_tell_time,
+    positions_tell_time,
+    time_findings,
+    time_prior,
+    times_may_vary,
+    undeclared_readouts,
+)
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
+from schemas.findings import Finding
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
@@ -68,6 +81,9 @@ class Refinement:
     placed_by_rough_poses: bool = False
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
+    times_vary: bool = False
+    mean_time_varies: bool = False
+    times: TimeCertainty | None = None  # of the cameras' time offsets; None where it is not known
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
@@ -76,7 +92,9 @@ class Refinement:
     certainty: Covariances | None = None
     directions: Observability | None = None  # of the cameras' poses; None where it is not known
     held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
+    held_times: Bools | None = None  # (cameras,) time offsets that were not observed and stay zero
     miscalibrations: list[Miscalibration] = field(default_factory=list)
+    late_cameras: list[Finding] = field(default_factory=list)
     wrong_pair: MiscalibratedPair | None = None  # of a rig of two cameras
     road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
@@ -133,6 +151,9 @@ def refine(
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
     if result.calibration.free and positions is None and is_straight(mapper):
         _hold_unless_contradicted(mapper, free_units, result)
+    result.times_vary = result.calibration.free and times_may_vary(mapper)
+    if result.times_vary and positions is not None:
+        result.mean_time_varies = positions_may_tell_time(mapper, positions)
     result.intrinsics = held_intrinsics(mapper)
     if mapper.config.bundle_adjustment.refine_focal and result.calibration.free:
         result.intrinsics = assess_intrinsics(
@@ -163,8 +184,24 @@ def refine(
     result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _with_common_error(mapper, result, _certainty(mapper, positions, result))
     result.directions = _directions(mapper, result.certainty)
+    mean_time_varied = result.mean_time_varies
+    if result.times_vary and result.certainty is not None:
+        result.mean_time_varies &= positions_tell_time(mapper, result.certainty)
+        prior = time_prior(mapper, mean_varies=result.mean_time_varies)
+        result.times = assess_times(prior, result.certainty, interpolation_error_s(mapper))
     if result.recalibrated.any() and result.directions is not None:
-        _hold_unobserved(mapper, positions, result, free_units & mapper.registered, cancel)
+        _hold_unobserved(
+            mapper,
+            positions,
+            result,
+            free_units & mapper.registered,
+            holds_mean_time=mean_time_varied and not result.mean_time_varies,
+            cancel=cancel,
+        )
+        if result.times is not None:
+            offset_s = mapper.state.camera_time_offset_s
+            prior = time_prior(mapper, mean_varies=result.mean_time_varies)
+            result.late_cameras = time_findings(mapper.drive, offset_s, prior, result.times)
         known = calibration_prior(mapper), mapper.state, result.directions
         result.miscalibrations = find_miscalibrations(*known)
         result.wrong_pair = find_wrong_pair(*known)
@@ -188,6 +225,7 @@ def _adjust(
             free_units & mapper.registered,
             free_cameras=result.recalibrated,
             free_intrinsics=None if result.intrinsics is None else result.intrinsics.free,
+            free_times=result.recalibrated if result.times_vary else None,
             terms=terms,
             options=_options(mapper, result.sigma_px, rough=rough),
             an_image=mapper.config.mapping.pose_observations if rough else 0,
@@ -286,6 +324,8 @@ def _hold_unobserved(
     positions: PositionPrior | None,
     result: Refinement,
     free_units: Bools,
+    *,
+    holds_mean_time: bool,
     cancel: Cancel | None,
 ) -> None:
     """Adjust once more with that held as given of which the drive says nothing.
@@ -297,7 +337,10 @@ def _hold_unobserved(
     weighed = _directions(mapper, result.certainty, result.certainty.calibration_of_independent_errors)
     if weighed is None:
         return
-    if result.calibration.free and weighed.to_hold.any():
+    if result.times is not None:
+        result.held_times = result.times.to_hold
+    hold_times = result.held_times is not None and (result.held_times.any() or holds_mean_time)
+    if result.calibration.free and (weighed.to_hold.any() or hold_times):
         result.held = weighed.to_hold
         _adjust(mapper, positions, result, free_units, rough=False, cancel=cancel)
     if result.georeferenced and weighed.scale_only_prior:
@@ -360,6 +403,8 @@ def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) 
         terms.append(replace(calibration_prior(mapper), gauge_weights=(~result.recalibrated).astype(np.float64)))
     if result.intrinsics is not None and result.intrinsics.free.any():
         terms.append(intrinsics_prior(mapper))
+    if result.times_vary:
+        terms.append(time_prior(mapper, mean_varies=result.mean_time_varies, held=result.held_times))
     if positions is not None:
         terms += [
             positions,
@@ -403,10 +448,16 @@ def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refineme
         free_intrinsics = np.full((len(mapper.camera_kind), INTRINSICS), several)
         if not result.intrinsics.free.any():
             terms.append(intrinsics_prior(mapper))
+    times_vary = several and times_may_vary(mapper)
+    if times_vary:
+        terms += [] if result.times_vary else [time_prior(mapper, mean_varies=False)]
+        terms.append(ReadoutPrior(sigma_s=SIGMA_READOUT_S))
     problem, _ = mapper.problem(
         _free_units(mapper, georeferenced=positions is not None),
         free_cameras=np.full(len(mapper.camera_kind), several),
         free_intrinsics=free_intrinsics,
+        free_times=np.full(len(mapper.camera_kind), times_vary),
+        free_readouts=undeclared_readouts(mapper) & times_vary,
         terms=terms,
         options=_options(mapper, result.sigma_px),
     )

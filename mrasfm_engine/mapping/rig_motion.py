@@ -14,7 +14,14 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.problem import RowBandMotion
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.local_motion import MAX_GAP_S, LocalMotion, local_motion, moved, smoothed_velocity
+from mrasfm_engine.geometry.local_motion import (
+    MAX_GAP_S,
+    LocalMotion,
+    local_motion,
+    moved,
+    smoothed_velocity,
+    third_differences,
+)
 from mrasfm_engine.scene.row_bands import MAX_BAND_S, RowBands
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -110,9 +117,11 @@ class RigMotion:
         rows = self._bands_of(_with_neighbours(np.flatnonzero(free_units & registered), registered))
         motion = self._motion(state, registered)
         moving = rows[~self._own[self.bands.image[rows]]]
-        held = RowBandMotion.held(self.bands.unit)
+        held = RowBandMotion.held(self.bands.unit, self.bands.height_px.astype(np.float64))
         held.support[moving] = motion.support[self.bands.unit[moving]]
-        held.weight[moving] = motion.weights(self.bands.unit[moving], self.bands.time_offset_s[moving])
+        unit, offset_s = self.bands.unit[moving], self._offset_s(state, moving)
+        held.weight[moving] = motion.weights(unit, offset_s)
+        held.velocity[moving] = motion.velocity_at(unit, offset_s)
 
         def place_bands(after: State) -> State:
             after = replace(
@@ -121,7 +130,7 @@ class RigMotion:
             self._apply(after, self._motion(after, registered), rows)
             return after
 
-        return RowBandMotion(support=held.support, weight=held.weight, place_bands=place_bands)
+        return replace(held, place_bands=place_bands)
 
     def predict(self, state: State, registered: Bools, unit: int) -> None:
         """Set `unit_from_band` of a unit that has no pose yet: it moves as its registered neighbours do."""
@@ -136,8 +145,8 @@ class RigMotion:
             if around.known.all():
                 velocity = around.velocity[0]
         rows = self._bands_of(np.array([unit]))
-        at_band = moved(self.bands.time_offset_s[rows, None] * velocity)
-        self._write(state, rows, at_band, moved(self._offset_of_image(rows)[:, None] * velocity))
+        at_band = moved(self._offset_s(state, rows)[:, None] * velocity)
+        self._write(state, rows, at_band, moved(self._offset_of_image_s(state, rows)[:, None] * velocity))
 
     def expected_pose(self, state: State, registered: Bools, unit: int) -> Floats | None:
         """Predict the pose (4, 4) of a unit from the two registered units nearest in time; None where these are far."""
@@ -153,6 +162,24 @@ class RigMotion:
         if not around.known.all() or abs(elapsed_s) > MAX_GAP_S:
             return None
         result: Floats = state.world_from_rig_of(pair)[near] @ moved(elapsed_s * around.velocity[near : near + 1])[0]
+        return result
+
+    def left_out(self, state: State, registered: Bools) -> tuple[Floats, Floats]:
+        """Velocities (images, 6) of the images' units, and how far a parabola leaves the rig from where images are.
+
+        Both are rotation (rad) and translation (m), a second, in the unit's axes; of images of units that are not
+        registered, or at the ends of the drive, the second is zero.
+        """
+        motion, rows = self._motion(state, registered), self.bands.middle_of_image
+        unit, t = self.bands.unit[rows], self._offset_s(state, rows)[:, None]
+        a, b = np.nan_to_num(motion.support_s[unit]).T[:, :, None]
+        jerk = third_differences(state.world_from_rig, self._time_s, motion)
+        return motion.velocity[unit], t * (t - a) * (t - b) * jerk[unit]
+
+    def velocity_mps(self, state: State, registered: Bools) -> Floats:
+        """Velocities (u, 3) of the rig's origin at the units, in the world's axes; zero where not known."""
+        velocity = self._motion(state, registered).velocity[:, 3:]
+        result: Floats = (state.unit_rotation @ velocity[:, :, None])[..., 0]
         return result
 
     def unit_from_image(self, state: State) -> Floats:
@@ -190,8 +217,8 @@ class RigMotion:
         Their row bands stand where the unit does, as if all had been taken at once.
         """
         # Where an image has a pose of its own, only its rows are apart from it.
-        own = self._own[self.bands.image]
-        apart_s = self.bands.time_offset_s - np.where(own, self._offset_of_image(np.arange(len(self.bands))), 0.0)
+        own, every = self._own[self.bands.image], np.arange(len(self.bands))
+        apart_s = self._offset_s(state, every) - np.where(own, self._offset_of_image_s(state, every), 0.0)
         unknown = ~local_motion(state.world_from_rig, self._time_s, registered).known & ~self._prior_known
         return np.intersect1d(self.bands.unit[np.abs(apart_s) > MAX_BAND_S], np.flatnonzero(registered & unknown))
 
@@ -200,14 +227,20 @@ class RigMotion:
         rows = [np.arange(lo, hi) for lo, hi in zip(first, last, strict=True)]
         return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
 
-    def _offset_of_image(self, rows: Ints) -> Floats:
-        result: Floats = self.bands.time_offset_s[self.bands.middle_of_image[self.bands.image[rows]]]
+    def _offset_s(self, state: State, rows: Ints) -> Floats:
+        """When row bands were taken, from their units' timestamps on."""
+        result: Floats = self.bands.time_offset_s[rows] + state.camera_time_offset_s[self.bands.camera[rows]]
         return result
+
+    def _offset_of_image_s(self, state: State, rows: Ints) -> Floats:
+        """The same of the images that row bands belong to."""
+        return self._offset_s(state, self.bands.middle_of_image[self.bands.image[rows]])
 
     def _apply(self, state: State, motion: LocalMotion, rows: Ints) -> float:
         unit, before = self.bands.unit[rows], state.band_position_m[rows]
-        at_band = motion.at(unit, self.bands.time_offset_s[rows])
-        self._write(state, rows, at_band, None if not self._own.any() else motion.at(unit, self._offset_of_image(rows)))
+        at_band = motion.at(unit, self._offset_s(state, rows))
+        at_image = motion.at(unit, self._offset_of_image_s(state, rows)) if self._own.any() else None
+        self._write(state, rows, at_band, at_image)
         return float(np.linalg.norm(state.band_position_m[rows] - before, axis=1).max(initial=0.0))
 
     def _write(self, state: State, rows: Ints, at_band: Floats, at_image: Floats | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -88,6 +89,17 @@ def _observability(refinement: Refinement) -> CalibrationObservability:
     )
 
 
+def _time_offset(mapper: Mapper, refinement: Refinement, camera: int) -> dict[str, Any]:
+    times = refinement.times
+    if times is None:
+        return {}
+    return {
+        "time_offset_s": float(mapper.state.camera_time_offset_s[camera]),
+        "sigma_time_offset_s": float(times.sigma_s[camera]),
+        "time_offset_observed": bool(times.observed[camera]),
+    }
+
+
 def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibration]:
     prior: CalibrationPrior = calibration_prior(mapper)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
@@ -110,6 +122,7 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
             sigma_focal_px=float(focal[c]),
             observed=observed[c],
             is_wrong=c in wrong,
+            **_time_offset(mapper, refinement, c),
         )
         for c, camera in enumerate(mapper.drive.cameras)
     ]

@@ -28,6 +28,7 @@ class RowBands:
     time_offset_s: Floats  # (s,) when the row band's middle row was taken, from its unit's timestamp on
     first_of_image: Ints  # (images + 1,) row bands of image i: first[i]:first[i + 1]
     height_px: Ints  # (cameras,)
+    times_vary: bool  # a camera may have a time offset, which moves its row bands from their unit's timestamp
 
     @staticmethod
     def from_drive(drive: Drive, *, compensate: bool = True) -> RowBands:
@@ -55,6 +56,7 @@ class RowBands:
             time_offset_s=offset_s,
             first_of_image=first,
             height_px=np.array([camera.height for camera in drive.cameras], dtype=np.int64),
+            times_vary=compensate and any(camera.sigma_time_offset_us is not None for camera in drive.cameras),
         )
 
     def __len__(self) -> int:
@@ -62,8 +64,8 @@ class RowBands:
 
     @property
     def simultaneous(self) -> bool:
-        """Every row band is at its unit's timestamp."""
-        return not self.time_offset_s.any()
+        """Every row band is at its unit's timestamp, and stays there."""
+        return not self.times_vary and not self.time_offset_s.any()
 
     @property
     def middle_of_image(self) -> Ints:

@@ -73,6 +73,9 @@ class CameraCalibration:
     # observed, the rest is only the prior
     observed: Bools  # (6,)
     is_wrong: bool = False  # whether what was given is far from what the drive shows
+    time_offset_s: float | None = None  # its images were taken so much later than their timestamps say; None: not asked
+    sigma_time_offset_s: float = float("nan")
+    time_offset_observed: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ class State:
     camera_position_m: Floats  # (c, 3)
     camera_params: Floats  # (c, 8), see geometry.camera_model
     points_m: Floats  # (p, 3)
+    camera_time_offset_s: Floats  # (c,) by how much later than their timestamps a camera's images were taken
     band_rotation: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (s, 3, 3) of unit_from_band
     band_position_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (s, 3)
 

@@ -142,6 +142,7 @@ def _start(
         camera_rotation=turned(rig_from_cam[:, :3, :3], START["camera_deg"]),
         camera_position_m=shifted(rig_from_cam[:, :3, 3], START["camera_m"]),
         camera_params=np.concatenate([camera_params, np.zeros((len(camera_params), 4))], axis=1),
+        camera_time_offset_s=np.zeros(len(camera_params)),
         points_m=shifted(points_m, START["point_m"]),
     )
 

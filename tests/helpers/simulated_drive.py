@@ -93,11 +93,16 @@ def make_simulated_drive(
     given: Callable[[np.ndarray], np.ndarray] = lambda rig_from_cam: rig_from_cam,
     hidden: Callable[[int, int], bool] = lambda unit, camera: False,
     time_offset_ms: Sequence[int] | None = None,
+    late_ms: Sequence[int] | None = None,
     readout_ms: int = 0,
     travelled_m: np.ndarray | None = None,
     seed: int = 0,
 ) -> SimulatedDrive:
-    """Images of (unit, camera) for which `hidden` says True have no keypoints; `given` is what the manifest says."""
+    """Images of (unit, camera) for which `hidden` says True have no keypoints; `given` is what the manifest says.
+
+    Cameras take their images `time_offset_ms` after the units' timestamps, and `late_ms` after their own.
+    """
+    stamped_ms = None if time_offset_ms is None else np.subtract(time_offset_ms, late_ms or [0] * cameras).tolist()
     rng = np.random.default_rng(seed)
     truth = simulate_observations(
         units=units,
@@ -117,7 +122,7 @@ def make_simulated_drive(
         units=units,
         size_px=truth.image_size_px,
         names=[m.name for m in mounts(cameras)],
-        time_offset_us=None if time_offset_ms is None else [1000 * ms for ms in time_offset_ms],
+        time_offset_us=None if stamped_ms is None else [1000 * ms for ms in stamped_ms],
         readout_us=1000 * readout_ms or None,
     )
     descriptors = random_descriptors(len(truth.points_m), rng)

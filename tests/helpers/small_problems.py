@@ -66,6 +66,7 @@ def make_case(
         camera_rotation=np.ascontiguousarray(sim.rig_from_cam[:, :3, :3]),
         camera_position_m=np.ascontiguousarray(sim.rig_from_cam[:, :3, 3]),
         camera_params=np.concatenate([sim.camera_params, np.zeros((cameras, 4))], axis=1),
+        camera_time_offset_s=np.zeros(cameras),
         points_m=sim.points_m.copy(),
     )
     kind = np.zeros(cameras, dtype=np.int64) if kinds is None else np.array(kinds, dtype=np.int64)

@@ -306,7 +306,7 @@ def test_what_is_fixed_is_as_it_was_given() -> None:
 def test_what_colmap_cannot_say_is_refused() -> None:
     problem = everything(np.random.default_rng(0))
     with pytest.raises(ValueError, match="unit's timestamp"):
-        CeresProblem.of(replace(problem, motion=RowBandMotion.held(np.zeros(1, dtype=np.int64))))
+        CeresProblem.of(replace(problem, motion=RowBandMotion.held(np.zeros(1, dtype=np.int64), np.ones(1))))
     with pytest.raises(ValueError, match="fixed calibration"):
         CeresProblem.of(replace(problem, sets=RigidGroups(of_unit=np.zeros(UNITS, dtype=np.int64), count=1)))
     params = problem.state.camera_params.copy()

@@ -6,8 +6,24 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.kernels import BEHIND_PX
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, IntrinsicsPrior, PositionPrior, UprightPrior
-from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout, Observations, RowBandMotion
+from mrasfm_engine.bundle_adjustment.priors import (
+    CalibrationPrior,
+    IntrinsicsPrior,
+    PositionPrior,
+    TimePrior,
+    UprightPrior,
+)
+from mrasfm_engine.bundle_adjustment.problem import (
+    CAMERA_DOF,
+    FOCAL,
+    LENS,
+    READOUT,
+    TIME,
+    UNIT_DOF,
+    Layout,
+    Observations,
+    RowBandMotion,
+)
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
@@ -71,7 +87,7 @@ def with_bands(case: Case, state: State, seed: int = 0) -> tuple[Problem, State]
     band = o.unit * cameras + o.camera
     seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, band)
     observations = replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), band=band)
-    held = RowBandMotion.held(np.repeat(np.arange(len(state.unit_rotation)), cameras))
+    held = RowBandMotion.held(np.repeat(np.arange(len(state.unit_rotation)), cameras), np.ones(cameras))
     return replace(case.problem, observations=observations, motion=held), replace(state, **motion)
 
 
@@ -125,7 +141,7 @@ def test_the_reduced_system_is_the_schur_complement_of_the_full_one(
     n = problem.layout.size
     matrix, gradient = schur(h, g, n)
     system = problem.normal_equations(state, 0.0)
-    scale = np.sqrt(np.diagonal(h)[:n])
+    scale = np.sqrt(np.diagonal(h)[:n]) + 1e-9
     np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
     np.testing.assert_allclose(system.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
     np.testing.assert_allclose(system.diagonal, np.diagonal(h)[:n], rtol=1e-5)
@@ -139,6 +155,8 @@ def test_the_step_equals_that_of_the_dense_full_system(free_intrinsics: bool) ->
     damping, n = 1e-3, problem.layout.size
     h, g = dense_normal_equations(problem, state)
     h[np.diag_indices(len(h))] *= 1 + damping
+    held = problem.layout.held()
+    h[held, held] += 1.0
     expected = -np.linalg.solve(h, g)
     system = problem.normal_equations(state, damping)
     step = system.step(damping)
@@ -158,7 +176,7 @@ def test_derivatives_are_right_where_images_are_not_simultaneous() -> None:
     np.testing.assert_allclose(g, numeric, rtol=1e-4, atol=1e-4 * np.abs(g).max())
     np.testing.assert_allclose(system.v_gradient.ravel(), numeric[n:], rtol=1e-4, atol=0.05)
     matrix, gradient = schur(h, g, n)
-    scale = np.sqrt(np.diagonal(h)[:n])
+    scale = np.sqrt(np.diagonal(h)[:n]) + 1e-9
     np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=1e-5)
     np.testing.assert_allclose(system.gradient / scale, gradient / scale, atol=1e-4 * np.abs(gradient / scale).max())
     still = replace(problem, observations=replace(problem.observations, band=None))
@@ -174,7 +192,7 @@ def following(case: Case) -> tuple[Problem, State]:
 
     def follow(state: State) -> State:
         motion = local_motion(state.world_from_rig, time_s, np.ones(units, dtype=np.bool_))
-        moved = motion.at(unit, offset_s)
+        moved = motion.at(unit, offset_s + np.tile(state.camera_time_offset_s, units))
         return replace(state, band_rotation=moved[:, :3, :3].copy(), band_position_m=moved[:, :3, 3].copy())
 
     motion = local_motion(case.truth.world_from_rig, time_s, np.ones(units, dtype=np.bool_))
@@ -184,7 +202,13 @@ def following(case: Case) -> tuple[Problem, State]:
     problem = replace(
         case.problem,
         observations=replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), band=band),
-        motion=RowBandMotion(support=motion.support[unit], weight=motion.weights(unit, offset_s), place_bands=follow),
+        motion=RowBandMotion(
+            support=motion.support[unit],
+            weight=motion.weights(unit, offset_s),
+            velocity=motion.velocity_at(unit, offset_s),
+            height_px=np.full(cameras, 720.0),
+            place_bands=follow,
+        ),
         state=truth,
     )
     return problem, follow(perturbed(truth, np.random.default_rng(0), units=range(1, units), unit_m=0.02, point_m=0.05))
@@ -200,10 +224,73 @@ def test_derivatives_follow_the_trajectory_that_moves_the_bands() -> None:
     # That a unit's rotation bends the way to its neighbours is left out: some percent of a rotation's effect.
     scale = np.sqrt(np.diagonal(h)[:n]) + 1e-9
     np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=0.1)
-    held = replace(problem, motion=RowBandMotion.held(np.repeat(np.arange(5), 3))).normal_equations(state, 0.0)
+    held = replace(problem, motion=RowBandMotion.held(np.repeat(np.arange(5), 3), np.ones(3))).normal_equations(
+        state, 0.0
+    )
     error, if_held = (np.abs((r.gradient - gradient) / scale).max() for r in (system, held))
     assert 0 < error < 0.1 * np.abs(gradient / scale).max()
     assert if_held > 2 * error
+
+
+def test_a_time_offset_moves_its_camera_along_the_trajectory() -> None:
+    free = {"free_units": [False] * 5, "free_cameras": [True] * 3}
+    problem, state = following(make_case(units=5, cameras=3, points=120, **free))
+    state = replace(problem.state, points_m=state.points_m)  # velocities are those of the true trajectory
+    problem = replace(problem, layout=replace(problem.layout, free_times=np.array([False, True, True])))
+    n = problem.layout.size
+    assert n == 3 * LENS
+    held = {FOCAL, TIME, READOUT} | {k * LENS + place for k in (1, 2) for place in (FOCAL, READOUT)}
+    assert set(problem.layout.held()) == held
+    system = problem.normal_equations(state, 0.0)
+    matrix, gradient = schur(*dense_normal_equations(problem, state), n)
+    free = np.setdiff1d(np.arange(n), [place for place in held if place % LENS == READOUT])  # the state has no readout
+    scale = np.sqrt(np.diagonal(matrix)[free])
+    found, expected = (m[np.ix_(free, free)] / np.outer(scale, scale) for m in (system.matrix, matrix))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    found, expected = (g[free] / scale for g in (system.gradient, gradient))
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_a_readout_moves_rows_by_where_they_are_from_the_middle() -> None:
+    free = {"free_units": [False] * 5, "free_cameras": [True] * 3}
+    problem, state = following(make_case(units=5, cameras=3, points=120, **free))
+    every = np.ones(3, dtype=np.bool_)
+    layout = replace(problem.layout, free_times=every, free_readouts=every)
+    # Where all keypoints are at 3/4 of the height, a readout of 4 ms is an offset of 1 ms.
+    at = 0.75
+    xy_px = np.column_stack([problem.observations.xy_px[:, 0], np.full(len(problem.observations.unit), at * 720.0)])
+    rows = replace(problem.observations, xy_px=xy_px)
+    cameras = replace(problem, layout=layout, observations=rows).normal_equations(state, 0.0).cameras
+    for c in range(3):
+        square = cameras[c * LENS : (c + 1) * LENS, c * LENS : (c + 1) * LENS]
+        assert square[TIME, TIME] > 0.0
+        assert square[READOUT, TIME] == pytest.approx((at - 0.5) * square[TIME, TIME])
+        assert square[READOUT, READOUT] == pytest.approx((at - 0.5) ** 2 * square[TIME, TIME])
+
+
+@pytest.mark.parametrize("mean_is_held", [False, True])
+def test_time_offsets_of_cameras_are_found(mean_is_held: bool) -> None:
+    problem, _ = following(make_case(units=5, cameras=3, points=300, noise_px=0.0, free_cameras=[True] * 3))
+    calibration = all_terms(make_case(units=5, cameras=3))[0]
+    firm = replace(calibration, sigma_rotation_rad=np.full(3, 1e-5), sigma_translation_m=np.full(3, 1e-4))
+    problem = replace(
+        problem,
+        layout=replace(problem.layout, free_times=np.ones(3, dtype=np.bool_)),
+        terms=[
+            firm,
+            TimePrior(
+                sigma_s=np.full(3, 0.005),
+                held=np.zeros(3, dtype=np.bool_),
+                gauge_weights=np.ones(3) if mean_is_held else None,
+            ),
+        ],
+    )
+    off_s = np.array([0.004, -0.006, 0.003])
+    begin = problem.motion.place_bands(replace(problem.state, camera_time_offset_s=off_s))
+    assert problem.cost(begin) > 100.0
+    solution, report = solve(replace(problem, state=begin))
+    assert report.termination is Termination.CONVERGED
+    np.testing.assert_allclose(solution.camera_time_offset_s, 0.0, atol=1e-5)
 
 
 def test_a_drive_that_is_not_simultaneous_is_solved_in_few_steps() -> None:
@@ -248,7 +335,7 @@ def test_fixed_units_and_cameras_have_no_place_in_the_system() -> None:
     assert layout.held().tolist() == [18]
     one = np.array([True])
     assert not len(Layout.from_free(one, one, free_intrinsics=intrinsics_mask(1, focal=True)).held())
-    assert Layout.from_free(one, one, free_intrinsics=intrinsics_mask(1, focal=True, every=True)).size == 6 + 14
+    assert Layout.from_free(one, one, free_intrinsics=intrinsics_mask(1, focal=True, every=True)).size == 6 + CAMERA_DOF
 
 
 def test_an_observation_behind_its_camera_costs_and_pulls_nothing() -> None:
@@ -301,6 +388,7 @@ def test_a_point_of_very_many_units_is_still_right() -> None:
         camera_rotation=camera_rotation,
         camera_position_m=np.zeros((1, 3)),
         camera_params=np.array([[500.0, 500, 480, 270, 0, 0, 0, 0]]),
+        camera_time_offset_s=np.zeros(1),
         points_m=np.array([[20.0, 3.0, 1.0]]),
     )
     index = np.arange(units, dtype=np.int64)

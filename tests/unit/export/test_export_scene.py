@@ -267,6 +267,17 @@ def test_calibration(scene: Scene, written: Path) -> None:
     np.testing.assert_allclose(read["right"], scene.calibration[1].rig_from_cam, atol=1e-12)
 
 
+def test_a_time_offset_is_told_where_it_was_estimated(scene: Scene) -> None:
+    late = replace(scene.calibration[0], time_offset_s=0.004, sigma_time_offset_s=0.0005, time_offset_observed=True)
+    cameras = calibration_document(replace(scene, calibration=[late, *scene.calibration[1:]]))["cameras"]
+    first, second = (cameras[camera.name] for camera in scene.drive.cameras[:2])
+    assert first["refined"]["time_offset_us"] == pytest.approx(4000.0)
+    assert first["sigma"]["time_offset_us"] == pytest.approx(500.0)
+    assert first["observed"]["time_offset"] is True
+    assert first["verdict"]["time_offset"] == "observed"
+    assert "time_offset_us" not in second["refined"]
+
+
 def test_what_all_cameras_share_is_never_called_observed(scene: Scene) -> None:
     observability = CalibrationObservability(
         adjusted=True, reason="GNSS", scale_observed=True, scale_rests_on="observed by positions", sigma_scale=0.004

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.local_motion import MAX_ACCELERATION_MPS2, MAX_GAP_S, local_motion, smoothed_velocity
+from mrasfm_engine.geometry.local_motion import (
+    MAX_ACCELERATION_MPS2,
+    MAX_GAP_S,
+    local_motion,
+    smoothed_velocity,
+    third_differences,
+)
 
 TWIST = np.array([0.05, -0.02, 0.6, 8.0, 0.3, -0.1])  # rad/s and m/s: a turn with some roll and climb
 START = se3.transform(se3.exp_so3([0.1, 0.2, -1.0]), [3.0, -4.0, 1.0])
@@ -28,6 +34,34 @@ def test_a_steady_turn_is_followed_inside_and_at_both_ends(unit: int, offset_s: 
     np.testing.assert_allclose(found[:3, :3], expected[:3, :3], atol=1e-12)
     np.testing.assert_allclose(found[:3, 3], expected[:3, 3], atol=1e-3)  # a line would be 6 mm off
     assert motion.known.all()
+
+
+def test_velocities_are_derivatives_of_the_motion_in_the_axes_of_their_time() -> None:
+    time_s = np.array([0.0, 0.1, 0.2, 0.35, 0.4])
+    motion = local_motion(driven(time_s), time_s, all_known(time_s))
+    unit, offset_s, step_s = np.array([0, 2, 4, 2]), np.array([-0.05, 0.04, 0.03, 0.0]), 1e-5
+    before, now, after = (motion.at(unit, offset_s + by_s) for by_s in (-step_s, 0.0, step_s))
+    numeric = se3.log_so3(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / (2 * step_s)
+    found = motion.velocity_at(unit, offset_s)
+    np.testing.assert_allclose(found[:, :3], numeric, atol=1e-3)
+    numeric = np.swapaxes(now[:, :3, :3], 1, 2) @ (after - before)[:, :3, 3, None] / (2 * step_s)
+    np.testing.assert_allclose(found[:, 3:], numeric[..., 0], atol=1e-6)
+    assert not motion.velocity_at(np.array([2]), np.array([1.0])).any()
+
+
+def test_third_differences_say_what_a_parabola_leaves_out() -> None:
+    time_s = np.array([0.0, 0.1, 0.2, 0.35, 0.4, 0.5])
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = 7.0 * time_s - 3.0 * time_s**2 + 5.0 * time_s**3
+    motion = local_motion(poses, time_s, all_known(time_s))
+    found = third_differences(poses, time_s, motion)
+    np.testing.assert_allclose(found[1:-1, 3], 5.0)
+    assert not found[[0, -1]].any()
+    unit, t = 3, 0.02
+    a, b = motion.support_s[unit]
+    at = time_s[unit] + t
+    place_m = poses[unit, 0, 3] + motion.at(np.array([unit]), np.array([t]))[0, 0, 3] + t * (t - a) * (t - b) * 5.0
+    assert place_m == pytest.approx(7.0 * at - 3.0 * at**2 + 5.0 * at**3)
 
 
 def test_places_follow_a_scaling_of_the_whole_way_exactly() -> None:

@@ -88,10 +88,13 @@ def test_leaving_the_prior_is_a_finding() -> None:
 def test_the_prior_is_the_manifests_where_it_says_one() -> None:
     mapper, simulated = model(straight=False, cameras=2)
     rig = simulated.drive.manifest.rig
-    cameras = [rig.cameras[0].model_copy(update={"sigma_focal_px": 3.0}), rig.cameras[1]]
+    given = {"sigma_focal_px": 3.0, "sigma_principal_point_px": 1.5, "sigma_distortion": 0.01}
+    cameras = [rig.cameras[0].model_copy(update=given), rig.cameras[1]]
     manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
     mapper.drive = replace(simulated.drive, manifest=manifest)
     prior = intrinsics_prior(mapper)
     assert prior.sigma[0, 0] == pytest.approx(3.0 / prior.params[0, 0])
     assert prior.sigma[1, 0] == SIGMA_FOCAL
+    np.testing.assert_array_equal(prior.sigma[0, 2:4], 1.5)
+    np.testing.assert_array_equal(prior.sigma[0, 4:6], 0.01)
     assert (prior.sigma > 0).all()

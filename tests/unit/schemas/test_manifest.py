@@ -22,6 +22,7 @@ from schemas import (
     parse_manifest,
     parse_new_manifest,
 )
+from schemas.drive import FIELDS_OF_VERSION_2
 from schemas.export import SCHEMA_FILE, schema_text
 from schemas.file_names import name_problems
 from schemas.parsing import parse_document
@@ -85,7 +86,8 @@ def change(document: Any, path: str, value: Any) -> Any:
 @pytest.mark.parametrize(
     ("path", "value", "named", "message"),
     [
-        ("version", 2, "version", "1"),
+        ("version", 3, "version", "1 or 2"),
+        ("rig.cameras.0.sigma_time_offset_us", 500.0, "", "rig.cameras.0.sigma_time_offset_us is of version 2"),
         ("name", "", "name", "at least 1 character"),
         ("rig.body_axes", "xyz", "rig.body_axes", "'flu', 'rdf' or 'frd'"),
         ("rig.cameras", [], "rig.cameras", "at least 1 item"),
@@ -217,6 +219,15 @@ def test_a_version_that_only_equals_one(example: dict[str, Any], version: object
     assert [problem.path for problem in refused.value.problems] == ["version"]
     read = parse_manifest(encoded(example)).version
     assert (read, type(read)) == (1, int)
+
+
+def test_version_2_says_how_well_more_of_a_camera_is_known(example: dict[str, Any]) -> None:
+    new = {"sigma_principal_point_px": 1.5, "sigma_distortion": 0.01, "sigma_time_offset_us": 500.0}
+    example["rig"]["cameras"][0] |= new
+    example["version"] = 2
+    camera = parse_manifest(json.dumps(example).encode()).rig.cameras[0].model_dump()
+    assert {name: camera[name] for name in new} == new
+    assert set(new) == FIELDS_OF_VERSION_2
 
 
 def test_a_version_may_be_left_out(example: dict[str, Any]) -> None:

@@ -61,6 +61,7 @@ def setting(
         camera_rotation=RIG_FROM_FORWARD_CAM[None],
         camera_position_m=np.array([[1.5, 0.2, 1.5]]),
         camera_params=params[None],
+        camera_time_offset_s=np.zeros(1),
         points_m=np.zeros((n, 3)),
     )
     poses = se3.inverse(state.world_from_rig @ state.rig_from_cam[0])

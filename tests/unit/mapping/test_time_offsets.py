@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.time_offsets import time_prior, times_may_vary
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    metric_errors_m,
+    rmse,
+    with_true_poses,
+)
+from tests.unit.mapping.test_placement import ARM_M, received
+
+UNITS = 30
+APART_MS = [0, 30, -20, 40]
+LATE_MS = [4, -6, 3, -1]
+# From 4 to 18 m/s and back: at one speed a camera that is late looks like one that is mounted elsewhere.
+TRAVELLED_M = 1.1 * np.arange(UNITS) - 2.5 * np.sin(2 * np.pi * np.arange(UNITS) / UNITS)
+
+
+def model(
+    late_ms: list[int], config: EngineConfig | None = None, *, apart: bool = True, **camera: Any
+) -> tuple[Mapper, SimulatedDrive]:
+    """A drive at its true poses, whose cameras take images so much later than their timestamps."""
+    simulated = make_simulated_drive(
+        units=UNITS,
+        cameras=4,
+        points=2500,
+        travelled_m=TRAVELLED_M,
+        time_offset_ms=APART_MS if apart else late_ms,
+        late_ms=late_ms,
+    )
+    rig = simulated.drive.manifest.rig
+    cameras = [c.model_copy(update={"readout_us": 0, "sigma_time_offset_us": 5000.0, **camera}) for c in rig.cameras]
+    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
+    simulated = replace(simulated, drive=replace(simulated.drive, manifest=manifest))
+    return with_true_poses(make_model(simulated, config=config), simulated, range(UNITS)), simulated
+
+
+def refined(mapper: Mapper, simulated: SimulatedDrive, sigma_m: float | None = None) -> Refinement:
+    gnss = None if sigma_m is None else received(simulated, sigma_m)
+    return refine(mapper, gnss=gnss, antenna_in_rig_m=None if gnss is None else ARM_M, rough_world_from_rig=None)
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_time_offsets_are_found_to_what_is_stated_of_them(apart: bool) -> None:
+    mapper, simulated = model(LATE_MS, apart=apart)
+    result = refined(mapper, simulated)
+    assert result.times is not None
+    assert result.times.observed.all()
+    weights = time_prior(mapper, mean_varies=False).gauge_weights
+    assert weights is not None
+    off_s = mapper.state.camera_time_offset_s - 1e-3 * (np.array(LATE_MS) - np.average(LATE_MS, weights=weights))
+    assert np.abs(off_s).max() < (0.001 if apart else 0.0003)
+    assert (np.abs(off_s) < 3 * result.times.sigma_s).all()
+    assert result.late_cameras == []
+
+
+def test_a_camera_that_is_late_no_longer_bends_the_trajectory() -> None:
+    errors_m = []
+    for refine_times in (True, False):
+        config = EngineConfig(threads=1, bundle_adjustment=BundleAdjustmentConfig(refine_time_offsets=refine_times))
+        mapper, simulated = model(LATE_MS, config)
+        result = refined(mapper, simulated)
+        assert (result.times is not None) == refine_times
+        errors_m.append(rmse(metric_errors_m(mapper, simulated)))
+    assert errors_m[0] < 0.5 * errors_m[1]
+    assert not mapper.state.camera_time_offset_s.any()
+
+
+def test_the_mean_is_that_of_most_cameras_unless_positions_tell_it() -> None:
+    for sigma_m, expected_ms in ((None, [0, 0, 0, 4]), (0.02, [0, 0, 0, 4]), (0.005, [4, 4, 4, 8])):
+        mapper, simulated = model([4, 4, 4, 8])
+        result = refined(mapper, simulated, sigma_m)
+        assert result.times is not None
+        assert result.mean_time_varies == (sigma_m == 0.005)
+        off_s = mapper.state.camera_time_offset_s - 1e-3 * np.array(expected_ms)
+        assert np.abs(off_s).max() < 0.0025
+        assert (np.abs(off_s) < 3 * result.times.sigma_s).all()
+
+
+def test_a_readout_that_is_not_declared_may_be_what_passes_for_an_offset() -> None:
+    declared, unknown = (model(LATE_MS, readout_us=readout_us) for readout_us in (0, None))
+    certain, uncertain = (refined(*drive).times for drive in (declared, unknown))
+    assert certain is not None
+    assert uncertain is not None
+    assert (uncertain.sigma_s > 2 * certain.sigma_s).all()
+    np.testing.assert_allclose(declared[0].state.camera_time_offset_s, unknown[0].state.camera_time_offset_s, atol=1e-6)
+
+
+def test_leaving_the_prior_is_a_finding() -> None:
+    mapper, simulated = model([0, 0, 15, 0], sigma_time_offset_us=2000.0)
+    (said,) = refined(mapper, simulated).late_cameras
+    assert said.code == "time-offset-beyond-prior"
+    assert simulated.drive.cameras[2].name in said.what
+    assert "sigma_time_offset_us" in said.remedy
+
+
+def test_cameras_that_are_simultaneous_have_no_offset_unless_the_manifest_says_so() -> None:
+    exact, _ = model([0] * 4, apart=False, sigma_time_offset_us=None)
+    assert exact.state.simultaneous
+    assert not times_may_vary(exact)
+    declared, _ = model([0] * 4, apart=False)
+    assert times_may_vary(declared)
+    np.testing.assert_allclose(time_prior(declared, mean_varies=False).sigma_s, 0.005)
