@@ -99,8 +99,8 @@ def _numbers_in_another_form(document: Any) -> list[FieldProblem]:
         return []
     problems = []
     version = document.get("version", 1)
-    if version == 1 and type(version) is not int:
-        problems.append(FieldProblem("version", f"must be the integer 1, is {json.dumps(version)}"))
+    if version in (1, 2) and type(version) is not int:
+        problems.append(FieldProblem("version", f"must be the integer 1 or 2, is {json.dumps(version)}"))
     label_map = document.get("label_map")
     ids = label_map.get("ids") if isinstance(label_map, dict) else None
     for key in ids if isinstance(ids, dict) else ():

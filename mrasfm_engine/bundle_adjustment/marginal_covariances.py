@@ -125,7 +125,7 @@ def _with_scale(problem: Problem, state: State, eliminated: Eliminated, cameras:
 
 
 def _with_readouts_as_declared(
-    problem: Problem, columns: Floats, joint: Floats, free: Ints
+    problem: Problem, columns: Floats, covariance: Floats, free: Ints
 ) -> tuple[Floats, Floats, Floats]:
     """Columns and covariance as `_with_scale` has them where readouts vary, for readouts that stay as they are.
 
@@ -133,17 +133,17 @@ def _with_readouts_as_declared(
     Bierman, Factorization Methods for Discrete Sequential Estimation, 1977]: rows of another time pass for one.
     """
     dof = problem.layout.camera_dof
-    of_readouts = np.zeros_like(joint)
+    of_readouts = np.zeros_like(covariance)
     at = np.flatnonzero(free % dof == READOUT) if problem.layout.free_readouts.any() else np.zeros(0, dtype=np.int64)
     if not len(at):
-        return columns, joint, of_readouts
+        return columns, covariance, of_readouts
     known = next(term for term in problem.terms if isinstance(term, ReadoutPrior))
-    gain = joint[:, at] @ np.linalg.inv(joint[np.ix_(at, at)])
+    gain = covariance[:, at] @ np.linalg.inv(covariance[np.ix_(at, at)])
     times = np.flatnonzero(free % dof == TIME)
     of_readouts[np.ix_(times, times)] = known.sigma_s**2 * gain[times] @ gain[times].T
-    columns, joint = columns - columns[:, at] @ gain.T, joint - gain @ joint[at]
-    columns[:, at] = joint[at] = joint[:, at] = 0.0
-    return columns, joint, of_readouts
+    columns, covariance = columns - columns[:, at] @ gain.T, covariance - gain @ covariance[at]
+    columns[:, at] = covariance[at] = covariance[:, at] = 0.0
+    return columns, covariance, of_readouts
 
 
 def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:

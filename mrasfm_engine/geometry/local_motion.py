@@ -122,7 +122,7 @@ def local_motion(world_from_rig: Floats, time_s: Floats, known: Bools) -> LocalM
 
 
 def third_differences(world_from_rig: Floats, time_s: Floats, motion: LocalMotion) -> Floats:
-    """What a parabola leaves out, (u, 6): the vehicle is t (t - a) (t - b) times that from where `motion` says.
+    """Remainder (u, 6) that a parabola leaves: the vehicle is t (t - a) (t - b) times that from where `motion` says.
 
     It is the mean of the divided differences with the units beyond the neighbours at a and b; zero at the drive's ends.
     """

@@ -228,7 +228,7 @@ class RigMotion:
         return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
 
     def _offset_s(self, state: State, rows: Ints) -> Floats:
-        """When row bands were taken, from their units' timestamps on."""
+        """Times (seconds) at which row bands were taken, from their units' timestamps on."""
         result: Floats = self.bands.time_offset_s[rows] + state.camera_time_offset_s[self.bands.camera[rows]]
         return result
 

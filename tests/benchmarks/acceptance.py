@@ -24,6 +24,7 @@
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
 | 21 | real drives with poorer receivers than theirs, and with cameras left out |
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
+| 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -64,6 +65,7 @@ from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.sigmas import halves, simulated
+from tests.benchmarks.simulated_routes import simulated_routes
 from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
@@ -106,6 +108,7 @@ LINES = {
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
     "21": Line(untimed=(receivers,)),
     "22": Line(timed=(surround_peers,)),
+    "23": Line(untimed=(simulated_routes,)),
 }
 
 

@@ -16,8 +16,9 @@ from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.pair_selection import pairs_from_window
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.registry import load_components
+from tests.benchmarks.colmap import THREADS
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
-from tests.benchmarks.real_drives import THREADS, imported, reconstructed
+from tests.benchmarks.real_drives import imported, reconstructed
 from tests.benchmarks.table import Figure, exactly
 
 IMAGES = 102

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
+from mrasfm_engine.benchmark.baselines import Baseline
 from mrasfm_engine.evaluation.cameras import compare_camera_poses
 from mrasfm_engine.io.read_scene import read_poses
-from mrasfm_engine.io.trajectory_file import read_tum
+from tests.benchmarks.colmap import beside_colmap
 from tests.benchmarks.commands import evaluate, mrasfm
 from tests.benchmarks.table import Figure, exactly
-
-THREADS = os.cpu_count() or 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +113,6 @@ def _baselines(data: Path, work: Path) -> Iterator[Figure]:
     """COLMAP on the matches of kitti06 without GNSS, for comparison."""
     drive = imported(data, "kitti06", work)
     scene = reconstructed(drive, work / "kitti06 without GNSS", "--no-gnss")
-    truth = read_tum(drive / "truth.tum").world_from_rig
     for mapper in (Baseline.GLOBAL, Baseline.GLOBAL_FIXED_CALIBRATION, Baseline.INCREMENTAL_FIXED_CALIBRATION):
-        result = run_baseline(scene / "features.db", mapper, threads=THREADS)
-        title = f"kitti06 without GNSS, COLMAP {mapper}"
-        yield Figure(line="1", what=f"{title}: mapping", value=result.seconds, unit="s", remark=result.failure)
-        yield Figure(line="1", what=f"{title}: images registered", value=result.registered_images)
-        errors = result.errors(truth)
-        if errors is not None:
-            yield Figure(line="1", what=f"{title}: metric RMSE", value=errors.metric_rmse_m, unit="m")
-            yield Figure(line="1", what=f"{title}: similarity RMSE", value=errors.similarity_rmse_m, unit="m")
+        figures, _ = beside_colmap("1", "kitti06 without GNSS", mapper, scene=scene, drive=drive)
+        yield from figures

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -15,13 +16,14 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_rigid
 from mrasfm_engine.io.read_scene import read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
-from mrasfm_engine.synthetic.gnss import Origin
 from tests.benchmarks.commands import evaluate, mrasfm
+from tests.benchmarks.positions import Receiver
 from tests.benchmarks.real_drives import DRIVES, imported
 from tests.benchmarks.table import Figure, exactly
 
 SEEDS = 5
-WHITE_M, WANDER_M, WANDER_TIME_S = 0.3, 0.5, 60.0
+WHITE_M, WANDER_M = 0.3, 0.5
+WANDERING = Receiver(white_m=WHITE_M, wander_m=WANDER_M, declared_m=math.hypot(WHITE_M, WANDER_M))
 EVERY, POOR_M = 5, 1.0
 METRES_A_DEGREE = 111_320.0
 
@@ -93,37 +95,13 @@ def _edited(drive: Path, copy: Path, edit: Edit) -> Path:
 def _wander(drive: Path, seed: int) -> Edit:
     """Positions of the rig's origin with white noise and a Gauss-Markov error."""
     truth = read_tum(drive / "truth.tum")
-    rng = np.random.default_rng(seed)
     # The truth's first pose may be tilted: the receiver's frame stands upright.
     up = truth.world_from_rig[:, :3, 2].mean(0)
-    level = se3.exp_so3(np.cross(up, [0.0, 0.0, 1.0]))
-    position_m = truth.world_from_rig[:, :3, 3] @ level.T
-    position_m += rng.normal(0, WHITE_M, position_m.shape)
-    error_m = rng.normal(0, WANDER_M, 3)
-    for i, elapsed_s in enumerate(np.diff(truth.timestamps_us, prepend=truth.timestamps_us[0]) / 1e6):
-        kept = np.exp(-elapsed_s / WANDER_TIME_S)
-        error_m = kept * error_m + rng.normal(0, WANDER_M, 3) * np.sqrt(1.0 - kept**2)
-        position_m[i] += error_m
-    sigma_m = float(np.hypot(WHITE_M, WANDER_M))
+    position_m = truth.world_from_rig[:, :3, 3] @ se3.exp_so3(np.cross(up, [0.0, 0.0, 1.0])).T
 
     def edit(manifest: dict[str, Any]) -> None:
-        manifest["gnss"] = {
-            "height_datum": "ellipsoidal",
-            "antenna_in_rig_m": [0.0, 0.0, 0.0],
-            "samples": [
-                {
-                    "timestamp_us": int(time_us),
-                    "latitude_deg": latitude,
-                    "longitude_deg": longitude,
-                    "height_m": height,
-                    "sigma_horizontal_m": sigma_m,
-                    "sigma_vertical_m": sigma_m,
-                }
-                for time_us, (latitude, longitude, height) in zip(
-                    truth.timestamps_us, Origin().geodetic(position_m).tolist(), strict=True
-                )
-            ],
-        }
+        rng = np.random.default_rng(seed)
+        manifest["gnss"] = WANDERING.gnss(truth.timestamps_us, position_m, np.zeros(3), rng)
 
     return edit
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
-from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.benchmark.baselines import Baseline
 from mrasfm_engine.preflight.drive_reader import read_drive
+from tests.benchmarks.colmap import beside_colmap
 from tests.benchmarks.commands import evaluate
 from tests.benchmarks.real_drives import DRIVES, imported, reconstructed
 from tests.benchmarks.table import Figure, exactly
@@ -31,20 +30,12 @@ def surround_peers(data: Path, work: Path) -> Iterator[Figure]:
     ours, theirs = (_median_error_px(folder) for folder in (scene, with_gnss))
     yield Figure(line="22", what=f"{NAME} without GNSS: images' reprojection errors, median", value=ours, unit="px")
     yield Figure(line="22", what=f"{NAME}: the same with GNSS, of that", value=theirs / ours, most=MAX_GROWTH)
-    truth = read_tum(drive / "truth.tum").world_from_rig
     units = {image.file: image.unit for image in read_drive(drive).images}
     best_m = np.inf
     for mapper in Baseline:
-        result = run_baseline(scene / "features.db", mapper, unit_of_image=units, threads=os.cpu_count() or 1)
-        title = f"{NAME}, COLMAP {mapper}"
-        yield Figure(line="22", what=f"{title}: mapping", value=result.seconds, unit="s", remark=result.failure)
-        found = result.errors(truth)
-        if found is not None:
-            remark = f"{result.registered_images} images, {found.metric_rmse_m:.3f} m metric"
-            yield Figure(
-                line="22", what=f"{title}: similarity RMSE", value=found.similarity_rmse_m, unit="m", remark=remark
-            )
-            best_m = min(best_m, found.similarity_rmse_m)
+        figures, rmse_m = beside_colmap("22", NAME, mapper, scene=scene, drive=drive, unit_of_image=units)
+        yield from figures
+        best_m = min(best_m, rmse_m)
     yield Figure(
         line="22",
         what=f"{NAME} without GNSS: similarity RMSE, at most the best of COLMAP's",

@@ -14,17 +14,17 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
-from mrasfm_engine.synthetic.gnss import Origin
 from mrasfm_engine.types import Floats
 from schemas import Pose
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.positions import Receiver
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure, exactly
 
 TURNED = 1  # of the rig's two cameras
 PITCH_DEG = 1.0
 FOCAL, SIGMA_FOCAL = 1.01, 0.02
-RTK_SIGMA_M = 0.02
+RTK = Receiver(white_m=0.02, declared_m=0.02)
 ARM_M = np.array([0.5, 0.1, 1.5])
 
 Edit = Callable[[dict[str, Any]], None]
@@ -97,28 +97,12 @@ def _long_focal_lengths(manifest: dict[str, Any]) -> None:
 
 def _rtk(drive: Path) -> Edit:
     """A receiver of white noise of 2 cm, declared so."""
-    truth = read_tum(drive / "truth.tum").world_from_rig
-    rng = np.random.default_rng(1)
+    truth = read_tum(drive / "truth.tum")
     # The truth's frame is the first vehicle's: forward is east, left is north.
-    antenna_m = se3.apply(truth, ARM_M[None])[:, 0] + RTK_SIGMA_M * rng.normal(size=(len(truth), 3))
-    places = Origin().geodetic(antenna_m)
+    antenna_m = se3.apply(truth.world_from_rig, ARM_M[None])[:, 0]
 
     def edit(manifest: dict[str, Any]) -> None:
-        manifest["gnss"] = {
-            "height_datum": "ellipsoidal",
-            "antenna_in_rig_m": ARM_M.tolist(),
-            "samples": [
-                {
-                    "timestamp_us": frame["timestamp_us"],
-                    "latitude_deg": latitude,
-                    "longitude_deg": longitude,
-                    "height_m": height,
-                    "sigma_horizontal_m": RTK_SIGMA_M,
-                    "sigma_vertical_m": RTK_SIGMA_M,
-                }
-                for frame, (latitude, longitude, height) in zip(manifest["frames"], places.tolist(), strict=True)
-            ],
-        }
+        manifest["gnss"] = RTK.gnss(truth.timestamps_us, antenna_m, ARM_M, np.random.default_rng(1))
 
     return edit
 

@@ -164,9 +164,10 @@ MANIFESTS: dict[str, tuple[bytes, str]] = {
     "leaves the drive": (with_manifest(set_in("frames", 0, "images", "front", "file", "../x.png")), "relative path"),
     "absolute": (with_manifest(set_in("frames", 0, "images", "front", "file", "/x.png")), "relative path"),
     "foreign camera": (with_manifest(set_in("frames", 0, "images", "left", {"file": "x.png"})), "left"),
-    "version": (with_manifest(set_in("version", 2)), "version"),
-    "version true": (with_manifest(set_in("version", True)), "version: must be the integer 1, is true"),
-    "version 1.0": (with_manifest(set_in("version", 1.0)), "version: must be the integer 1, is 1.0"),
+    "version": (with_manifest(set_in("version", 3)), "version"),
+    "version true": (with_manifest(set_in("version", True)), "version: must be the integer 1 or 2, is true"),
+    "version 1.0": (with_manifest(set_in("version", 1.0)), "version: must be the integer 1 or 2, is 1.0"),
+    "version 2.0": (with_manifest(set_in("version", 2.0)), "version: must be the integer 1 or 2, is 2.0"),
     "names differ in case": (
         with_manifest(set_in("frames", 0, "images", "rear", "file", NAME.upper())),
         "one file with",

@@ -214,7 +214,9 @@ def test_a_pose_that_was_written_reads_back_as_it_was() -> None:
 def test_a_version_that_only_equals_one(example: dict[str, Any], version: object) -> None:
     """A new drive is refused, and one that was accepted before is read."""
     example["version"] = version
-    with pytest.raises(DocumentError, match=f"version: must be the integer 1, is {json.dumps(version)}") as refused:
+    with pytest.raises(
+        DocumentError, match=f"version: must be the integer 1 or 2, is {json.dumps(version)}"
+    ) as refused:
         parse_new_manifest(encoded(example))
     assert [problem.path for problem in refused.value.problems] == ["version"]
     read = parse_manifest(encoded(example)).version
