@@ -85,10 +85,10 @@ def _regular_marginals(
     eliminated = system.eliminate(unseen.astype(np.float64))
     if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
         return None
-    units, cameras = eliminated.inverse()
+    units, border = eliminated.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    columns, joint = _with_scale(problem, state, eliminated, cameras)
+    columns, joint = _with_scale(problem, state, eliminated, border)
     columns, joint, of_readouts = _with_readouts_as_declared(problem, columns, joint, eliminated.free)
     cameras = joint[:-1, :-1]
     if shared_errors:
@@ -112,15 +112,18 @@ def _regular_marginals(
     )
 
 
-def _with_scale(problem: Problem, state: State, eliminated: Eliminated, cameras: Floats) -> tuple[Floats, Floats]:
-    """Columns (n, f + 1) of the inverse for the cameras' unknowns that vary and the scale, and their covariance."""
+def _with_scale(problem: Problem, state: State, eliminated: Eliminated, border: Floats) -> tuple[Floats, Floats]:
+    """Columns (n, f + 1) of the inverse for the cameras' unknowns that vary and the scale, and their covariance.
+
+    `border` is the inverse's part of these unknowns, and after them of those of the terms.
+    """
     split, free = UNIT_DOF * problem.layout.num_units, UNIT_DOF * problem.layout.num_units + eliminated.free
     functional = _scale_functional(state.unit_position_m[problem.layout.unit_slot >= 0])
-    along = cameras @ (eliminated.coupled.T @ functional)
-    columns = np.zeros((problem.layout.size, len(free) + 1))  # of the inverse
-    columns[:split, :-1], columns[free, :-1] = -eliminated.coupled @ cameras, cameras
-    columns[:split, -1], columns[free, -1] = eliminated.units_of(functional) + eliminated.coupled @ along, -along
-    joint = np.block([[cameras, -along[:, None]], [-along, functional @ columns[:split, -1]]])
+    along, f = border @ (eliminated.coupled.T @ functional), len(free)
+    columns = np.zeros((problem.layout.size, f + 1))  # of the inverse
+    columns[:split, :-1], columns[free, :-1] = -eliminated.coupled @ border[:, :f], border[:f, :f]
+    columns[:split, -1], columns[free, -1] = eliminated.units_of(functional) + eliminated.coupled @ along, -along[:f]
+    joint = np.block([[border[:f, :f], -along[:f, None]], [-along[:f], functional @ columns[:split, -1]]])
     return columns, joint
 
 

@@ -11,11 +11,14 @@ cameras. With Z = A^-1 B' and z = A^-1 gu
     (C - B Z) dc = B z - gc          du = -z - Z dc
 
 and in the inverse, the units' part is A^-1 + Z (C - B Z)^-1 Z', the cameras' part (C - B Z)^-1.
+
+Terms may have unknowns of their own that are at their best for every value of the others (a receiver's wandering
+error). These widen the border: they are solved for, have no gradient, and are no part of the reduced vector.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
@@ -29,12 +32,41 @@ TINY = 1e-12  # damps what nothing observes
 
 
 @dataclass(frozen=True, kw_only=True)
+class Auxiliary:
+    """Unknowns of the terms themselves, which are at their best."""
+
+    coupling: Floats  # (6 units, x) with the units
+    square: Floats  # (x, x) of their own
+
+    @staticmethod
+    def none(layout: Layout) -> Auxiliary:
+        """No unknowns."""
+        return Auxiliary(coupling=np.zeros((UNIT_DOF * layout.num_units, 0)), square=np.zeros((0, 0)))
+
+    def eliminated(self, coupling: Floats) -> Floats:
+        """What is lost of the information (m, m) on others that are coupled (m, x) with them."""
+        if not len(self.square):
+            return np.zeros((len(coupling), len(coupling)))
+        factor = scipy.linalg.cho_factor(self.square, lower=True, check_finite=False)
+        result: Floats = coupling @ scipy.linalg.cho_solve(factor, coupling.T, check_finite=False)
+        return result
+
+
+@dataclass(kw_only=True)
 class Extra:
     """Sums of the terms that are not image observations: one block per unit, and the cameras' square."""
 
     units: Floats  # (units, 6, 6)
     cameras: Floats  # (d cameras, d cameras), d the layout's camera_dof
     gradient: Floats  # (n,)
+    auxiliary: Auxiliary
+
+    def add_auxiliary(self, coupling: Floats, square: Floats) -> None:
+        """Add unknowns (x,) of a term, with their coupling (6 units, x) and their own matrix (x, x)."""
+        self.auxiliary = Auxiliary(
+            coupling=np.concatenate([self.auxiliary.coupling, coupling], axis=1),
+            square=scipy.linalg.block_diag(self.auxiliary.square, square),
+        )
 
     @property
     def unit_gradient(self) -> Floats:
@@ -49,7 +81,10 @@ class Extra:
     @property
     def matrix(self) -> Floats:
         """All of it (n, n), for small problems."""
-        return scipy.linalg.block_diag(*self.units, self.cameras)
+        result: Floats = scipy.linalg.block_diag(*self.units, self.cameras)
+        split = UNIT_DOF * len(self.units)
+        result[:split, :split] -= self.auxiliary.eliminated(self.auxiliary.coupling)
+        return result
 
     @staticmethod
     def none(layout: Layout) -> Extra:
@@ -58,6 +93,7 @@ class Extra:
             units=np.zeros((layout.num_units, UNIT_DOF, UNIT_DOF)),
             cameras=np.zeros((layout.camera_dof * layout.num_cameras,) * 2),
             gradient=np.zeros(layout.size),
+            auxiliary=Auxiliary.none(layout),
         )
 
 
@@ -74,6 +110,7 @@ class ReducedCameraSystem:
     gradient: Floats  # (n,)
     v_inverse: Floats  # (p, 6)
     v_gradient: Floats  # (p, 3)
+    auxiliary: Auxiliary
 
     @staticmethod
     def from_sums(
@@ -107,6 +144,7 @@ class ReducedCameraSystem:
             gradient=gradient + extra.gradient,
             v_inverse=points[0],
             v_gradient=points[1],
+            auxiliary=extra.auxiliary,
         )
 
     @property
@@ -119,6 +157,7 @@ class ReducedCameraSystem:
         columns = (UNIT_DOF * self.structure.pattern.column_of_block())[:, None, None] + steps[None, :]
         result[rows, columns] = self.units
         result[columns, rows] = self.units
+        result[:split, :split] -= self.auxiliary.eliminated(self.auxiliary.coupling)
         result[split:, :split] = self._border_rows()
         result[:split, split:] = result[split:, :split].T
         result[split:, split:] = self.cameras
@@ -144,10 +183,11 @@ class ReducedCameraSystem:
         step = np.zeros(len(self.gradient))
         step[:split] = -solved.units_of(self.gradient[:split])
         if solved.cameras is not None:
-            right = -self.gradient[split:][solved.free] - solved.border @ step[:split]
-            cameras = scipy.linalg.cho_solve(solved.cameras, right, check_finite=False)
-            step[split:][solved.free] = cameras
-            step[:split] -= solved.coupled @ cameras
+            right = np.zeros(len(solved.border))
+            right[: len(solved.free)] = -self.gradient[split:][solved.free]
+            border = scipy.linalg.cho_solve(solved.cameras, right - solved.border @ step[:split], check_finite=False)
+            step[split:][solved.free] = border[: len(solved.free)]
+            step[:split] -= solved.coupled @ border
         return step if np.isfinite(step).all() else None
 
     def eliminate(self, damped: Floats) -> Eliminated | None:
@@ -162,12 +202,12 @@ class ReducedCameraSystem:
         if factor is None:
             return None
         free = np.setdiff1d(np.arange(layout.camera_dof * layout.num_cameras), layout.held() - split)
-        border = self._border_rows()[free]
+        border = np.concatenate([self._border_rows()[free], self.auxiliary.coupling.T])
         coupled = factor.solve(np.ascontiguousarray(border.T))
-        square = self.cameras[np.ix_(free, free)] - border @ coupled
-        square[np.diag_indices(len(free))] += damped[split:][free]
+        own = self.cameras[np.ix_(free, free)] + np.diag(damped[split:][free])
+        square = scipy.linalg.block_diag(own, self.auxiliary.square) - border @ coupled
         try:
-            cameras = scipy.linalg.cho_factor(square, lower=True, check_finite=False) if len(free) else None
+            cameras = scipy.linalg.cho_factor(square, lower=True, check_finite=False) if len(square) else None
         except np.linalg.LinAlgError:
             return None
         return Eliminated(factor=factor, free=free, border=border, coupled=coupled, cameras=cameras)
@@ -178,10 +218,10 @@ class Eliminated:
     """A reduced system whose units are eliminated too."""
 
     factor: BlockFactor
-    free: Ints  # (f,) of the cameras' unknowns
-    border: Floats  # (f, 6 units) B
-    coupled: Floats  # (6 units, f) A^-1 B'
-    cameras: tuple[Floats, bool] | None  # Cholesky factor of C - B A^-1 B', where cameras are free
+    free: Ints  # (f,) of the cameras' unknowns; after them, the border has those x of the terms
+    border: Floats  # (f + x, 6 units) B
+    coupled: Floats  # (6 units, f + x) A^-1 B'
+    cameras: tuple[Floats, bool] | None  # Cholesky factor of C - B A^-1 B', where the border has unknowns
 
     def units_of(self, right: Floats) -> Floats:
         """A^-1 (6 units,) of a right-hand side."""
@@ -195,14 +235,15 @@ class Eliminated:
         smallest = float(pivots.min(initial=np.inf))
         if self.cameras is not None:
             own = np.where(replaced, 1.0, diagonal)[split:][self.free]
+            own = np.concatenate([own, np.diagonal(system.auxiliary.square)])
             smallest = min(smallest, float((np.diagonal(self.cameras[0]) ** 2 / own).min()))
         return smallest
 
     def inverse(self) -> tuple[Floats, Floats]:
-        """Diagonal blocks (units, 6, 6) of the units and the cameras' part (f, f) of the whole matrix's inverse."""
+        """Diagonal blocks (units, 6, 6) of the units and the border's part (f + x, f + x) of the matrix's inverse."""
         units = self.factor.inverse_diagonal()
         if self.cameras is None:
             return units, np.zeros((0, 0))
-        cameras = scipy.linalg.cho_solve(self.cameras, np.eye(len(self.free)))
-        coupled = self.coupled.reshape(-1, UNIT_DOF, len(self.free))
-        return units + coupled @ cameras @ np.swapaxes(coupled, 1, 2), cameras
+        border = scipy.linalg.cho_solve(self.cameras, np.eye(len(self.border)))
+        coupled = self.coupled.reshape(-1, UNIT_DOF, len(self.border))
+        return units + coupled @ border @ np.swapaxes(coupled, 1, 2), border

@@ -58,7 +58,8 @@ def _of_terms(problem: Problem, state: State, columns: Floats) -> Floats:
     extra = Extra.none(problem.layout)
     for term in problem.terms:
         term.add_to(state, problem.layout, extra)
-    units = columns[: UNIT_DOF * problem.layout.num_units].reshape(-1, UNIT_DOF, columns.shape[1])
-    cameras = columns[UNIT_DOF * problem.layout.num_units :]
+    split = UNIT_DOF * problem.layout.num_units
+    units, cameras = columns[:split].reshape(-1, UNIT_DOF, columns.shape[1]), columns[split:]
     result: Floats = np.einsum("uik,uij,ujl->kl", units, extra.units, units, optimize=True)
+    result = result - extra.auxiliary.eliminated(columns[:split].T @ extra.auxiliary.coupling)
     return result + cameras.T @ extra.cameras @ cameras

@@ -10,6 +10,7 @@ written for a turn omega of that pose, R <- exp(omega) R, and its translation.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,6 +21,7 @@ import pyceres
 from numpy.typing import NDArray
 
 from mrasfm_engine.bundle_adjustment import priors
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ class Residuals:
     count: int
     blocks: list[Floats] = field(default_factory=list)  # what Ceres varies
     loss_scale: float | None = None  # of a Cauchy loss of them as a whole; squares without
+    states: list[Floats] = field(default_factory=list)  # blocks of the terms themselves, after those of the problem
 
 
 def add_terms(handed: CeresProblem, problem: pyceres.Problem) -> list[object]:
@@ -59,8 +62,8 @@ def add_terms(handed: CeresProblem, problem: pyceres.Problem) -> list[object]:
             raise ValueError("a term is on a unit or camera that no image observes: COLMAP does not vary it")
         cost = _Cost(residuals, sigma_px)
         loss = None if residuals.loss_scale is None else pyceres.CauchyLoss(residuals.loss_scale * sigma_px)
-        problem.add_residual_block(cost, loss, residuals.blocks)
-        kept += [cost, loss]
+        problem.add_residual_block(cost, loss, residuals.blocks + residuals.states)
+        kept += [cost, loss, *residuals.states]
     return kept
 
 
@@ -70,7 +73,7 @@ class _Cost(pyceres.CostFunction):
     def __init__(self, residuals: Residuals, scale: float) -> None:
         super().__init__()
         self.set_num_residuals(residuals.count)
-        self.set_parameter_block_sizes([len(block) for block in residuals.blocks])
+        self.set_parameter_block_sizes([len(block) for block in residuals.blocks + residuals.states])
         self.function, self.scale = residuals.function, scale
 
     def Evaluate(self, blocks: list[Floats], residuals: Floats, jacobians: list[Floats] | None) -> bool:
@@ -105,6 +108,8 @@ def _residuals(term: priors.Term, handed: CeresProblem) -> Iterator[Residuals]:
             return _positions(term, handed)
         case priors.UprightPrior():
             return _upright(term, handed)
+        case ReceiverPositions():
+            return _receiver(term, handed)
     raise ValueError(f"no residuals of Ceres' are known for a {type(term).__name__}")
 
 
@@ -130,6 +135,42 @@ def _position(blocks: list[Floats], *, antenna: Floats, measured: Floats, sigma:
     off = rotation.T @ (antenna - translation) - measured
     derivative = np.column_stack([rotation.T @ se3.skew(antenna - translation), -rotation.T])
     return off / sigma, [derivative / sigma[:, None]]
+
+
+def _receiver(term: ReceiverPositions, handed: CeresProblem) -> Iterator[Residuals]:
+    """(antenna - measured - wander d) / sigma, and the steps of the Gauss-Markov process d from knot to knot."""
+    states = [np.zeros(3) for _ in term.knots_s]
+    yield Residuals(function=lambda blocks: (blocks[0], [np.eye(3)]), count=3, states=[states[0]])
+    for k, (before, after) in enumerate(itertools.pairwise(term.knots_s.tolist())):
+        kept = float(np.exp((before - after) / term.wander_time_s))
+        yield Residuals(function=partial(_process_step, kept=kept), count=3, states=[states[k], states[k + 1]])
+    for n, u in enumerate(term.unit.tolist()):
+        k = min(int(np.searchsorted(term.knots_s, term.time_s[n], side="right")) - 1, len(states) - 2)
+        share = (term.time_s[n] - term.knots_s[k]) / (term.knots_s[k + 1] - term.knots_s[k])
+        antenna = se3.apply(handed.reference_from_unit[u], term.lever_arm_m[None])[0]
+        yield Residuals(
+            function=partial(
+                _received,
+                position=partial(_position, antenna=antenna, measured=term.position_m[n], sigma=term.sigma_m[n]),
+                gain=term.wander_m[n] / term.sigma_m[n],
+                share=float(share),
+            ),
+            count=3,
+            blocks=[handed.unit_pose(u)],
+            states=[states[k], states[k + 1]],
+            loss_scale=term.loss_scale,
+        )
+
+
+def _process_step(blocks: list[Floats], *, kept: float) -> tuple[Floats, list[Floats]]:
+    lost = np.sqrt(1.0 - kept**2)
+    return (blocks[1] - kept * blocks[0]) / lost, [-kept / lost * np.eye(3), np.eye(3) / lost]
+
+
+def _received(blocks: list[Floats], *, position: Function, gain: Floats, share: float) -> tuple[Floats, list[Floats]]:
+    off, by_pose = position(blocks[:1])
+    wander = gain * ((1.0 - share) * blocks[1] + share * blocks[2])
+    return off - wander, [*by_pose, -np.diag((1.0 - share) * gain), -np.diag(share * gain)]
 
 
 def _upright(term: priors.UprightPrior, handed: CeresProblem) -> Iterator[Residuals]:

@@ -1,0 +1,226 @@
+"""Positions of a receiver whose error wanders: the error is a state of the adjustment, eliminated within the term.
+
+A receiver's error has a part that differs from sample to sample, and a part that stays for about a minute (orbits,
+troposphere, multipath, the receiver's own filter). The second is a Gauss-Markov process: over a drive much shorter than
+its correlation time it is a constant error with a random walk. With d its value at knots in time, in units of its
+standard deviation, the term costs
+
+    min over d of  sum of rho(|e|^2) + d' P d        e = (t + R lever - measured - wander A d) / sigma
+
+where A interpolates linearly between knots and P is the precision of the process, which is tridiagonal. Its
+derivatives in the poses are those of e at the best d. Its Gauss-Newton matrix is J'WJ - G M^-1 G' with G = -J'W D,
+M = P + D'WD and D = wander A / sigma: the Schur complement of d, which `Extra.add_auxiliary` takes as G and M.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.state import State
+from mrasfm_engine.types import Floats, Ints
+
+AXES = 3
+MAX_KNOTS = 64  # of a drive: the width that they add to the reduced system is three times that
+MAX_REWEIGHTINGS = 30  # of the loss for one value of the poses
+SAME_WEIGHTS = 1e-7
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReceiverPositions:
+    """Measured positions of a point of the vehicle (antenna, or the rig's origin), with a Cauchy loss.
+
+    Use `from_samples`: between knots the process is not what is interpolated, which sigmas have to cover.
+    """
+
+    unit: Ints  # (n,) units that have a measurement, each at most once
+    position_m: Floats  # (n, 3) in the world frame
+    sigma_m: Floats  # (n, 3) of the independent part of their errors
+    wander_m: Floats  # (n, 3) standard deviations of the wandering part; 0 where there is none
+    lever_arm_m: Floats  # (3,) in the rig frame
+    time_s: Floats  # (n,)
+    knots_s: Floats  # (k,) ascending
+    wander_time_s: float  # correlation time of the wandering part
+    loss_scale: float = 3.0
+
+    @staticmethod
+    def from_samples(
+        *,
+        unit: Ints,
+        time_s: Floats,
+        position_m: Floats,
+        white_m: Floats,
+        wander_m: Floats,
+        lever_arm_m: Floats,
+        wander_time_s: float,
+        least_spacing_s: float,
+    ) -> ReceiverPositions:
+        """The term of samples (n,) with independent and wandering errors (n, 3), with knots where they are needed.
+
+        Knots are `least_spacing_s` apart, farther on drives that would need more than `MAX_KNOTS`. What the process
+        does between two of them counts as an error that the samples between them share.
+        """
+        span_s = float(np.ptp(time_s)) if len(time_s) else 0.0
+        spacing_s = max(least_spacing_s, span_s / (MAX_KNOTS - 1))
+        count = 1 + int(np.ceil(span_s / spacing_s - 1e-9))
+        first_s = float(time_s.min(initial=np.inf)) if len(time_s) else 0.0
+        knots_s = first_s + spacing_s * np.arange(count)
+        # Variance half way between knots of unit variance, given both; samples share it while they are alike.
+        half = np.exp(-0.5 * spacing_s / wander_time_s)
+        between = max(0.0, 1.0 + 0.5 * (1.0 + half**2) - 2.0 * half) if count > 1 else 0.0
+        step_s = span_s / max(len(time_s) - 1, 1)
+        sharing = max(1.0, min(spacing_s, 2.0 * wander_time_s) / step_s) if step_s > 0 else 1.0
+        return ReceiverPositions(
+            unit=unit,
+            position_m=position_m,
+            sigma_m=np.sqrt(white_m**2 + sharing * between * wander_m**2),
+            wander_m=wander_m,
+            lever_arm_m=lever_arm_m,
+            time_s=time_s,
+            knots_s=knots_s,
+            wander_time_s=wander_time_s,
+        )
+
+    def of_rows(self, rows: Ints, unit: Ints, share: Floats) -> ReceiverPositions:
+        """Some samples (m,), on other units (m,), with sigmas of their independent part times `share` (m,)."""
+        return replace(
+            self,
+            unit=unit,
+            position_m=self.position_m[rows],
+            sigma_m=self.sigma_m[rows] * share[:, None],
+            wander_m=self.wander_m[rows],
+            time_s=self.time_s[rows],
+        )
+
+    @cached_property
+    def _places(self) -> tuple[Ints, Ints, Floats]:
+        """Knots (n,) before and after every sample, and the second's share (n,)."""
+        last = len(self.knots_s) - 1
+        before = np.clip(np.searchsorted(self.knots_s, self.time_s, side="right") - 1, 0, max(last - 1, 0))
+        after = np.minimum(before + 1, last)
+        length = np.where(after > before, self.knots_s[after] - self.knots_s[before], 1.0)
+        share = np.clip((self.time_s - self.knots_s[before]) / length, 0.0, 1.0) * (after > before)
+        return before, after, share
+
+    @cached_property
+    def _precision(self) -> Floats:
+        """The process' precision (2, k): its superdiagonal, whose first entry is unused, and its diagonal."""
+        alike = np.exp(-np.diff(self.knots_s) / self.wander_time_s)
+        lost = np.maximum(1.0 - alike**2, 1e-12)
+        diagonal = np.concatenate([[1.0], 1.0 / lost]) + np.concatenate([alike**2 / lost, [0.0]])
+        return np.stack([np.concatenate([[0.0], -alike / lost]), diagonal])
+
+    @cached_property
+    def _gain(self) -> Floats:
+        """Wandering part over the independent one (n, 3)."""
+        return self.wander_m / self.sigma_m
+
+    def _by_knots(self, weights: Floats, axis: int) -> Floats:
+        """M (2, k) of one axis, as `_precision` has it."""
+        before, after, share = self._places
+        weighted, count = weights * self._gain[:, axis] ** 2, len(self.knots_s)
+        diagonal = np.bincount(before, weighted * (1.0 - share) ** 2, minlength=count)
+        diagonal += np.bincount(after, weighted * share**2, minlength=count)
+        off = np.bincount(after, weighted * share * (1.0 - share), minlength=count)
+        result: Floats = self._precision + np.stack([off, diagonal])
+        return result
+
+    def _at_knots(self, values: Floats, axis: int) -> Floats:
+        """D' v (k, m) of values (n, m) of one axis."""
+        before, after, share = self._places
+        weighted = values * self._gain[:, axis, None]
+        result = np.zeros((len(self.knots_s), values.shape[1]))
+        np.add.at(result, before, weighted * (1.0 - share)[:, None])
+        np.add.at(result, after, weighted * share[:, None])
+        return result
+
+    def _at_samples(self, states: Floats) -> Floats:
+        """D d (n, 3) of states (k, 3)."""
+        before, after, share = self._places
+        blend = states[before] + share[:, None] * (states[after] - states[before])
+        result: Floats = self._gain * blend
+        return result
+
+    def _whitened(self, state: State) -> tuple[Floats, Floats]:
+        arm = state.unit_rotation[self.unit] @ self.lever_arm_m
+        return arm, (state.unit_position_m[self.unit] + arm - self.position_m) / self.sigma_m
+
+    def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats]:
+        """The states (k, 3) that cost least, residuals (n, 3) and robust weights (n,) with them."""
+        weights, states, residuals = np.ones(len(whitened)), np.zeros((len(self.knots_s), AXES)), whitened
+        for _ in range(MAX_REWEIGHTINGS):
+            for axis in range(AXES):
+                right = self._at_knots((weights * whitened[:, axis])[:, None], axis)
+                states[:, axis] = _solved(self._by_knots(weights, axis), right)[:, 0]
+            residuals = whitened - self._at_samples(states)
+            renewed = 1.0 / (1.0 + (residuals**2).sum(1) / self.loss_scale**2)
+            same = bool((np.abs(renewed - weights) < SAME_WEIGHTS).all())
+            weights = renewed
+            if same:
+                break
+        return states, residuals, weights
+
+    def errors_m(self, state: State) -> Floats:
+        """The wandering part (n, 3) of the measured positions' errors, as the poses of a state let it be seen."""
+        states = self._best(self._whitened(state)[1])[0]
+        result: Floats = -self._at_samples(states) * self.sigma_m
+        return result
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        states, residuals, _ = self._best(self._whitened(state)[1])
+        s2, (off, diagonal) = self.loss_scale**2, self._precision
+        robust = s2 * np.log1p((residuals**2).sum(1) / s2).sum()
+        prior = (diagonal[:, None] * states**2).sum() + 2.0 * (off[1:, None] * states[1:] * states[:-1]).sum()
+        return float(0.5 * (robust + prior))
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        arm, whitened = self._whitened(state)
+        _, r, w = self._best(whitened)
+        # d (R arm) / d omega = -[R arm]x in world axes
+        j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+        j = j / self.sigma_m[:, :, None]
+        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
+        if not len(free):
+            return
+        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
+        np.add.at(extra.units, slots, j_w @ j[free])
+        np.add.at(extra.unit_gradient, slots, (j_w @ r[free, :, None])[:, :, 0])
+        if not self.wander_m.any():
+            return
+        count, (before, after, share) = len(self.knots_s), self._places
+        coupling = np.zeros((layout.num_units, UNIT_DOF, AXES, count))
+        for knot, part in ((before, 1.0 - share), (after, share)):
+            along = -j_w * (self._gain * part[:, None])[free, None, :]  # (f, 6, 3)
+            np.add.at(coupling, (slots, slice(None), slice(None), knot[free]), along)
+        square = np.zeros((AXES * count, AXES * count))
+        for axis in range(AXES):
+            off, diagonal = self._by_knots(w, axis)
+            own = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
+            square[axis * count : (axis + 1) * count, axis * count : (axis + 1) * count] = own
+        extra.add_auxiliary(coupling.reshape(-1, AXES * count), square)
+
+    def information(self, columns: Floats) -> Floats:
+        """Information X' C^-1 X (m, m) on m ways (n, 3, m) in which the antenna may be moved in metres.
+
+        C is the covariance of the positions' errors, with all of them at full weight.
+        """
+        scaled = columns / self.sigma_m[:, :, None]
+        result: Floats = np.einsum("nam,nal->ml", scaled, scaled)
+        for axis in range(AXES):
+            at_knots = self._at_knots(scaled[:, axis], axis)
+            result = result - at_knots.T @ _solved(self._by_knots(np.ones(len(scaled)), axis), at_knots)
+        return result
+
+
+def _solved(tridiagonal: Floats, right: Floats) -> Floats:
+    """Solution (k, m) of a symmetric system, given by its superdiagonal and its diagonal (2, k)."""
+    bands = tridiagonal if tridiagonal.shape[1] > 1 else tridiagonal[1:]
+    return np.asarray(scipy.linalg.solveh_banded(bands, right, check_finite=False))

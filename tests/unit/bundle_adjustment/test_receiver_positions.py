@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from mrasfm_engine.bundle_adjustment.problem import Layout
+from mrasfm_engine.bundle_adjustment.receiver_positions import MAX_KNOTS, ReceiverPositions
+from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.state import State
+
+UNITS, WANDER_TIME_S = 12, 30.0
+ARM_M = np.array([-0.5, 0.3, 1.8])
+
+
+def free_units(fixed: int | None = None) -> Layout:
+    free = np.ones(UNITS, dtype=np.bool_)
+    if fixed is not None:
+        free[fixed] = False
+    return Layout.from_free(free, np.zeros(1, dtype=np.bool_))
+
+
+def moving(rng: np.random.Generator) -> State:
+    return State(
+        unit_rotation=se3.exp_so3(0.2 * rng.normal(size=(UNITS, 3))),
+        unit_position_m=np.cumsum(rng.normal(size=(UNITS, 3)) + [2, 0, 0], axis=0),
+        camera_rotation=np.eye(3)[None],
+        camera_position_m=np.zeros((1, 3)),
+        camera_params=np.ones((1, 8)),
+        points_m=np.zeros((0, 3)),
+        camera_time_offset_s=np.zeros(1),
+    )
+
+
+def received(state: State, rng: np.random.Generator, **changes: object) -> ReceiverPositions:
+    """Positions with errors; a knot at every sample, so that the process is interpolated exactly."""
+    time_s = 2.0 * np.arange(UNITS)
+    term = ReceiverPositions(
+        unit=np.arange(UNITS),
+        position_m=state.unit_position_m + state.unit_rotation @ ARM_M + 0.4 * rng.normal(size=(UNITS, 3)) + 1.0,
+        sigma_m=rng.uniform(0.1, 0.3, (UNITS, 3)),
+        wander_m=rng.uniform(0.5, 1.0, (UNITS, 3)),
+        lever_arm_m=ARM_M,
+        time_s=time_s,
+        knots_s=time_s,
+        wander_time_s=WANDER_TIME_S,
+    )
+    return replace(term, **changes)  # type: ignore[arg-type]
+
+
+def covariances(term: ReceiverPositions) -> list[np.ndarray]:
+    """Covariance (n, n) of the errors along each axis, as it is defined."""
+    alike = np.exp(-np.abs(term.time_s[:, None] - term.time_s) / WANDER_TIME_S)
+    return [
+        np.diag(term.sigma_m[:, a] ** 2) + np.outer(term.wander_m[:, a], term.wander_m[:, a]) * alike for a in range(3)
+    ]
+
+
+def test_without_outliers_it_costs_what_correlated_errors_do() -> None:
+    rng = np.random.default_rng(0)
+    state = moving(rng)
+    term = received(state, rng, loss_scale=1e6)
+    off_m = state.unit_position_m + state.unit_rotation @ ARM_M - term.position_m
+    expected = 0.5 * sum(off_m[:, a] @ np.linalg.solve(c, off_m[:, a]) for a, c in enumerate(covariances(term)))
+    assert term.cost(state) == pytest.approx(expected, rel=1e-9)
+    # A constant error of some sigmas costs little beside independent ones of the same size.
+    assert term.cost(state) < 0.3 * replace(term, wander_m=0 * term.wander_m).cost(state)
+
+
+@pytest.mark.parametrize("fixed", [None, 4])
+def test_matrix_is_the_information_of_correlated_errors(fixed: int | None) -> None:
+    rng = np.random.default_rng(1)
+    state, layout = moving(rng), free_units(fixed)
+    term = received(state, rng, loss_scale=1e6)
+    extra = Extra.none(layout)
+    term.add_to(state, layout, extra)
+    units = np.flatnonzero(layout.unit_slot >= 0)
+    expected = np.zeros((layout.size, layout.size))
+    for a, covariance in enumerate(covariances(term)):
+        rows = [np.concatenate([-se3.skew(state.unit_rotation[u] @ ARM_M), np.eye(3)], 1)[a] for u in units]
+        jacobian = np.zeros((UNITS, layout.size))
+        jacobian[units] = scipy.linalg.block_diag(*rows)
+        expected += jacobian.T @ np.linalg.solve(covariance, jacobian)
+    np.testing.assert_allclose(extra.matrix, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_gradient_is_that_of_the_cost() -> None:
+    rng = np.random.default_rng(2)
+    state, layout = moving(rng), free_units()
+    term = received(state, rng)
+    term.position_m[3] += [5.0, -3.0, 2.0]
+    extra = Extra.none(layout)
+    term.add_to(state, layout, extra)
+    step = 1e-6
+    for place in range(0, layout.size, 5):
+        costs = []
+        for sign in (-1.0, 1.0):
+            d = np.zeros(layout.size)
+            d[place] = sign * step
+            turn, shift = d.reshape(-1, 6)[:, :3], d.reshape(-1, 6)[:, 3:]
+            moved = replace(
+                state,
+                unit_rotation=se3.exp_so3(turn) @ state.unit_rotation,
+                unit_position_m=state.unit_position_m + shift,
+            )
+            costs.append(term.cost(moved))
+        assert extra.gradient[place] == pytest.approx((costs[1] - costs[0]) / (2 * step), rel=1e-4, abs=1e-4)
+
+
+def test_wrong_position_loses_its_pull_and_does_not_move_the_error() -> None:
+    rng = np.random.default_rng(3)
+    state = moving(rng)
+    term = received(state, rng, sigma_m=np.full((UNITS, 3), 0.3))
+    before_m = term.errors_m(state)
+    term.position_m[5] += [30.0, 0.0, 0.0]
+    changed_m = np.abs(term.errors_m(state) - before_m).max(axis=1)
+    assert changed_m[5] < 0.8  # where its neighbours alone tell now
+    assert np.delete(changed_m, 5).max() < 0.2
+    assert 0.5 < before_m[:, 0].mean() < 1.3  # a metre, which all positions are off by
+
+
+def test_information_on_a_shift_is_that_of_the_error_they_share() -> None:
+    rng = np.random.default_rng(4)
+    state = moving(rng)
+    term = received(state, rng)
+    shift = np.tile(np.eye(3), (UNITS, 1, 1))
+    expected = [np.ones(UNITS) @ np.linalg.solve(c, np.ones(UNITS)) for c in covariances(term)]
+    np.testing.assert_allclose(term.information(shift), np.diag(expected), rtol=1e-8)
+
+
+@pytest.mark.parametrize(("units", "step_s"), [(40, 0.1), (400, 0.1), (600, 1.0)])
+def test_knots_leave_the_information_on_shape_and_place_as_it_is(units: int, step_s: float) -> None:
+    time_s = step_s * np.arange(units)
+    white_m, wander_m = np.full((units, 3), 0.3), np.full((units, 3), 0.5)
+    term = ReceiverPositions.from_samples(
+        unit=np.arange(units), time_s=time_s, position_m=np.zeros((units, 3)), white_m=white_m, wander_m=wander_m,
+        lever_arm_m=np.zeros(3), wander_time_s=60.0, least_spacing_s=1.0,
+    )  # fmt: skip
+    assert 1 <= len(term.knots_s) <= MAX_KNOTS
+    assert term.knots_s[-1] >= time_s[-1]
+    covariance = 0.09 * np.eye(units) + 0.25 * np.exp(-np.abs(time_s[:, None] - time_s) / 60.0)
+    ways = np.stack([np.ones(units), time_s - time_s.mean(), (time_s - time_s.mean()) ** 2], axis=1)
+    columns = np.zeros((units, 3, 3))
+    columns[:, 0] = ways
+    exact = np.linalg.inv(ways.T @ np.linalg.solve(covariance, ways))
+    stated = np.linalg.inv(term.information(columns))
+    ratio = np.sqrt(np.diagonal(stated) / np.diagonal(exact))
+    assert (ratio > 0.97).all()  # never more certain than the samples are
+    assert (ratio < 1.3).all()
+
+
+def test_single_sample_is_a_position_with_both_errors() -> None:
+    state = moving(np.random.default_rng(5))
+    term = ReceiverPositions.from_samples(
+        unit=np.array([2]), time_s=np.array([7.0]), position_m=state.unit_position_m[[2]] + [0.5, 0.0, 0.0],
+        white_m=np.full((1, 3), 0.3), wander_m=np.full((1, 3), 0.4), lever_arm_m=np.zeros(3), wander_time_s=60.0,
+        least_spacing_s=1.0,
+    )  # fmt: skip
+    term = replace(term, loss_scale=1e6)
+    assert term.cost(state) == pytest.approx(0.5, rel=1e-6)  # half a metre of a sigma of half a metre
