@@ -21,6 +21,7 @@ from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
 from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
@@ -48,7 +49,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 5}
+VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 6}
 
 
 @dataclass
@@ -335,15 +336,26 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             pairs,
             known.world_from_rig,
             run.config,
+            absolute=absolute_priors(known),
             progress=run.step(Stage.MAPPING),
             cancel=run.cancel,
         )
         mapper.missing |= np.array([f.left_out is not None for f in found])
         return mapper.to_arrays(), mapping_report.describe(mapper, log)
 
-    settings = (run.config.mapping.model_dump(), run.config.bundle_adjustment.model_dump(), run.config.seed)
+    sections = (run.config.mapping, run.config.bundle_adjustment, run.config.gnss)
+    settings = [*(section.model_dump() for section in sections), run.config.seed, run.config.use_gnss]
     arrays, _ = run.stage(Stage.MAPPING, settings, work)
     return Mapper.from_arrays(run.drive, keypoints, run.config, known.world_from_rig, arrays)
+
+
+def absolute_priors(known: PriorTrajectory) -> AbsolutePriors:
+    """What the manifest says of the units' poses in the world, for the adjustments."""
+    return AbsolutePriors(
+        gnss=known.gnss,
+        antenna_in_rig_m=known.antenna_in_rig_m,
+        rough_world_from_rig=known.rough_world_from_rig,
+    )
 
 
 def scene(
@@ -354,9 +366,7 @@ def scene(
     run.begin(Stage.REFINEMENT)
     refinement = refine(
         mapper,
-        gnss=known.gnss,
-        antenna_in_rig_m=known.antenna_in_rig_m,
-        rough_world_from_rig=known.rough_world_from_rig,
+        absolute_priors(known),
         progress=run.step(Stage.REFINEMENT),
         cancel=run.cancel,
     )

@@ -319,6 +319,35 @@ class PositionPrior:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RotationPrior:
+    """Measured rotations of units, as of rough poses, with a Cauchy loss over rotation vectors of R R_measured'."""
+
+    unit: Ints  # (n,)
+    rotation: Floats  # (n, 3, 3) world_from_rig
+    sigma_rad: Floats  # (n,) about each axis
+    loss_scale: float = 3.0
+
+    def _residuals(self, state: State) -> Floats:
+        turn: Floats = se3.log_so3(state.unit_rotation[self.unit] @ np.swapaxes(self.rotation, 1, 2))
+        return turn / self.sigma_rad[:, None]
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        s2 = self.loss_scale**2
+        return float(0.5 * s2 * np.log1p((self._residuals(state) ** 2).sum(1) / s2).sum())
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        r = self._residuals(state)
+        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
+        j = se3.inverse_left_jacobian(r * self.sigma_rad[:, None]) / self.sigma_rad[:, None, None]
+        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
+        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
+        np.add.at(extra.units[:, :3, :3], slots, j_w @ j[free])
+        np.add.at(extra.unit_gradient[:, :3], slots, (j_w @ r[free, :, None])[:, :, 0])
+
+
+@dataclass(frozen=True, kw_only=True)
 class UprightPrior:
     """Vehicles are upright on average: roll and pitch are zero within a road's cross fall and grade.
 

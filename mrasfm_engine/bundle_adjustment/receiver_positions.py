@@ -70,7 +70,7 @@ class ReceiverPositions:
         spacing_s = max(least_spacing_s, span_s / (MAX_KNOTS - 1))
         count = 1 + int(np.ceil(span_s / spacing_s - 1e-9))
         first_s = float(time_s.min(initial=np.inf)) if len(time_s) else 0.0
-        knots_s = first_s + spacing_s * np.arange(count)
+        knots_s: Floats = first_s + spacing_s * np.arange(count, dtype=np.float64)
         # Variance half way between knots of unit variance, given both; samples share it while they are alike.
         half = np.exp(-0.5 * spacing_s / wander_time_s)
         between = max(0.0, 1.0 + 0.5 * (1.0 + half**2) - 2.0 * half) if count > 1 else 0.0
@@ -196,10 +196,10 @@ class ReceiverPositions:
         if not self.wander_m.any():
             return
         count, (before, after, share) = len(self.knots_s), self._places
-        coupling = np.zeros((layout.num_units, UNIT_DOF, AXES, count))
+        coupling = np.zeros((layout.num_units, count, UNIT_DOF, AXES))
         for knot, part in ((before, 1.0 - share), (after, share)):
-            along = -j_w * (self._gain * part[:, None])[free, None, :]  # (f, 6, 3)
-            np.add.at(coupling, (slots, slice(None), slice(None), knot[free]), along)
+            np.add.at(coupling, (slots, knot[free]), -j_w * (self._gain * part[:, None])[free, None, :])
+        coupling = np.moveaxis(coupling, 1, 3)
         square = np.zeros((AXES * count, AXES * count))
         for axis in range(AXES):
             off, diagonal = self._by_knots(w, axis)
@@ -218,6 +218,33 @@ class ReceiverPositions:
             at_knots = self._at_knots(scaled[:, axis], axis)
             result = result - at_knots.T @ _solved(self._by_knots(np.ones(len(scaled)), axis), at_knots)
         return result
+
+    def restricted_log_likelihood(self, off_m: Floats, others: Floats) -> float:
+        """Log likelihood of errors (n, 3) of the positions, up to a constant, whatever moves the antenna.
+
+        That is of what the ways (n, 3, m), by which the scene may be moved, cannot explain [Patterson and Thompson,
+        Recovery of inter-block information when block sizes are unequal, Biometrika 1971].
+        """
+        known = self.information(np.concatenate([others, off_m[:, :, None]], axis=2))
+        matrix, right = known[:-1, :-1], known[:-1, -1]
+        left = float(known[-1, -1] - right @ np.linalg.lstsq(matrix, right, rcond=1e-12)[0])
+        determinant = 2.0 * float(np.log(self.sigma_m).sum()) + np.linalg.slogdet(matrix)[1]
+        prior = _log_determinant(self._precision)
+        for axis in range(AXES):
+            determinant += _log_determinant(self._by_knots(np.ones(len(off_m)), axis)) - prior
+        return -0.5 * (left + float(determinant))
+
+    def information_given(self, way: Floats, others: Floats) -> float:
+        """Information on one way (n, 3) in which the antenna may be moved, if others (n, 3, m) are not known."""
+        known = self.information(np.concatenate([way[:, :, None], others], axis=2))
+        lost = known[0, 1:] @ np.linalg.pinv(known[1:, 1:], rcond=1e-12, hermitian=True) @ known[1:, 0]
+        return max(0.0, float(known[0, 0] - lost))
+
+
+def _log_determinant(tridiagonal: Floats) -> float:
+    """Logarithm of the determinant of a positive definite matrix, given as to `_solved`."""
+    bands = tridiagonal if tridiagonal.shape[1] > 1 else tridiagonal[1:]
+    return 2.0 * float(np.log(scipy.linalg.cholesky_banded(bands, check_finite=False)[-1]).sum())
 
 
 def _solved(tridiagonal: Floats, right: Floats) -> Floats:

@@ -18,7 +18,7 @@ error). These widen the border: they are solved for, have no gradient, and are n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg

@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
-from mrasfm_engine.bundle_adjustment.priors import PositionPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import RotationPrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
@@ -92,18 +93,25 @@ def terms_of_images(terms: Sequence[Term], image_unit: Ints, adjusted: Bools) ->
     """Convert terms over units and cameras to terms over adjusted images (images,), each a unit of its own."""
     result: list[Term] = []
     for term in terms:
-        if isinstance(term, PositionPrior):
-            row_of_unit = np.full(image_unit.max() + 1, -1)
-            row_of_unit[term.unit] = np.arange(len(term.unit))
-            image = np.flatnonzero(adjusted & (row_of_unit[image_unit] >= 0))
-            row = row_of_unit[image_unit[image]]
-            share = np.sqrt(np.bincount(row, minlength=len(term.unit)))[row]
-            result.append(
-                replace(term, unit=image, position_m=term.position_m[row], sigma_m=term.sigma_m[row] * share[:, None])
-            )
+        if isinstance(term, ReceiverPositions):
+            image, row, share = _measured_images(term.unit, image_unit, adjusted)
+            result.append(term.of_rows(row, image, share))
+        elif isinstance(term, RotationPrior):
+            image, row, share = _measured_images(term.unit, image_unit, adjusted)
+            of_images = replace(term, unit=image, rotation=term.rotation[row], sigma_rad=term.sigma_rad[row] * share)
+            result.append(of_images)
         elif isinstance(term, UprightPrior):
             result.append(replace(term, unit=np.flatnonzero(adjusted & np.isin(image_unit, term.unit))))
     return result
+
+
+def _measured_images(units: Ints, image_unit: Ints, adjusted: Bools) -> tuple[Ints, Ints, Floats]:
+    """Adjusted images (m,) of units (n,) with a measurement, its row, and the factor on its sigma: images share it."""
+    row_of_unit = np.full(image_unit.max() + 1, -1)
+    row_of_unit[units] = np.arange(len(units))
+    image = np.flatnonzero(adjusted & (row_of_unit[image_unit] >= 0))
+    row = row_of_unit[image_unit[image]]
+    return image, row, np.sqrt(np.bincount(row, minlength=len(units)))[row]
 
 
 def _take_over(mapper: Mapper, images: Ints, world_from_image: Floats) -> None:

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import rotation_between
-from mrasfm_engine.types import Bools, Floats, Ints
+from mrasfm_engine.types import Bools, Floats
 
 SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
 SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
@@ -28,6 +29,7 @@ MOST = 0.7
 MIRRORED = (1, 0, 2)  # axes of measured positions whose latitude and longitude are swapped
 MIRRORED_SHARE = 0.5  # of the residuals as measured: a bend by chance agrees with the mirror image less often
 LOSS_SCALE = 2.0
+SINGULAR = 1e-10  # eigenvalue of a matrix of unit diagonal that is rounding
 MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
 
 
@@ -197,7 +199,7 @@ def _why_not(
     )
 
 
-def clock_offset(antenna_m: Floats, measured_m: Floats, sigma_m: Floats, times_us: Ints) -> tuple[float, float] | None:
+def clock_offset(antenna_m: Floats, positions: ReceiverPositions) -> tuple[float, float] | None:
     """Seconds by which measured positions are ahead of aligned ones (n, 3), and the standard deviation of that.
 
     A clock that is off moves every position along the track by speed times offset. Where the speed or the direction
@@ -206,20 +208,23 @@ def clock_offset(antenna_m: Floats, measured_m: Floats, sigma_m: Floats, times_u
     """
     if len(antenna_m) < 5:
         return None
-    p = antenna_m
-    velocity = np.gradient(p, times_us / 1e6, axis=0)
-    centred = p - p.mean(0)
-    rows = np.zeros((len(p), 3, 5))
-    rows[:, :, 0] = velocity
-    rows[:, :, 1:4] = np.eye(3)
-    rows[:, :, 4] = np.cross([0.0, 0.0, 1.0], centred)
-    a = (rows / sigma_m[:, :, None]).reshape(-1, 5)
-    r = ((measured_m - p) / sigma_m).ravel()
-    solution, _, rank, _ = np.linalg.lstsq(a, r, rcond=None)
-    if rank < a.shape[1]:
+    velocity = np.gradient(antenna_m, positions.time_s, axis=0)[:, :, None]
+    off_m = (positions.position_m - antenna_m)[:, :, None]
+    turns = rigid_motions(antenna_m - antenna_m.mean(0))[:, :, [0, 1, 2, 5]]
+    known = positions.information(np.concatenate([velocity, turns, off_m], axis=2))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known)[:-1], 1e-12))
+    matrix, right = known[:-1, :-1] * np.outer(scale, scale), known[:-1, -1] * scale
+    if np.linalg.eigvalsh(matrix)[0] < SINGULAR:
         return None
-    noise = max(1.0, float(np.mean((r - a @ solution) ** 2)))
-    return float(solution[0]), float(np.sqrt(noise * np.linalg.inv(a.T @ a)[0, 0]))
+    solution = np.linalg.solve(matrix, right)
+    noise = max(1.0, float(known[-1, -1] - right @ solution) / off_m.size)
+    sigma_s = float(np.sqrt(noise * np.linalg.inv(matrix)[0, 0]) * scale[0])
+    return float(solution[0] * scale[0]), sigma_s
+
+
+def rigid_motions(place_m: Floats) -> Floats:
+    """Ways (n, 3, 6) in which rigid motions move places (n, 3): along the axes, then about them."""
+    return np.concatenate([np.tile(np.eye(3), (len(place_m), 1, 1)), -se3.skew(place_m)], axis=2)
 
 
 def _unit(v: Floats) -> Floats:

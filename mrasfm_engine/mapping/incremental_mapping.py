@@ -10,10 +10,12 @@ import numpy as np
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.baseline_without_rig import register_images_singly, retry_missing, take_over
 from mrasfm_engine.mapping.calibration import (
     assess_calibration,
     calibration_prior,
+    resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
 )
@@ -40,6 +42,7 @@ DECREMENT_TOLERANCE = 0.1  # while the scene grows: less than half a standard de
 class MappingLog:
     """Log of incremental mapping."""
 
+    absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
     initialisation: Initialisation | None = None
     registrations: list[Registration] = field(default_factory=list)
     failures: dict[int, Registration] = field(default_factory=dict)  # by unit, the last attempt
@@ -58,10 +61,13 @@ def run_incremental_mapping(
     pairs: Sequence[PairMatches],
     prior_world_from_rig: Floats | None,
     *,
+    absolute: AbsolutePriors | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> MappingLog:
     """Register as many units as possible, beginning with the best-connected two.
+
+    Positions and rough poses of `absolute` take part in its adjustments.
 
     Raises
     ------
@@ -70,7 +76,7 @@ def run_incremental_mapping(
     CancelledError
         Where `cancel` answers True.
     """
-    log = MappingLog()
+    log = MappingLog(absolute=AbsolutePriors() if absolute is None else absolute)
     log.initialisation = initialise(mapper, pairs, prior_world_from_rig)
     adjust_globally(mapper, log, cancel)
     register_remaining(mapper, log, progress=progress, cancel=cancel)
@@ -99,7 +105,7 @@ def register_remaining(
             adjust_globally(mapper, log, cancel)
             at_global, since_local = int(mapper.registered.sum()), 0
         elif since_local >= config.mapping.local_every:
-            _adjust_locally(mapper, registration.unit)
+            _adjust_locally(mapper, registration.unit, log.absolute)
             log.local_adjustments += 1
             since_local = 0
         if progress is not None:
@@ -115,6 +121,7 @@ def map_units(
     prior_world_from_rig: Floats | None,
     config: EngineConfig,
     *,
+    absolute: AbsolutePriors | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> tuple[Mapper, MappingLog]:
@@ -138,7 +145,9 @@ def map_units(
     mapper.keyframe = select_keyframes(mapper)
     if prior_world_from_rig is not None:
         mapper.motion.follow_prior(prior_world_from_rig)
-    log = run_incremental_mapping(mapper, sound, prior_world_from_rig, progress=progress, cancel=cancel)
+    log = run_incremental_mapping(
+        mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
+    )
     # Only the poses of all cameras together separate dynamic objects reliably, so mapping comes before the cleaning.
     moving = find_moving_along(mapper, near)
     if moving.any:
@@ -217,7 +226,7 @@ def _register_next(mapper: Mapper, log: MappingLog) -> Registration | None:
     return None
 
 
-def _adjust_locally(mapper: Mapper, unit: int) -> None:
+def _adjust_locally(mapper: Mapper, unit: int, absolute: AbsolutePriors) -> None:
     """Adjust a new unit and those it shares most points with; all other units and the calibration stay."""
     tracks = mapper.tracks_of_units(np.array([unit]))
     rows = mapper.observation_rows(tracks[mapper.triangulated[tracks]])
@@ -233,6 +242,7 @@ def _adjust_locally(mapper: Mapper, unit: int) -> None:
     adjust_poses(
         mapper,
         free,
+        terms=absolute.local_terms(mapper, free),
         options=SolverOptions(
             max_iterations=10,
             function_tolerance=LOCAL_TOLERANCE,
@@ -249,8 +259,10 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> N
 
     Once: the next adjustment is near while the scene grows, and the refinement when it has.
     """
+    log.absolute.renew(mapper)
     free_units = mapper.registered.copy()
-    free_units[np.flatnonzero(mapper.registered)[0]] = False
+    if not log.absolute.hold_the_frame:
+        free_units[np.flatnonzero(mapper.registered)[0]] = False
     options = SolverOptions(
         max_iterations=20,
         function_tolerance=GLOBAL_TOLERANCE,
@@ -258,17 +270,22 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> N
         loss_scale=mapper.config.bundle_adjustment.loss_scale,
         threads=mapper.config.threads,
     )
+    terms = log.absolute.terms(mapper)
     # Once a part of the drive observes the calibration, more of it does so all the more.
     log.calibration_free = (
         log.calibration_free
-        or assess_calibration(mapper, free_units=free_units, terms=(), georeferenced=False, options=options).free
+        or assess_calibration(
+            mapper, free_units=free_units, terms=terms, georeferenced=bool(terms), options=options
+        ).free
     )
     free, priors = log.calibration_free, mapper.config.bundle_adjustment.priors
+    if free and priors:
+        terms = [calibration_prior(mapper), *terms]
     report = adjust_poses(
         mapper,
         free_units,
         free_cameras=np.full(len(mapper.camera_kind), free),
-        terms=[calibration_prior(mapper)] if free and priors else (),
+        terms=terms,
         options=options,
         an_image=mapper.config.mapping.pose_observations,
         cancel=cancel,
@@ -276,7 +293,10 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> N
     log.global_adjustments.append(report)
     if free and priors:
         # Scale is a direction in which the cost hardly changes: over many adjustments it would wander off.
-        scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
+        if log.absolute.hold_the_frame:
+            resolve_scale(mapper, terms)
+        else:
+            scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
     mapper.complete()  # filters, too
     if mapper.config.mapping.semantic_triangulation:
         log.roads.append(drop_off_road(mapper))

@@ -14,7 +14,7 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import voted_out
-from mrasfm_engine.mapping.placement import receiver_errors
+from mrasfm_engine.mapping.placement import Placement
 from mrasfm_engine.mapping.refinement import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
@@ -119,12 +119,20 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "outliers_at_us": [int(t) for t in times],
             "residual_rms_m": float(np.sqrt((placement.off_m[placement.inlier] ** 2).sum(1).mean())),
             "noise_factor": placement.noise_factor,
-            "common_error_share": receiver_errors(mapper, placement).common,
+            "errors_in_declared_sigmas": {"white": placement.errors.white, "wander": placement.errors.wander},
+            "wandering_error_rms_m": _wandering_rms_m(mapper, placement),
             "scale_of_rig_against_gnss": alignment.scale,
         }
     elif placement is not None:
         result["gnss"] = {"not_used": placement.reason}
     return result
+
+
+def _wandering_rms_m(mapper: Mapper, placement: Placement) -> float:
+    """Size of the receiver's errors that wander, as the scene shows them."""
+    if placement.prior is None:
+        return 0.0
+    return float(np.sqrt((placement.prior.errors_m(mapper.state) ** 2).sum(1).mean()))
 
 
 def _directions(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:

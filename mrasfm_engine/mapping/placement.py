@@ -5,13 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.linalg
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.optimize import minimize
 
-from mrasfm_engine.bundle_adjustment.priors import PositionPrior
+from mrasfm_engine.bundle_adjustment.priors import RotationPrior
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, assess_residuals, clock_offset
+from mrasfm_engine.mapping.georeferencing import (
+    GnssAlignment,
+    align_with_gnss,
+    assess_residuals,
+    clock_offset,
+    rigid_motions,
+)
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas.findings import Finding, warning
@@ -22,32 +32,64 @@ MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receive
 SCALE_DISAGREEMENT_SIGMAS = 3.0
 MIN_ROUGH_POSES = 2
 MIN_POSITIONS = 3
-MOST_TIMES = 1000  # compared with one another
+MIN_WHITE = 0.01  # of the declared sigma: of a receiver that filters, positions scatter by nothing that shows
+STEADY = 1.5
+KNOTS = 20  # in the correlation time of what wanders: less often than its filter lets a receiver change its mind
+USUAL_LOG_WANDER = np.log(2.0)  # standard deviation of the logarithm of what wanders over what is declared,
+BROAD_LOG_WHITE = np.log(10.0)  # and of what scatters: some declare the one, some the other
+MOST_RESIDUALS, MIN_FOR_LIKELIHOOD = 150, 8
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReceiverErrors:
+    """Errors of a receiver's positions, of which some scatter and some wander, in the declared sigmas.
+
+    Attributes
+    ----------
+    white
+        Standard deviation of what differs from sample to sample,
+    wander
+        and of what wanders.
+    positions_a_sample
+        Number of units whose positions are interpolated between the same two samples.
+    """
+
+    white: float = 1.0
+    wander: float = 0.0
+    positions_a_sample: int = 1
+
+    def is_as_large_as(self, other: ReceiverErrors) -> bool:
+        """True where neither differs by more than a factor that a few samples leave open."""
+        sizes = np.array([[e.white, e.wander] for e in (self, other)]) + MIN_WHITE
+        return bool((np.abs(np.log(sizes[0] / sizes[1])) < np.log(STEADY)).all())
 
 
 @dataclass(kw_only=True)
 class Placement:
     """Fit of the reconstruction to the receiver's positions; without a prior it does not fit, for the reason given."""
 
-    prior: PositionPrior | None = None
+    prior: ReceiverPositions | None = None
     reason: str = ""
     alignment: GnssAlignment | None = None
-    units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # that have a position
-    measured_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) positions of these
-    sigma_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3)
+    known_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (u, 3) positions, NaN where there is none
+    known_sigma_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (u, 3)
+    lever_arm_m: Floats = field(default_factory=lambda: np.zeros(3))
+    units: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (n,) that were assessed last
     inlier: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (n,)
     off_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) scene minus measured, as assessed last
     interval_us: float = 0.0  # of the receiver's samples
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
+    errors: ReceiverErrors = field(default_factory=ReceiverErrors)
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
 
-def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> Placement:
+def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, thorough: bool = False) -> Placement:
     """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
-    The reconstruction keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
+    The reconstruction keeps its scale, which comes from the rig; only that of a single camera is the receiver's. See
+    `reassess_positions` for `thorough`.
     """
     settings, times = mapper.config.gnss, mapper.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
@@ -64,52 +106,83 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats) -> 
     if isinstance(alignment, str):
         return Placement(reason=alignment)
     _move(mapper, alignment.world_from_model)
-    good = units[alignment.inlier]
-    antenna_m = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ antenna_in_rig_m
     placement = Placement(
         alignment=alignment,
+        known_m=measured,
+        known_sigma_m=sigma,
+        lever_arm_m=np.asarray(antenna_in_rig_m),
         units=units,
-        measured_m=measured[units],
-        sigma_m=sigma[units],
         inlier=alignment.inlier,
-        off_m=antenna_m - measured[units],
+        off_m=_antenna_m(mapper, units, antenna_in_rig_m) - measured[units],
         interval_us=float(np.median(np.diff(gnss.timestamps_us[gnss.good]))) if gnss.good.sum() > 1 else 0.0,
         noise_factor=alignment.noise_factor,
     )
+    placement = _with_prior(mapper, placement, thorough=thorough)
     if not single:
-        inflation = receiver_errors(mapper, placement).factor
-        found = _findings(mapper, alignment, measured[good], sigma[good], good, antenna_in_rig_m, inflation)
-        placement = replace(placement, findings=found)
-    return _with_prior(mapper, placement, np.asarray(antenna_in_rig_m))
+        assert placement.prior is not None
+        placement.findings = _findings(mapper, alignment, placement.prior)
+    return placement
 
 
-def reassess_positions(mapper: Mapper, placement: Placement) -> Placement:
-    """Judge all positions by where the adjustment has put their units.
+def reassess_positions(
+    mapper: Mapper, placement: Placement, *, thorough: bool = False, clock_varies: bool = False
+) -> Placement:
+    """Judge the positions of all registered units by where the adjustment has put them.
 
-    Those that were outliers of a bent trajectory come back, with the weight that they have by their sigmas.
+    Those that were outliers of a bent trajectory come back, with the weight that they have by their sigmas. The sizes
+    of their errors are those of `receiver_errors`, or, if `thorough`, of `most_likely_errors`.
     """
-    assert placement.prior is not None
-    units, arm_m = placement.units, placement.prior.lever_arm_m
-    off_m = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ arm_m - placement.measured_m
-    outlier_sigmas = mapper.config.gnss.outlier_sigmas
-    inlier, factor = assess_residuals(off_m, placement.sigma_m, placement.inlier, outlier_sigmas=outlier_sigmas)
-    inlier &= mapper.registered[units]
+    units = np.flatnonzero(mapper.registered & np.isfinite(placement.known_m[:, 0]))
+    off_m = _antenna_m(mapper, units, placement.lever_arm_m) - placement.known_m[units]
+    inlier, factor = assess_residuals(
+        off_m,
+        placement.known_sigma_m[units],
+        ~np.isin(units, placement.units[~placement.inlier]),
+        outlier_sigmas=mapper.config.gnss.outlier_sigmas,
+    )
     if inlier.sum() < MIN_POSITIONS:
         return placement
-    return _with_prior(mapper, replace(placement, inlier=inlier, off_m=off_m, noise_factor=factor), arm_m)
+    placement = replace(placement, units=units, inlier=inlier, off_m=off_m, noise_factor=factor)
+    return _with_prior(mapper, placement, thorough=thorough, clock_varies=clock_varies)
 
 
-def _with_prior(mapper: Mapper, placement: Placement, antenna_in_rig_m: Floats) -> Placement:
-    """The placement with its positions that are no outliers as a term of the adjustment."""
-    good = placement.inlier
-    units = placement.units[good]
-    prior = PositionPrior(
+def positions_of_units(mapper: Mapper, placement: Placement, units: Ints) -> ReceiverPositions:
+    """The term of the positions of some units, but for those that were outliers as they were assessed last."""
+    units = units[np.isfinite(placement.known_m[units, 0])]
+    units = units[~np.isin(units, placement.units[~placement.inlier])]
+    return _as_term(mapper, placement, units, placement.errors)
+
+
+def _as_term(mapper: Mapper, placement: Placement, units: Ints, errors: ReceiverErrors) -> ReceiverPositions:
+    """Positions of some units with errors of a certain size."""
+    sigma_m, settings = placement.known_sigma_m[units], mapper.config.gnss
+    return ReceiverPositions.from_samples(
         unit=units,
-        position_m=placement.measured_m[good],
-        sigma_m=placement.sigma_m[good] * placement.noise_factor * receiver_errors(mapper, placement).factor,
-        lever_arm_m=antenna_in_rig_m,
+        time_s=mapper.drive.timestamps_us[units] / 1e6,
+        position_m=placement.known_m[units],
+        white_m=sigma_m * errors.white * np.sqrt(errors.positions_a_sample),
+        wander_m=sigma_m * errors.wander,
+        lever_arm_m=placement.lever_arm_m,
+        wander_time_s=settings.wander_time_s,
+        least_spacing_s=max(settings.correlation_time_s, settings.wander_time_s / KNOTS),
     )
-    return replace(placement, prior=prior)
+
+
+def _with_prior(
+    mapper: Mapper, placement: Placement, *, thorough: bool = False, clock_varies: bool = False
+) -> Placement:
+    """The placement with its positions that are no outliers as a term of the adjustment."""
+    if thorough:
+        placement = replace(placement, errors=most_likely_errors(mapper, placement, clock_varies=clock_varies))
+    else:
+        placement = replace(placement, errors=receiver_errors(mapper, placement))
+    return replace(placement, prior=positions_of_units(mapper, placement, placement.units[placement.inlier]))
+
+
+def _antenna_m(mapper: Mapper, units: Ints, lever_arm_m: Floats) -> Floats:
+    """Places (n, 3) of the antenna at some units."""
+    result: Floats = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ lever_arm_m
+    return result
 
 
 def _align(
@@ -149,6 +222,41 @@ def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_tra
     return True
 
 
+def compare_rough_poses(
+    mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float, sigma_rotation_rad: float
+) -> tuple[Placement, RotationPrior] | None:
+    """Rough poses (units, 4, 4; NaN where unknown), moved to where the scene lies, as terms of the adjustment.
+
+    As of a receiver's positions, what they do not scatter by from pose to pose is an error that wanders. None where
+    there are too few.
+    """
+    units = np.flatnonzero(mapper.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
+    if len(units) < MIN_POSITIONS:
+        return None
+    own, rough = mapper.state.world_from_rig[units], rough_world_from_rig[units]
+    turns = own[:, :3, :3] @ np.swapaxes(rough[:, :3, :3], 1, 2)
+    rotation = robust_mean_rotation(turns)
+    shift_m = geometric_median(own[:, :3, 3] - rough[:, :3, 3] @ rotation.T)
+    known = se3.transform(rotation, shift_m) @ rough_world_from_rig
+    off_m = own[:, :3, 3] - known[units, :3, 3]
+    sigma_m = np.full((len(known), 3), sigma_translation_m)
+    inlier, factor = assess_residuals(
+        off_m, sigma_m[units], np.ones(len(units), dtype=np.bool_), outlier_sigmas=mapper.config.gnss.outlier_sigmas
+    )
+    if inlier.sum() < MIN_POSITIONS:
+        return None
+    placement = Placement(
+        known_m=known[:, :3, 3], known_sigma_m=sigma_m, units=units, inlier=inlier, off_m=off_m, noise_factor=factor
+    )
+    turn_rad = se3.log_so3(turns @ rotation.T)
+    scatter = np.median(np.abs(np.diff(turn_rad, axis=0))) / (0.6745 * np.sqrt(2.0) * sigma_rotation_rad)
+    white = float(np.clip(scatter**2, 0.0, 1.0))
+    # What does not scatter is one error of all: together they weigh no more than one rotation.
+    sigma_rad = sigma_rotation_rad * np.sqrt(white + (1.0 - white) * len(units))
+    rotations = RotationPrior(unit=units, rotation=known[units, :3, :3], sigma_rad=np.full(len(units), sigma_rad))
+    return _with_prior(mapper, placement), rotations
+
+
 def _extent(position_m: Floats) -> float:
     """Median distance of positions from their median: a size that single wrong ones do not change."""
     return max(float(np.median(np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1))), 1e-9)
@@ -161,90 +269,120 @@ def _move(mapper: Mapper, world_from_model: Floats) -> None:
     state.points_m[:] = se3.apply(world_from_model, state.points_m)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReceiverErrors:
-    """Errors of a receiver's positions, of which some scatter and some wander.
-
-    Attributes
-    ----------
-    factor
-        On the sigmas of positions: taken as independent, they then say no more of the trajectory's shape than they do.
-    common
-        Share of the declared sigmas that all positions have in common: it moves the scene, but does not bend it.
-    """
-
-    factor: float
-    common: float
-
-
 def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
     """Tell white errors from wandering ones by how positions scatter about the scene from one to the next.
 
-    The scatter q^2 of the declared variance is white, and averages out. The rest wanders as a Gauss-Markov process of
-    `gnss.wander_time_s`, with correlations K = exp(-|t_i - t_j| / time) between samples. With times u from their mean a
-    slope over n samples then has the variance of that over independent ones of
-
-        q^2 + (1 - q^2) u' K u / u' u
-
-    of theirs. Scatter that is not clearly less than declared is all of it. A receiver's filter holds the rest back for
-    `gnss.correlation_time_s` at least, so that samples closer in time count once.
+    The scatter's share of the declared variance is white, and averages out; the rest wanders. Scatter that is not
+    clearly less than declared is all of it.
     """
     good = placement.inlier
     times_s = mapper.drive.timestamps_us[placement.units[good]] / 1e6
     if len(times_s) < MIN_POSITIONS:
-        return ReceiverErrors(factor=1.0, common=1.0)
+        return ReceiverErrors(white=MIN_WHITE, wander=placement.noise_factor)
     # Positions between two samples are a blend of both.
-    step_s = float(np.median(np.diff(times_s)))
-    apart = max(1, round(placement.interval_us / 1e6 / step_s))
-    whitened = placement.off_m[good] / (placement.sigma_m[good] * placement.noise_factor)
+    apart = max(1, round(placement.interval_us / 1e6 / float(np.median(np.diff(times_s)))))
+    sigma_m = placement.known_sigma_m[placement.units[good]] * placement.noise_factor
+    whitened = placement.off_m[good] / sigma_m
     steps = (whitened[apart:] - whitened[:-apart]).ravel() / np.sqrt(2.0)
-    white = 0.0
-    if len(steps):
-        white = min(1.0, float((np.median(np.abs(steps)) / 0.6745) ** 2))
-        # A variance from the median of n normal numbers is uncertain by 2.3 / sqrt(n) of itself; neighbouring steps
-        # share a sample, which makes n half of them.
-        if white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * len(steps)):
-            white = 1.0
-    some = times_s[:: 1 + len(times_s) // MOST_TIMES]
-    alike = np.exp(-np.abs(some[:, None] - some[None]) / mapper.config.gnss.wander_time_s)
-    slope = some - some.mean()
-    wander = float(slope @ alike @ slope / (slope @ slope)) * len(times_s) / len(some)
-    wander = max(wander, mapper.config.gnss.correlation_time_s / step_s, 1.0)
+    white = float((np.median(np.abs(steps)) / 0.6745) ** 2) if len(steps) else 0.0
+    # A variance from the median of n normal numbers is uncertain by 2.3 / sqrt(n) of itself; neighbouring steps
+    # share a sample, which makes n half of them.
+    if len(steps) and white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * len(steps)):
+        white = 1.0
     return ReceiverErrors(
-        factor=float(np.sqrt(apart * white + wander * (1.0 - white))),
-        common=float(np.sqrt((1.0 - white) * alike.mean())),
+        white=placement.noise_factor * max(float(np.sqrt(min(white, 1.0))), MIN_WHITE),
+        wander=placement.noise_factor * float(np.sqrt(1.0 - min(white, 1.0))),
+        positions_a_sample=apart,
     )
 
 
-def _findings(
-    mapper: Mapper,
-    alignment: GnssAlignment,
-    measured_m: Floats,
-    sigma_m: Floats,
-    units: Ints,
-    antenna_in_rig_m: Floats,
-    inflation: float,
-) -> list[Finding]:
+def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bool = False) -> ReceiverErrors:
+    """The sizes of both kinds of errors that residuals make most likely, and what was declared.
+
+    Where the scene lies, how it is turned and how large it is takes no part in it, and, if `clock_varies`, nor does
+    when its images were taken. Receivers that wander by twice or
+    half of what they declare are usual. What wanders is at most what residuals exceed their sigmas by: more, the scene
+    makes of errors of its own.
+    """
+    begin = receiver_errors(mapper, placement)
+    good = np.flatnonzero(placement.inlier)
+    good = good[:: max(begin.positions_a_sample, -(-len(good) // MOST_RESIDUALS))]
+    whitened = placement.off_m[good] / placement.known_sigma_m[placement.units[good]]
+    good = good[_among_neighbours(whitened, mapper.config.gnss.outlier_sigmas)]
+    if len(good) < MIN_FOR_LIKELIHOOD:
+        return begin
+    units, off_m = placement.units[good], placement.off_m[good]
+    place_m = _antenna_m(mapper, units, placement.lever_arm_m)
+    place_m = place_m - place_m.mean(0)
+    ways = [rigid_motions(place_m), place_m[:, :, None]]
+    if clock_varies:
+        ways.append(mapper.motion.velocity_mps(mapper.state, mapper.registered)[units][:, :, None])
+    # Along a straight line they are fewer.
+    moves = scipy.linalg.orth(np.concatenate(ways, axis=2).reshape(3 * len(place_m), -1), rcond=1e-6)
+    moves = moves.reshape(len(place_m), 3, -1)
+    sigma_m, time_s = placement.known_sigma_m[units], mapper.drive.timestamps_us[units] / 1e6
+    declared_errors = ReceiverPositions(
+        unit=units,
+        position_m=placement.known_m[units],
+        sigma_m=sigma_m,
+        wander_m=sigma_m,
+        lever_arm_m=placement.lever_arm_m,
+        time_s=time_s,
+        knots_s=time_s,
+        wander_time_s=mapper.config.gnss.wander_time_s,
+    )
+
+    least, most = np.log([MIN_WHITE, MIN_WHITE]), np.log([np.inf, placement.noise_factor])
+
+    def unlikelihood(log_sizes: Floats) -> float:
+        white, wander = np.exp(np.clip(log_sizes, least, most))
+        sizes = {"sigma_m": white * sigma_m, "wander_m": wander * sigma_m}
+        declared = float(log_sizes[1] / USUAL_LOG_WANDER) ** 2 + float(log_sizes[0] / BROAD_LOG_WHITE) ** 2
+        return 0.5 * declared - replace(declared_errors, **sizes).restricted_log_likelihood(off_m, moves)
+
+    start = np.log([max(begin.white, MIN_WHITE), max(begin.wander, 0.3)])
+    simplex = start + np.array([[0.0, 0.0], [0.7, 0.0], [0.0, -0.7]])
+    found = minimize(
+        unlikelihood,
+        start,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.01, "maxiter": 60},
+    )
+    white, wander = np.exp(np.clip(found.x, least, most))
+    return ReceiverErrors(white=float(white), wander=float(wander), positions_a_sample=begin.positions_a_sample)
+
+
+def _among_neighbours(residuals: Floats, outlier_sigmas: float) -> Bools:
+    """Residuals (n, 3) in the order of time that are no farther from their neighbours' median than others are.
+
+    Of normal ones, half are within half a standard deviation of it: they may be twice as many away.
+    """
+    window = sliding_window_view(np.pad(residuals, ((2, 2), (0, 0)), mode="reflect"), 5, axis=0)
+    away = residuals - np.median(window, axis=2)
+    usual = float(np.median(np.abs(away))) / 0.6745
+    result: Bools = np.linalg.norm(away, axis=1) <= 2.0 * outlier_sigmas * max(usual, 1e-9)
+    return result
+
+
+def _findings(mapper: Mapper, alignment: GnssAlignment, positions: ReceiverPositions) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
     findings = []
-    antenna = mapper.state.unit_position_m[units] + mapper.state.unit_rotation[units] @ antenna_in_rig_m
-    centre = antenna.mean(0)
-    fitted = centre + alignment.scale * (antenna - centre)
-    times = mapper.drive.timestamps_us[units]
-    offset = clock_offset(fitted, measured_m, sigma_m * alignment.noise_factor, times)
-    # Where the receiver's errors change slowly, its samples know less of the clock than independent ones would.
-    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * inflation * offset[1]):
+    antenna_m = _antenna_m(mapper, positions.unit, positions.lever_arm_m)
+    centred_m = antenna_m - antenna_m.mean(0)
+    offset = clock_offset(antenna_m.mean(0) + alignment.scale * centred_m, positions)
+    if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
         direction = "ahead of" if offset[0] > 0 else "behind"
         findings.append(
             warning(
                 "gnss-clock-offset",
                 f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
-                f"(sigma {inflation * offset[1]:.2f} s)",
+                f"(sigma {offset[1]:.2f} s)",
                 "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
             )
         )
     _, sigma_rig = scale_of_baselines(mapper)
-    sigma = float(np.hypot(sigma_rig, inflation * alignment.sigma_scale))
+    known = positions.information_given(centred_m, rigid_motions(centred_m))
+    sigma = float(np.hypot(sigma_rig, 1.0 / np.sqrt(max(known, 1e-12))))
     if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
         findings.append(
             warning(

@@ -9,12 +9,12 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, ReadoutPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
-from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
     STRAIGHT,
     CalibrationDecision,
@@ -26,7 +26,6 @@ from mrasfm_engine.mapping.calibration import (
     scale_of_baselines,
     scale_with_baselines,
 )
-from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
@@ -36,13 +35,7 @@ from mrasfm_engine.mapping.miscalibration import (
     find_miscalibrations,
     find_wrong_pair,
 )
-from mrasfm_engine.mapping.placement import (
-    Placement,
-    place_by_gnss,
-    place_by_rough_poses,
-    reassess_positions,
-    receiver_errors,
-)
+from mrasfm_engine.mapping.placement import Placement
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.mapping.time_offsets import (
@@ -60,7 +53,8 @@ from mrasfm_engine.mapping.time_offsets import (
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
 from schemas.findings import Finding
 
-ROUNDS = 2  # of adjusting, triangulating anew and filtering
+ROUNDS = 2  # of adjusting, triangulating anew and filtering,
+MAX_ROUNDS = 6  # and while the weights of positions change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
 BENT = 1.5  # by such a factor on their sigmas,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
@@ -77,8 +71,7 @@ class Refinement:
     """Result of the refinement."""
 
     sigma_px: float = 1.0
-    placement: Placement | None = None  # by GNSS, where it was to be used
-    placed_by_rough_poses: bool = False
+    absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
     times_vary: bool = False
@@ -99,39 +92,36 @@ class Refinement:
     road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
+    def placement(self) -> Placement | None:
+        """Fit of the receiver's positions, where these were to be used."""
+        return self.absolute.placement
+
+    @property
+    def placed_by_rough_poses(self) -> bool:
+        """The scene stands where rough poses say."""
+        return self.absolute.placed_by_rough_poses
+
+    @property
     def georeferenced(self) -> bool:
         """The scene stands where the receiver says."""
-        return self.placement is not None and self.placement.prior is not None
+        return self.absolute.positions is not None
 
 
 def refine(
     mapper: Mapper,
+    absolute: AbsolutePriors | None = None,
     *,
-    gnss: GnssTrack | None,
-    antenna_in_rig_m: Floats | None,
-    rough_world_from_rig: Floats | None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> Refinement:
     """Georeference where positions allow, adjust everything with all priors, and estimate the uncertainty.
 
-    Parameters
-    ----------
-    gnss, antenna_in_rig_m
-        The receiver's track in the local frame and the lever arm (3,), or None.
-    rough_world_from_rig
-        Rough poses (units, 4, 4): without GNSS the scene is moved into their frame.
+    Without positions, rough poses say where the scene lies.
     """
-    result = Refinement()
-    positions = None
-    if gnss is not None and antenna_in_rig_m is not None:
-        result.placement = place_by_gnss(mapper, gnss, antenna_in_rig_m)
-        positions = result.placement.prior
-    rough = mapper.drive.manifest.rough_poses
-    placed = positions is not None
-    if not placed and rough_world_from_rig is not None and rough is not None:
-        placed = place_by_rough_poses(mapper, rough_world_from_rig, rough.sigma_translation_m)
-        result.placed_by_rough_poses = placed
+    absolute = AbsolutePriors() if absolute is None else absolute
+    result = Refinement(absolute=absolute)
+    absolute.place(mapper)
+    placed = result.georeferenced or result.placed_by_rough_poses
     if not placed and mapper.drive.has_single_camera:
         raise ReconstructionError(
             "one camera tells no scale, and neither GNSS nor rough poses could: "
@@ -139,36 +129,38 @@ def refine(
             remedy="Give a second camera with its baseline, or positions along the vehicle's trajectory.",
             code="no-metric-scale",
         )
-    free_units = _free_units(mapper, georeferenced=positions is not None and mapper.config.bundle_adjustment.priors)
+    free_units = _free_units(mapper, absolute)
     result.sigma_px = _observation_sigma(mapper)
     result.calibration = assess_calibration(
         mapper,
         free_units=free_units,
-        terms=_terms(mapper, positions, result),
-        georeferenced=positions is not None,
+        terms=_terms(mapper, result),
+        georeferenced=result.georeferenced,
         options=_options(mapper, result.sigma_px),
     )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    if result.calibration.free and positions is None and is_straight(mapper):
+    if result.calibration.free and not result.georeferenced and is_straight(mapper):
         _hold_unless_contradicted(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)
-    if result.times_vary and positions is not None:
-        result.mean_time_varies = positions_may_tell_time(mapper, positions)
+    if result.times_vary and absolute.positions is not None:
+        result.mean_time_varies = positions_may_tell_time(mapper, absolute.positions)
+        absolute.clock_varies = result.mean_time_varies
     result.intrinsics = held_intrinsics(mapper)
     if mapper.config.bundle_adjustment.refine_focal and result.calibration.free:
         result.intrinsics = assess_intrinsics(
             mapper,
             free_units=free_units,
-            terms=_terms(mapper, positions, result),
+            terms=_terms(mapper, result),
             options=_options(mapper, result.sigma_px),
         )
-    _rescale(mapper, result, _terms(mapper, positions, result))
-    positions = _unbend(mapper, positions, result, free_units, cancel)
-    for done in range(ROUNDS):
-        is_last = done == ROUNDS - 1
+    _rescale(mapper, result, _terms(mapper, result))
+    steady = _unbend(mapper, result, free_units, cancel)
+    done, is_last = 0, False
+    while not is_last:
         result.sigma_px = _observation_sigma(mapper)
-        _adjust(mapper, positions, result, free_units, rough=not is_last, cancel=cancel)
-        positions = _reassessed(mapper, positions, result)
+        is_last = done == MAX_ROUNDS - 1 or (done >= ROUNDS - 1 and steady)
+        _adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
+        steady = _reassess(mapper, result)
         if is_last:
             mapper.readmit()
         else:
@@ -179,10 +171,11 @@ def refine(
         result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points
+        done += 1
         if progress is not None:
-            progress(done + 1, ROUNDS)
+            progress(min(done, ROUNDS), ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
-    result.certainty = _with_common_error(mapper, result, _certainty(mapper, positions, result))
+    result.certainty = _certainty(mapper, result)
     result.directions = _directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
@@ -192,7 +185,6 @@ def refine(
     if result.recalibrated.any() and result.directions is not None:
         _hold_unobserved(
             mapper,
-            positions,
             result,
             free_units & mapper.registered,
             holds_mean_time=mean_time_varied and not result.mean_time_varies,
@@ -210,7 +202,6 @@ def refine(
 
 def _adjust(
     mapper: Mapper,
-    positions: PositionPrior | None,
     result: Refinement,
     free_units: Bools,
     *,
@@ -218,7 +209,7 @@ def _adjust(
     cancel: Cancel | None,
 ) -> None:
     """Adjust everything that varies, with all priors."""
-    terms = _terms(mapper, positions, result)
+    terms = _terms(mapper, result)
     result.adjustments.append(
         adjust_poses(
             mapper,
@@ -235,36 +226,32 @@ def _adjust(
     _rescale(mapper, result, terms)
 
 
-def _unbend(
-    mapper: Mapper,
-    positions: PositionPrior | None,
-    result: Refinement,
-    free_units: Bools,
-    cancel: Cancel | None,
-) -> PositionPrior | None:
+def _unbend(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> bool:
     """Adjust until positions, of which a bent trajectory contradicts most, agree with it as well as they can.
 
     They begin with the weight that the bend leaves them; what the adjustment has straightened makes the next more
-    certain [graduated non-convexity].
+    certain [graduated non-convexity]. Returns whether their weights are what they were before the last adjustment.
     """
-    for _ in range(MAX_UNBENDING if positions is not None and _reassesses(mapper) else 0):
+    steady = True
+    for _ in range(MAX_UNBENDING if result.georeferenced and _reassesses(mapper) else 0):
         assert result.placement is not None
         before = result.placement.noise_factor
         if before < BENT:
             break
-        _adjust(mapper, positions, result, free_units, rough=True, cancel=cancel)
-        positions = _reassessed(mapper, positions, result)
+        _adjust(mapper, result, free_units, rough=True, cancel=cancel)
+        steady = _reassess(mapper, result)
         if result.placement.noise_factor > STRAIGHTENED * before:
             break
-    return positions
+    return steady
 
 
-def _reassessed(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> PositionPrior | None:
-    """The positions as a prior, judged by the adjusted scene; as they are where they took no part in it."""
-    if positions is None or result.placement is None or not _reassesses(mapper):
-        return positions
-    result.placement = reassess_positions(mapper, result.placement)
-    return result.placement.prior
+def _reassess(mapper: Mapper, result: Refinement) -> bool:
+    """Judge positions by the adjusted scene; whether their errors have the sizes that they had before."""
+    if result.placement is None or not (result.georeferenced and _reassesses(mapper)):
+        return True
+    before = result.placement.errors
+    result.absolute.reassess(mapper)
+    return result.placement.errors.is_as_large_as(before)
 
 
 def _reassesses(mapper: Mapper) -> bool:
@@ -283,7 +270,7 @@ def _hold_unless_contradicted(mapper: Mapper, free_units: Bools, result: Refinem
         problem, _ = mapper.problem(
             free_units,
             free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-            terms=_terms(mapper, None, result),
+            terms=_terms(mapper, result),
             options=_options(mapper, result.sigma_px),
         )
         return _directions(mapper, covariances(problem, problem.state))
@@ -321,7 +308,6 @@ def _directions(
 
 def _hold_unobserved(
     mapper: Mapper,
-    positions: PositionPrior | None,
     result: Refinement,
     free_units: Bools,
     *,
@@ -342,7 +328,7 @@ def _hold_unobserved(
     hold_times = result.held_times is not None and (result.held_times.any() or holds_mean_time)
     if result.calibration.free and (weighed.to_hold.any() or hold_times):
         result.held = weighed.to_hold
-        _adjust(mapper, positions, result, free_units, rough=False, cancel=cancel)
+        _adjust(mapper, result, free_units, rough=False, cancel=cancel)
     if result.georeferenced and weighed.scale_only_prior:
         scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
 
@@ -366,10 +352,10 @@ def _options(mapper: Mapper, sigma_px: float, *, rough: bool = False) -> SolverO
     )
 
 
-def _free_units(mapper: Mapper, *, georeferenced: bool) -> Bools:
-    """All registered units; without positions the first one holds the frame."""
+def _free_units(mapper: Mapper, absolute: AbsolutePriors) -> Bools:
+    """All registered units; where nothing else holds the frame, the first one does."""
     free = mapper.registered.copy()
-    if not georeferenced:
+    if not (absolute.hold_the_frame and mapper.config.bundle_adjustment.priors):
         free[np.flatnonzero(free)[0]] = False
     return free
 
@@ -392,7 +378,7 @@ def _observation_sigma(mapper: Mapper) -> float:
     return float(np.clip(sigma, *SIGMA_PX_RANGE))
 
 
-def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> list[Term]:
+def _terms(mapper: Mapper, result: Refinement) -> list[Term]:
     terms: list[Term] = []
     if not mapper.config.bundle_adjustment.priors:
         return terms
@@ -405,29 +391,10 @@ def _terms(mapper: Mapper, positions: PositionPrior | None, result: Refinement) 
         terms.append(intrinsics_prior(mapper))
     if result.times_vary:
         terms.append(time_prior(mapper, mean_varies=result.mean_time_varies, held=result.held_times))
-    if positions is not None:
-        terms += [
-            positions,
-            UprightPrior(
-                unit=np.flatnonzero(mapper.registered),
-                sigma_roll_rad=float(SIGMA_ROLL_RAD),
-                sigma_pitch_rad=float(SIGMA_PITCH_RAD),
-            ),
-        ]
-    return terms
+    return terms + result.absolute.terms(mapper)
 
 
-def _with_common_error(mapper: Mapper, result: Refinement, certainty: Covariances | None) -> Covariances | None:
-    """The certainty with what the receiver's positions are off by together, which no image shows."""
-    if certainty is None or result.placement is None or result.placement.prior is None:
-        return certainty
-    good = result.placement.inlier
-    sigma_m = np.sqrt((result.placement.sigma_m[good] ** 2).mean(0)) * result.placement.noise_factor
-    common_m = receiver_errors(mapper, result.placement).common * sigma_m
-    return replace(certainty, sigma_unit_position_m=np.hypot(certainty.sigma_unit_position_m, common_m))
-
-
-def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refinement) -> Covariances | None:
+def _certainty(mapper: Mapper, result: Refinement) -> Covariances | None:
     """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
 
     None where they would not be those of what was adjusted, and where there is too much for an inverse.
@@ -436,9 +403,7 @@ def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refineme
         return None
     several = not mapper.drive.has_single_camera
     terms = [
-        term
-        for term in _terms(mapper, positions, result)
-        if result.calibration.free or not isinstance(term, CalibrationPrior)
+        term for term in _terms(mapper, result) if result.calibration.free or not isinstance(term, CalibrationPrior)
     ]
     if several and not result.calibration.free:
         terms.append(calibration_prior(mapper))
@@ -453,7 +418,7 @@ def _certainty(mapper: Mapper, positions: PositionPrior | None, result: Refineme
         terms += [] if result.times_vary else [time_prior(mapper, mean_varies=False)]
         terms.append(ReadoutPrior(sigma_s=SIGMA_READOUT_S))
     problem, _ = mapper.problem(
-        _free_units(mapper, georeferenced=positions is not None),
+        _free_units(mapper, result.absolute),
         free_cameras=np.full(len(mapper.camera_kind), several),
         free_intrinsics=free_intrinsics,
         free_times=np.full(len(mapper.camera_kind), times_vary),

@@ -19,9 +19,10 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import OBSERVED_RATIO, ONLY_PRIOR_RATIO
-from mrasfm_engine.bundle_adjustment.priors import PositionPrior, TimePrior, robust_gauge_weights
-from mrasfm_engine.geometry import se3
+from mrasfm_engine.bundle_adjustment.priors import TimePrior, robust_gauge_weights
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.mapping.calibration import median_depth_m
+from mrasfm_engine.mapping.georeferencing import rigid_motions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import Bools, Floats
@@ -85,20 +86,18 @@ def _sigma_s(mapper: Mapper) -> Floats:
     return np.array([camera.sigma_time_offset_us or default_us for camera in mapper.drive.cameras]) / 1e6
 
 
-def positions_may_tell_time(mapper: Mapper, positions: PositionPrior) -> bool:
+def positions_may_tell_time(mapper: Mapper, positions: ReceiverPositions) -> bool:
     """True where positions would know the offsets' mean better than its prior does, if the scene could not bend.
 
     Wherever the scene lies, and however large it is.
     """
-    state, n = mapper.state, len(positions.unit)
-    velocity_mps = mapper.motion.velocity_mps(state, mapper.registered)[positions.unit]
-    place_m = state.unit_position_m[positions.unit] - state.unit_position_m[positions.unit].mean(0)
-    moves = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), -se3.skew(place_m), place_m[:, :, None]], axis=2)
-    moves = (moves / positions.sigma_m[:, :, None]).reshape(3 * n, 7)
-    shift = (velocity_mps / positions.sigma_m).ravel()
-    left = shift - moves @ np.linalg.lstsq(moves, shift)[0]
+    velocity_mps = mapper.motion.velocity_mps(mapper.state, mapper.registered)[positions.unit]
+    place_m = mapper.state.unit_position_m[positions.unit]
+    place_m = place_m - place_m.mean(0)
+    moves = np.concatenate([rigid_motions(place_m), place_m[:, :, None]], axis=2)
     sigma_s = _sigma_s(mapper)
-    return bool((left**2).sum() * (sigma_s**2).mean() / len(sigma_s) > OBSERVED_RATIO**-2)
+    known = positions.information_given(velocity_mps, moves)
+    return bool(known * (sigma_s**2).mean() / len(sigma_s) > OBSERVED_RATIO**-2)
 
 
 def positions_tell_time(mapper: Mapper, certainty: Covariances) -> bool:

@@ -16,6 +16,7 @@ from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.incremental_mapping import map_units
 from mrasfm_engine.mapping.mapper import Mapper
@@ -169,9 +170,6 @@ def _adjusted(drive: SimulatedDrive, rng: np.random.Generator) -> tuple[Mapper, 
     settings = BundleAdjustmentConfig(sigma_rotation_deg=OFF_DEG, sigma_translation_m=OFF_M)
     bands = RowBands.from_drive(drive.drive, compensate=True)
     keypoints = Keypoints.from_features(drive.drive, drive.features, bands)
-    mapper, _ = map_units(
-        drive.drive, keypoints, true_matches(drive), None, EngineConfig(bundle_adjustment=settings)
-    )  # fmt: skip
     antenna_m = se3.apply(drive.world_from_rig, ANTENNA_M[None])[:, 0]
     track = GnssTrack(
         timestamps_us=drive.drive.timestamps_us,
@@ -179,7 +177,15 @@ def _adjusted(drive: SimulatedDrive, rng: np.random.Generator) -> tuple[Mapper, 
         sigma_m=np.tile(GNSS_M, (len(antenna_m), 1)),
         good=np.ones(len(antenna_m), dtype=np.bool_),
     )
-    return mapper, refine(mapper, gnss=track, antenna_in_rig_m=ANTENNA_M, rough_world_from_rig=None)
+    mapper, _ = map_units(
+        drive.drive,
+        keypoints,
+        true_matches(drive),
+        None,
+        EngineConfig(bundle_adjustment=settings),
+        absolute=AbsolutePriors(gnss=track, antenna_in_rig_m=ANTENNA_M),
+    )
+    return mapper, refine(mapper, AbsolutePriors(gnss=track, antenna_in_rig_m=ANTENNA_M))
 
 
 def _camera_errors(mapper: Mapper, drive: SimulatedDrive) -> np.ndarray:

@@ -10,6 +10,7 @@ from mrasfm_engine.bundle_adjustment.priors import (
     CalibrationPrior,
     CameraPosePrior,
     PositionPrior,
+    RotationPrior,
     Term,
     UprightPrior,
     robust_gauge_weights,
@@ -162,6 +163,18 @@ def test_one_wrong_position_loses_its_pull() -> None:
 
     assert 5 < pull(0.1) < 10
     assert 0 < pull(50.0) < 0.1 * pull(0.1)
+
+
+def test_rotation_prior() -> None:
+    case, state = free_case()
+    measured = se3.exp_so3(0.05 * np.random.default_rng(0).normal(size=(3, 3))) @ case.truth.unit_rotation[[0, 1, 3]]
+    prior = RotationPrior(unit=np.array([0, 1, 3]), rotation=measured, sigma_rad=np.array([0.01, 0.03, 0.02]))
+    h = check_gradient(prior, case, state)
+    assert h[:3, :3].any()
+    assert not h[3:6, 3:6].any()
+    assert prior.cost(replace(case.truth, unit_rotation=case.truth.unit_rotation)) > 1
+    exact = replace(prior, rotation=case.truth.unit_rotation[[0, 1, 3]])
+    assert exact.cost(case.truth) == pytest.approx(0.0, abs=1e-20)
 
 
 def test_upright_prior() -> None:

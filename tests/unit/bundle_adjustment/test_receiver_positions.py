@@ -26,7 +26,7 @@ def free_units(fixed: int | None = None) -> Layout:
 def moving(rng: np.random.Generator) -> State:
     return State(
         unit_rotation=se3.exp_so3(0.2 * rng.normal(size=(UNITS, 3))),
-        unit_position_m=np.cumsum(rng.normal(size=(UNITS, 3)) + [2, 0, 0], axis=0),
+        unit_position_m=np.cumsum(np.array([2.0, 0.0, 0.0]) + rng.normal(size=(UNITS, 3)), axis=0),
         camera_rotation=np.eye(3)[None],
         camera_position_m=np.zeros((1, 3)),
         camera_params=np.ones((1, 8)),
@@ -48,7 +48,7 @@ def received(state: State, rng: np.random.Generator, **changes: object) -> Recei
         knots_s=time_s,
         wander_time_s=WANDER_TIME_S,
     )
-    return replace(term, **changes)  # type: ignore[arg-type]
+    return replace(term, **changes)
 
 
 def covariances(term: ReceiverPositions) -> list[np.ndarray]:

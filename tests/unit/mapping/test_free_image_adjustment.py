@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, RotationPrior, UprightPrior
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig, GnssConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import assess_calibration, calibration_prior
 from mrasfm_engine.mapping.free_image_adjustment import MIN_OBSERVATIONS, terms_of_images
 from mrasfm_engine.mapping.mapper import Mapper
@@ -124,19 +126,24 @@ def test_positions_hold_for_every_image_with_the_weight_of_one_unit() -> None:
     image_unit = np.repeat(np.arange(4), 3)
     adjusted = np.ones(12, dtype=np.bool_)
     adjusted[[0, 1, 2, 4]] = False
-    positions = PositionPrior(
-        unit=np.array([0, 1, 3]), position_m=np.arange(9.0).reshape(3, 3), sigma_m=np.full((3, 3), 0.6),
-        lever_arm_m=np.array([0.1, 0.2, 0.3]),
+    positions = ReceiverPositions.from_samples(
+        unit=np.array([0, 1, 3]), position_m=np.arange(9.0).reshape(3, 3), white_m=np.full((3, 3), 0.6),
+        wander_m=np.zeros((3, 3)), lever_arm_m=np.array([0.1, 0.2, 0.3]), time_s=np.array([0.0, 0.1, 0.3]),
+        wander_time_s=60.0, least_spacing_s=1.0,
     )  # fmt: skip
+    turns = RotationPrior(unit=np.array([1, 3]), rotation=np.tile(np.eye(3), (2, 1, 1)), sigma_rad=np.array([0.1, 0.2]))
     upright = UprightPrior(unit=np.arange(3), sigma_roll_rad=0.1, sigma_pitch_rad=0.1)
     calibration = CalibrationPrior(
         rotation=np.eye(3)[None], position_m=np.zeros((1, 3)), sigma_rotation_rad=np.ones(1),
         sigma_translation_m=np.ones(1),
     )  # fmt: skip
-    of_images = terms_of_images([positions, calibration, upright], image_unit, adjusted)
-    assert len(of_images) == 2
-    position, level = of_images
-    assert isinstance(position, PositionPrior)
+    of_images = terms_of_images([positions, calibration, turns, upright], image_unit, adjusted)
+    assert len(of_images) == 3
+    position, turn, level = of_images
+    assert isinstance(position, ReceiverPositions)
+    assert isinstance(turn, RotationPrior)
+    assert turn.unit.tolist() == [3, 5, 9, 10, 11]
+    np.testing.assert_allclose(np.bincount(image_unit[turn.unit], turn.sigma_rad**-2), [0, 100, 0, 25])
     assert isinstance(level, UprightPrior)
     assert position.unit.tolist() == [3, 5, 9, 10, 11]
     np.testing.assert_allclose(position.position_m[:, 0], [3, 3, 6, 6, 6])
@@ -169,13 +176,7 @@ def refined(adjustment: BundleAdjustmentConfig, *, bent: bool) -> tuple[Mapper, 
     gnss = GnssTrack(
         timestamps_us=times, position_m=position, sigma_m=np.full((20, 3), 0.1), good=np.ones(20, dtype=np.bool_)
     )
-    result = refine(
-        mapper,
-        gnss=gnss if bent else None,
-        antenna_in_rig_m=np.zeros(3) if bent else None,
-        rough_world_from_rig=None,
-    )
-    return mapper, result
+    return mapper, refine(mapper, AbsolutePriors(gnss=gnss if bent else None, antenna_in_rig_m=np.zeros(3)))
 
 
 def distances(mapper: Mapper) -> np.ndarray:

@@ -8,6 +8,7 @@ import pytest
 from mrasfm_engine.bundle_adjustment.priors import PositionPrior
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
@@ -64,7 +65,7 @@ def test_what_is_not_observed_is_held_and_said() -> None:
 
 def test_focal_lengths_that_are_given_too_long_are_found() -> None:
     mapper, simulated = model(straight=False, focal=1.01)
-    result = refine(mapper, gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M, rough_world_from_rig=None)
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
     assert result.intrinsics is not None
     assert result.intrinsics.free[:, :4].all()
     error = mapper.state.camera_params[:, 0] / simulated.truth.camera_params[:, 0] - 1

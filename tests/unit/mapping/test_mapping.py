@@ -239,7 +239,7 @@ def test_on_a_straight_street_a_calibration_that_is_nearly_right_is_held(off_deg
     mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1))
     assert heading_change_deg(mapper) < 5
     assert np.abs(mapper.state.rig_from_cam - simulated.drive.rig_from_cam).max() > 1e-5  # it varies while mapping
-    result = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    result = refine(mapper)
     assert not result.calibration.free
     np.testing.assert_array_equal(mapper.state.rig_from_cam, simulated.drive.rig_from_cam)
     assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < (0.03 if off_deg == 0.0 else 1.0)
@@ -251,7 +251,7 @@ def test_a_camera_that_looks_aside_does_not_decide_the_scale(off_deg: float) -> 
     simulated = make_simulated_drive(units=24, cameras=2, points=1500, straight=True, given=turned_away(off_deg))
     mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1))
     assert mapper.registered.all()
-    result = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    result = refine(mapper)
     assert result.calibration.free
     assert "contradict" in result.calibration.reason
     scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
@@ -266,7 +266,7 @@ def test_gates_hold_a_camera_that_looks_aside_and_lose_the_scale() -> None:
     simulated = make_simulated_drive(units=24, cameras=2, points=1500, straight=True, given=turned_away(0.5))
     settings = EngineConfig().bundle_adjustment.model_copy(update={"reassessment": False})
     mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1, bundle_adjustment=settings))
-    result = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    result = refine(mapper)
     assert not result.calibration.free
     np.testing.assert_array_equal(mapper.state.rig_from_cam, simulated.drive.rig_from_cam)
     scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale

@@ -45,7 +45,7 @@ def refined(simulated: SimulatedDrive) -> tuple[Mapper, Refinement]:
     """From true poses of the units, and the calibration as given, adjusted as mapping does."""
     mapper = with_true_poses(make_model(simulated), simulated, range(len(simulated.world_from_rig)))
     adjust_globally(mapper, MappingLog(), None)
-    return mapper, refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    return mapper, refine(mapper)
 
 
 def drive(given, *, straight: bool = False) -> SimulatedDrive:  # type: ignore[no-untyped-def]

@@ -166,7 +166,7 @@ def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
     for config in (ON, OFF):
         mapper = make_model(simulated, pairs, config)
         log = run_incremental_mapping(mapper, pairs, None)
-        refinement = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+        refinement = refine(mapper)
         results.append((mapper, log, refinement))
     (on, log, refinement), (off, _, switched_off) = results
     np.testing.assert_array_equal(on.state.points_m[on.triangulated], off.state.points_m[off.triangulated])
@@ -181,7 +181,7 @@ def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
 def test_bad_road_points_do_not_pull_the_poses(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
     simulated, moving = shadows
     mapper = mapped(simulated)
-    refinement = refine(mapper, gnss=None, antenna_in_rig_m=None, rough_world_from_rig=None)
+    refinement = refine(mapper)
     assert isinstance(refinement.road, RoadAssessment)
     report = describe_refinement(mapper, refinement)["road"]
     assert report["source"] == "masks"

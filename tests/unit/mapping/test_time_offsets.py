@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import Refinement, refine
 from mrasfm_engine.mapping.time_offsets import time_prior, times_may_vary
@@ -48,7 +49,7 @@ def model(
 
 def refined(mapper: Mapper, simulated: SimulatedDrive, sigma_m: float | None = None) -> Refinement:
     gnss = None if sigma_m is None else received(simulated, sigma_m)
-    return refine(mapper, gnss=gnss, antenna_in_rig_m=None if gnss is None else ARM_M, rough_world_from_rig=None)
+    return refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M))
 
 
 @pytest.mark.parametrize("apart", [True, False])

@@ -1,0 +1,150 @@
+"""Priors of the units' absolute poses in every adjustment: positions of a receiver, rough poses and gravity.
+
+They stand in local and global adjustments from the first units on that show how they lie to the scene, and are judged
+again by the scene after every global adjustment: each position against those that are near in time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.priors import RotationPrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
+from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.georeferencing import MOST, SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.placement import (
+    Placement,
+    compare_rough_poses,
+    place_by_gnss,
+    place_by_rough_poses,
+    positions_of_units,
+    reassess_positions,
+)
+from mrasfm_engine.types import Bools, Floats, Ints
+
+LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adjustment, that take part in it
+
+
+@dataclass(kw_only=True)
+class AbsolutePriors:
+    """What is known of the units' poses in the world, and how it fits the scene.
+
+    Attributes
+    ----------
+    gnss, antenna_in_rig_m
+        The receiver's track in the local frame and the lever arm (3,), or None.
+    rough_world_from_rig
+        Rough poses (units, 4, 4) in their own world, NaN where unknown, or None.
+    placement
+        Fit of the receiver's positions, once it was asked for.
+    rough
+        Fit of the rough poses' positions.
+    rough_rotations
+        Their rotations as a term.
+    """
+
+    gnss: GnssTrack | None = None
+    antenna_in_rig_m: Floats | None = None
+    rough_world_from_rig: Floats | None = None
+    placement: Placement | None = None
+    rough: Placement | None = None
+    rough_rotations: RotationPrior | None = None
+    placed_by_rough_poses: bool = False
+    clock_varies: bool = False  # whether the adjustment varies when all images were taken
+
+    @property
+    def positions(self) -> ReceiverPositions | None:
+        """The receiver's positions as a term, where they fit the scene."""
+        return None if self.placement is None else self.placement.prior
+
+    @property
+    def hold_the_frame(self) -> bool:
+        """True where they say how the scene lies, so that no unit has to be held."""
+        return self.positions is not None or self.rough is not None
+
+    def place(self, mapper: Mapper) -> None:
+        """Move the scene to where positions, or else rough poses, say that it is; both become terms."""
+        if self.gnss is not None and self.antenna_in_rig_m is not None:
+            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m, thorough=True)
+        sigma = mapper.drive.manifest.rough_poses
+        if self.positions is None and self.rough_world_from_rig is not None and sigma is not None:
+            self.placed_by_rough_poses = place_by_rough_poses(
+                mapper, self.rough_world_from_rig, sigma.sigma_translation_m
+            )
+        self._renew_rough(mapper)
+
+    def renew(self, mapper: Mapper) -> None:
+        """Judge them by the scene as it is now, and place the scene if that is not done yet.
+
+        Positions of which most contradict a scene are none of it: it is placed anew when it has grown.
+        """
+        settings = mapper.config.bundle_adjustment
+        if not (settings.priors and settings.reassessment):
+            return
+        if self.positions is not None:
+            self.reassess(mapper, thorough=False)
+            assert self.placement is not None
+            if self.placement.inlier.mean() < MOST:
+                self.placement = None
+        elif self.gnss is not None and self.antenna_in_rig_m is not None:
+            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m)
+        self._renew_rough(mapper)
+
+    def reassess(self, mapper: Mapper, *, thorough: bool = True) -> None:
+        """Judge positions by the adjusted scene, where they took part in it."""
+        if self.placement is not None and self.placement.prior is not None:
+            self.placement = reassess_positions(
+                mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
+            )
+
+    def _renew_rough(self, mapper: Mapper) -> None:
+        self.rough, self.rough_rotations = None, None
+        sigma = mapper.drive.manifest.rough_poses
+        if self.rough_world_from_rig is None or sigma is None or not mapper.config.bundle_adjustment.priors:
+            return
+        found = compare_rough_poses(
+            mapper, self.rough_world_from_rig, sigma.sigma_translation_m, np.radians(sigma.sigma_rotation_deg)
+        )
+        if found is not None:
+            self.rough, self.rough_rotations = found
+
+    def terms(self, mapper: Mapper) -> list[Term]:
+        """All of them as terms of an adjustment of all units."""
+        terms: list[Term] = []
+        if self.positions is not None:
+            terms += [self.positions, upright_prior(mapper, mapper.registered)]
+        if self.rough is not None and self.rough.prior is not None and self.rough_rotations is not None:
+            terms += [self.rough.prior, self.rough_rotations]
+        return terms
+
+    def local_terms(self, mapper: Mapper, free_units: Bools) -> list[Term]:
+        """Terms of an adjustment of some units (u,): their own, and positions near them that show the errors there."""
+        free = np.flatnonzero(free_units & mapper.registered)
+        near = _nearest(np.flatnonzero(mapper.registered), free)
+        terms: list[Term] = []
+        for placement in (self.placement, self.rough):
+            if placement is not None and placement.prior is not None:
+                terms.append(positions_of_units(mapper, placement, near))
+        if self.positions is not None:
+            terms.append(upright_prior(mapper, free_units))
+        return terms
+
+
+def upright_prior(mapper: Mapper, units: Bools) -> UprightPrior:
+    """Gravity as a term on some of the registered units (u,), with the weight that they have among all."""
+    chosen = np.flatnonzero(units & mapper.registered)
+    share = np.sqrt(mapper.registered.sum() / max(len(chosen), 1))
+    return UprightPrior(
+        unit=chosen, sigma_roll_rad=float(SIGMA_ROLL_RAD * share), sigma_pitch_rad=float(SIGMA_PITCH_RAD * share)
+    )
+
+
+def _nearest(units: Ints, free: Ints) -> Ints:
+    """Units, ascending, at most `LOCAL_POSITIONS` besides the free ones, that are nearest to one of these in time."""
+    after = np.searchsorted(free, units)
+    before, behind = free[np.maximum(after - 1, 0)], free[np.minimum(after, len(free) - 1)]
+    apart = np.minimum(np.abs(units - before), np.abs(units - behind))
+    return np.sort(units[np.argsort(apart, kind="stable")[: len(free) + LOCAL_POSITIONS]])
