@@ -188,7 +188,7 @@ class BundleAdjustmentConfig(_Section):
     )
     min_heading_change_deg: Positive = Field(
         15.0,
-        description="without GNSS, straighter drives put back cameras that moved by no more than lens models err",
+        description="with `reassessment = false` alone: without GNSS, straighter drives hold the calibration as given",
     )
 
 

@@ -118,7 +118,7 @@ def _with_scale(problem: Problem, state: State, eliminated: Eliminated, border: 
     `border` is the inverse's part of these unknowns, and after them of those of the terms.
     """
     split, free = UNIT_DOF * problem.layout.num_units, UNIT_DOF * problem.layout.num_units + eliminated.free
-    functional = _scale_functional(state.unit_position_m[problem.layout.unit_slot >= 0])
+    functional = scale_functional(state.unit_position_m[problem.layout.unit_slot >= 0])
     along, f = border @ (eliminated.coupled.T @ functional), len(free)
     columns = np.zeros((problem.layout.size, f + 1))  # of the inverse
     columns[:split, :-1], columns[free, :-1] = -eliminated.coupled @ border[:, :f], border[:f, :f]
@@ -172,7 +172,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     if np.isinf(units[:, 3:]).any():
         scale = np.inf
     elif len(position) >= 2:
-        functional = _scale_functional(position)
+        functional = scale_functional(position)
         scale = float(np.sqrt(max(float(functional @ covariance[:split, :split] @ functional), 0.0)))
     cameras = covariance[split:, split:]
     return _Marginals(units=units, cameras=cameras, cameras_of_independent_errors=cameras, sigma_scale=scale)
@@ -203,7 +203,7 @@ def _inverse(matrix: Floats) -> tuple[Floats, Bools]:
     return result, loose
 
 
-def _scale_functional(position: Floats) -> Floats:
+def scale_functional(position: Floats) -> Floats:
     """Derivative of the trajectory's size by a step (6 units,) of the units, relative to the size."""
     centred = position - position.mean(0)
     functional = np.zeros((len(position), UNIT_DOF))

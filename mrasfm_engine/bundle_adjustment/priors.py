@@ -267,6 +267,37 @@ class TimePrior:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ScalePrior:
+    """What given rotations of the cameras say of the scale: the residual is their corrections' effect on it over sigma.
+
+    All else about the rotations is left to other terms.
+    """
+
+    rotation: Floats  # (c, 3, 3) rig_from_cam, given
+    scale_by_rotation: Floats  # (c, 3) derivative of the logarithm of the scale by their corrections, in rig axes
+    sigma: float
+    sigma_scale: float  # of the scale, by both these rotations and lens models
+
+    def _residual(self, state: State) -> tuple[float, Floats]:
+        turn = se3.log_so3(state.camera_rotation @ np.swapaxes(self.rotation, 1, 2))
+        jacobian: Floats = (self.scale_by_rotation[:, None] @ se3.inverse_left_jacobian(turn))[:, 0] / self.sigma
+        return float((self.scale_by_rotation * turn).sum() / self.sigma), jacobian
+
+    def cost(self, state: State) -> float:
+        """See `Term`."""
+        return 0.5 * self._residual(state)[0] ** 2
+
+    def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
+        """See `Term`."""
+        residual, jacobian = self._residual(state)
+        free = np.flatnonzero(layout.camera_slot >= 0)
+        rows = ((layout.camera_dof * layout.camera_slot[free])[:, None] + np.arange(3)).ravel()
+        row = jacobian[free].ravel()
+        extra.cameras[np.ix_(rows, rows)] += np.outer(row, row)
+        extra.camera_gradient[rows] += residual * row
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReadoutPrior:
     """Knowledge of readouts that are not declared. As these are not estimated, it costs nothing."""
 

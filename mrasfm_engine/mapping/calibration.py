@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
-from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
@@ -18,10 +17,9 @@ from mrasfm_engine.matching.simultaneous import calibration_sigmas
 from mrasfm_engine.types import Bools, Floats
 
 STRAIGHT = "held as given: without GNSS a drive this straight does not observe it"
+FEW_UNITS = "held as given: too few units to tell what they err by together"
 MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
-LENS_SIGMA_PX = 0.5  # that lens models err by: what calibrations leave at their targets is of this size
-CONTRADICTED_SIGMAS = 3.0
 
 
 def calibration_prior(mapper: Mapper, held: Bools | None = None) -> CalibrationPrior:
@@ -91,36 +89,13 @@ def assess_calibration(
         if not np.isfinite(covariances(problem, problem.state, shared_errors=False).sigma_scale):
             return CalibrationDecision(False, "held as given: too few units to tell what freeing it would do")
     return CalibrationDecision(
-        True, "GNSS makes it observable" if georeferenced else "the drive turns enough to observe it"
+        True, "GNSS makes it observable" if georeferenced else "varies as far as the drive observes it"
     )
 
 
 def is_straight(mapper: Mapper) -> bool:
     """True where the drive turns too little to correct a calibration that is nearly right: it leaves the scale open."""
     return heading_change_deg(mapper) < mapper.config.bundle_adjustment.min_heading_change_deg
-
-
-def contradicted_cameras(mapper: Mapper, directions: Callable[[], Observability | None]) -> Bools:
-    """Cameras (c,) that the images have moved from where they began by more than lens models err.
-
-    Lens models are off by the same in all images, which no residual shows: along a straight street they turn cameras
-    against each other by some hundredths of a degree, and change the scale by per cents. What the drive observes is
-    asked only where a camera has moved by more.
-    """
-    prior, begun = calibration_prior(mapper), mapper.rig_as_begun
-    corrections = replace(prior, rotation=begun[:, :3, :3], position_m=begun[:, :3, 3]).corrections(mapper.state)
-    corrections -= np.median(corrections, axis=0) if len(corrections) > 2 else corrections.mean(0)
-    lens_rad = LENS_SIGMA_PX / mapper.state.camera_params[:, :2].mean(1) * np.sqrt(1.0 - 1.0 / len(corrections))
-    lens = np.repeat(np.stack([lens_rad, lens_rad * median_depth_m(mapper)], 1), 3, axis=1)
-    beyond = np.asarray(np.abs(corrections) > CONTRADICTED_SIGMAS * lens)
-    found = directions() if beyond.any() else None
-    if found is None:
-        return np.zeros(len(corrections), dtype=np.bool_)
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    posterior = np.nan_to_num(found.ratio, nan=1.0) * sigma
-    beyond = beyond & found.observed & (np.abs(corrections) > CONTRADICTED_SIGMAS * np.hypot(posterior, lens))
-    result: Bools = beyond.any(axis=1)
-    return result
 
 
 def median_depth_m(mapper: Mapper) -> float:

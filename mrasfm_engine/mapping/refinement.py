@@ -9,23 +9,22 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, Term
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
-    STRAIGHT,
+    FEW_UNITS,
     CalibrationDecision,
     assess_calibration,
     calibration_prior,
-    contradicted_cameras,
-    is_straight,
     resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
 )
+from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
@@ -73,6 +72,7 @@ class Refinement:
     sigma_px: float = 1.0
     absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
+    given_scale: ScalePrior | None = None  # what the rotations as given say of it, where positions do not
     intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
     times_vary: bool = False
     mean_time_varies: bool = False
@@ -139,12 +139,21 @@ def refine(
         options=_options(mapper, result.sigma_px),
     )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    if result.calibration.free and not result.georeferenced and is_straight(mapper):
-        _hold_unless_contradicted(mapper, free_units, result)
+    few = not result.georeferenced and _reassesses(mapper) and mapper.registered.sum() < MIN_UNITS
+    if result.calibration.free and few:
+        _hold_unless_wrong(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)
     if result.times_vary and absolute.positions is not None:
         result.mean_time_varies = positions_may_tell_time(mapper, absolute.positions)
         absolute.clock_varies = result.mean_time_varies
+    if result.calibration.free and not result.georeferenced and not few and _reassesses(mapper):
+        result.given_scale = scale_of_given_rotations(
+            mapper,
+            free_units=free_units,
+            free_times=result.recalibrated if result.times_vary else None,
+            terms=_terms(mapper, result),
+            options=_options(mapper, result.sigma_px),
+        )
     result.intrinsics = held_intrinsics(mapper)
     if mapper.config.bundle_adjustment.refine_focal and result.calibration.free:
         result.intrinsics = assess_intrinsics(
@@ -175,7 +184,7 @@ def refine(
         if progress is not None:
             progress(min(done, ROUNDS), ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
-    result.certainty = _certainty(mapper, result)
+    result.certainty = _with_lens_errors(result, _certainty(mapper, result))
     result.directions = _directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
@@ -259,33 +268,24 @@ def _reassesses(mapper: Mapper) -> bool:
     return settings.priors and settings.reassessment
 
 
-def _hold_unless_contradicted(mapper: Mapper, free_units: Bools, result: Refinement) -> None:
-    """Put cameras that mapping has moved by no more than lens models err back to where they were.
+def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) -> None:
+    """Put cameras back to where they began, but for those that are far off.
 
-    A straight street leaves the scale to the calibration, but shows very well that a camera looks elsewhere than the
-    others say.
+    So few units do not tell what they err by as a whole.
     """
-
-    def directions() -> Observability | None:
-        problem, _ = mapper.problem(
-            free_units,
-            free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-            terms=_terms(mapper, result),
-            options=_options(mapper, result.sigma_px),
-        )
-        return _directions(mapper, covariances(problem, problem.state))
-
-    if mapper.registered.sum() >= MIN_UNITS:
-        wrong = contradicted_cameras(mapper, directions)
-    else:
-        # So few units do not tell what they err by as a whole: only what is far off is believed.
-        found, wrong = directions(), np.zeros(len(mapper.camera_kind), dtype=np.bool_)
-        known = [] if found is None else find_miscalibrations(calibration_prior(mapper), mapper.state, found)
-        wrong[[miscalibrated.camera for miscalibrated in known]] = True
+    problem, _ = mapper.problem(
+        free_units,
+        free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
+        terms=_terms(mapper, result),
+        options=_options(mapper, result.sigma_px),
+    )
+    found, wrong = _directions(mapper, covariances(problem, problem.state)), np.zeros_like(result.recalibrated)
+    if found is not None:
+        wrong[[one.camera for one in find_miscalibrations(calibration_prior(mapper), mapper.state, found)]] = True
     if wrong.any() and (~wrong).sum() < MIN_OTHERS:
         result.calibration = CalibrationDecision(True, "images contradict what was given")
         return
-    result.calibration = CalibrationDecision(False, STRAIGHT)
+    result.calibration = CalibrationDecision(False, FEW_UNITS)
     result.recalibrated = wrong
     mapper.begin_anew(~wrong)
 
@@ -384,6 +384,7 @@ def _terms(mapper: Mapper, result: Refinement) -> list[Term]:
         return terms
     if result.calibration.free:
         terms.append(calibration_prior(mapper, result.held))
+        terms += [] if result.given_scale is None else [result.given_scale]
     elif result.recalibrated.any():
         # The cameras that stay hold the gauge.
         terms.append(replace(calibration_prior(mapper), gauge_weights=(~result.recalibrated).astype(np.float64)))
@@ -392,6 +393,13 @@ def _terms(mapper: Mapper, result: Refinement) -> list[Term]:
     if result.times_vary:
         terms.append(time_prior(mapper, mean_varies=result.mean_time_varies, held=result.held_times))
     return terms + result.absolute.terms(mapper)
+
+
+def _with_lens_errors(result: Refinement, certainty: Covariances | None) -> Covariances | None:
+    """The certainty with what lens models and given rotations leave open of the scale, where positions do not tell."""
+    if certainty is None or result.given_scale is None:
+        return certainty
+    return replace(certainty, sigma_scale=float(np.hypot(certainty.sigma_scale, result.given_scale.sigma_scale)))
 
 
 def _certainty(mapper: Mapper, result: Refinement) -> Covariances | None:

@@ -11,6 +11,7 @@ from mrasfm_engine.bundle_adjustment.priors import (
     CameraPosePrior,
     PositionPrior,
     RotationPrior,
+    ScalePrior,
     Term,
     UprightPrior,
     robust_gauge_weights,
@@ -163,6 +164,20 @@ def test_one_wrong_position_loses_its_pull() -> None:
 
     assert 5 < pull(0.1) < 10
     assert 0 < pull(50.0) < 0.1 * pull(0.1)
+
+
+def test_scale_prior_asks_for_one_combination_of_rotations() -> None:
+    case, state = free_case()
+    rng = np.random.default_rng(0)
+    cameras = len(case.truth.camera_rotation)
+    prior = ScalePrior(
+        rotation=case.truth.camera_rotation, scale_by_rotation=rng.normal(size=(cameras, 3)), sigma=0.01,
+        sigma_scale=0.01,
+    )  # fmt: skip
+    h = check_gradient(prior, case, state)
+    assert np.linalg.matrix_rank(h) == 1
+    assert prior.cost(state) > 0.01
+    assert prior.cost(case.truth) == pytest.approx(0.0, abs=1e-20)
 
 
 def test_rotation_prior() -> None:

@@ -233,16 +233,16 @@ def test_calibration_is_refined_where_the_drive_turns() -> None:
 
 
 @pytest.mark.parametrize("off_deg", [0.0, 0.03])
-def test_on_a_straight_street_a_calibration_that_is_nearly_right_is_held(off_deg: float) -> None:
-    """Correcting it would cost more in scale than it gains."""
+def test_on_a_straight_street_a_calibration_that_is_nearly_right_has_its_say(off_deg: float) -> None:
+    """Its rotations know the scale about as well as images do whose lens models are off by half a pixel."""
     simulated = make_simulated_drive(units=24, cameras=2, points=1500, straight=True, given=turned_away(off_deg))
     mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1))
     assert heading_change_deg(mapper) < 5
     assert np.abs(mapper.state.rig_from_cam - simulated.drive.rig_from_cam).max() > 1e-5  # it varies while mapping
     result = refine(mapper)
-    assert not result.calibration.free
-    np.testing.assert_array_equal(mapper.state.rig_from_cam, simulated.drive.rig_from_cam)
-    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < (0.03 if off_deg == 0.0 else 1.0)
+    assert result.calibration.free
+    assert result.given_scale is not None
+    assert 1e-4 < rmse(metric_errors_m(mapper, simulated)) < (0.03 if off_deg == 0.0 else 0.2)
 
 
 @pytest.mark.parametrize("off_deg", [-1.5, -0.5, 0.5, 1.5])
@@ -253,7 +253,6 @@ def test_a_camera_that_looks_aside_does_not_decide_the_scale(off_deg: float) -> 
     assert mapper.registered.all()
     result = refine(mapper)
     assert result.calibration.free
-    assert "contradict" in result.calibration.reason
     scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
     assert abs(scale - 1) < 0.03
     between, true = (

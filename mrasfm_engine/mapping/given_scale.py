@@ -1,0 +1,139 @@
+"""What the given rotations of the cameras say of the scale, beside what the drive says.
+
+Two cameras that are turned against each other by a little see all points nearer or farther: along a straight street
+that looks like another scale, and only lens models, which err by the same in all images, tell the two apart. A turn
+tells them apart much better. No residual shows errors of lens models, so an adjustment is far too certain of the scale.
+
+With x the corrections of the cameras' rotations and l the errors of the lens models, the adjustment finds the scale
+
+    s = a'x   with the rotations as given, whose errors x are those of a calibration
+    s = b'l   with the rotations as it finds them
+
+Both are estimates of one scale, and it is best known by their mean with the weights of their variances. How far the
+drive moves cameras in other directions says how good the given rotations are. Every other
+direction of the calibration stays free: one residual a'x on the rotations is added, whose sigma gives it the weight
+that it has against the images as these are weighed by the adjustment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.marginal_covariances import scale_functional
+from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, ScalePrior, Term
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRINSICS
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.types import Bools, Floats
+
+LENS_SIGMA_PX = 0.5  # RMS over an image of what each parameter of a lens model is off by
+# Rotations are means over whole images of what lens models leave: about as many independent errors as parameters.
+PATTERNS = 10
+ROTATION_SIGMA_PX = LENS_SIGMA_PX / np.sqrt(PATTERNS)
+CONTRADICTED_SIGMAS = 3.0
+RIDGE = 1e-9
+
+
+def scale_of_given_rotations(
+    mapper: Mapper, *, free_units: Bools, free_times: Bools | None, terms: Sequence[Term], options: SolverOptions
+) -> ScalePrior | None:
+    """The residual on the rotations; None where images say nothing of the scale, or rotations nothing.
+
+    Parameters
+    ----------
+    free_units, free_times, terms, options
+        Of the adjustment that follows, with the calibration's prior.
+    """
+    cameras = len(mapper.camera_kind)
+    lens = _lens_sigmas(mapper)
+    nuisance = IntrinsicsPrior(params=mapper.state.camera_params, sigma=lens)
+    problem, _ = mapper.problem(
+        free_units,
+        free_cameras=np.ones(cameras, dtype=np.bool_),
+        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
+        free_times=free_times,
+        terms=[*terms, nuisance],
+        options=options,
+    )
+    system = problem.normal_equations(problem.state, 0.0)
+    eliminated = system.eliminate(np.zeros(len(system.gradient)))
+    if eliminated is None or eliminated.cameras is None:
+        return None
+    functional = scale_functional(problem.state.unit_position_m[problem.layout.unit_slot >= 0])
+    by_border = -(eliminated.coupled.T @ functional)[: len(eliminated.free)]  # of the scale, if nothing else varies
+    place = eliminated.free % problem.layout.camera_dof
+    of_lens, of_rotation = np.isin(place, PLACES_OF_INTRINSICS), place < 3
+    of_rest, of_rig = ~of_lens & ~of_rotation, ~of_lens
+    factor = np.tril(eliminated.cameras[0])
+    known = (factor @ factor.T)[: len(place), : len(place)]
+    known = known + RIDGE * np.diag(np.diagonal(known))
+
+    def if_varied(chosen: Bools, others: Bools) -> Floats:
+        """Derivatives of the scale by some unknowns of the border, while others are at their best for each value."""
+        between = known[np.ix_(chosen, others)]
+        result: Floats = by_border[chosen] - between @ np.linalg.solve(known[np.ix_(others, others)], by_border[others])
+        return result
+
+    by_lens, by_rotation = if_varied(of_lens, of_rig), if_varied(of_rotation, of_rest).reshape(cameras, 3)
+    moved_px, by_px = _moved_px(mapper), by_rotation / mapper.state.camera_params[:, :2].mean(axis=1)[:, None]
+    of_given = float(np.linalg.norm(by_px)) * _rotation_sigma_px(moved_px, by_px)
+    of_free = float(np.linalg.norm(by_lens * lens.ravel()))
+    along = np.zeros(int(of_rig.sum()))
+    along[of_rotation[of_rig]] = by_rotation.ravel()
+    as_weighed = float(along @ np.linalg.solve(known[np.ix_(of_rig, of_rig)], along))
+    if not (of_given > 0.0 and of_free > 0.0 and as_weighed > 0.0):
+        return None
+    # What contradicts the images by many sigmas is no estimate of the same scale [Geman and McClure's weight].
+    off = float((by_px * moved_px).sum()) / np.hypot(of_given, of_free)
+    share = 1.0 / (1.0 + (off / CONTRADICTED_SIGMAS) ** 2)
+    return ScalePrior(
+        rotation=mapper.rig_as_begun[:, :3, :3],
+        scale_by_rotation=by_rotation,
+        sigma=float(np.sqrt(as_weighed) * of_given / of_free / share),
+        sigma_scale=1.0 / float(np.hypot(1.0 / of_given, 1.0 / of_free)),
+    )
+
+
+def _moved_px(mapper: Mapper) -> Floats:
+    """Turns (c, 3) of the cameras from where they began against one another, in pixels at the images' centres."""
+    given = mapper.rig_as_begun[:, :3, :3]
+    moved = se3.log_so3(mapper.state.camera_rotation @ np.swapaxes(given, 1, 2))
+    moved = moved * mapper.state.camera_params[:, :2].mean(axis=1)[:, None]
+    result: Floats = moved - (np.median(moved, axis=0) if len(moved) > 2 else moved.mean(axis=0))
+    return result
+
+
+def _rotation_sigma_px(moved_px: Floats, by_rotation: Floats) -> float:
+    """Standard deviation of the given rotations by how far the drive turns them (c, 3) otherwise than along one way.
+
+    As many independent errors as a lens model has parameters say what is usual, before the drive says anything.
+    """
+    along = by_rotation / max(float(np.linalg.norm(by_rotation)), 1e-30)
+    other = moved_px - along * (along * moved_px).sum()
+    counted = max(3 * (len(moved_px) - 1) - 1, 0)
+    return float(np.sqrt((PATTERNS * ROTATION_SIGMA_PX**2 + (other**2).sum()) / (PATTERNS + counted)))
+
+
+def _lens_sigmas(mapper: Mapper) -> Floats:
+    """Standard deviations (c, INTRINSICS) at which parameters move a camera's keypoints by `LENS_SIGMA_PX`, RMS."""
+    result = np.empty((len(mapper.camera_kind), INTRINSICS))
+    for c, params in enumerate(mapper.state.camera_params):
+        x, y = ((mapper.keypoints.xy_px[mapper.keypoints.camera == c] - params[2:4]) / params[:2]).T
+        r2, one = x**2 + y**2, np.ones_like(x)
+        moved = [
+            r2**0.5,
+            y,
+            one,
+            one,
+            r2**1.5,
+            r2**2.5,
+            np.hypot(2 * x * y, r2 + 2 * y**2),
+            np.hypot(2 * x * y, r2 + 2 * x**2),
+        ]
+        by_parameter = np.sqrt((np.array(moved) ** 2).mean(axis=1)) * params[:2].mean()
+        by_parameter[2:4] = 1.0
+        result[c] = LENS_SIGMA_PX / np.maximum(by_parameter, 1e-6)
+    return result

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.mapping import refinement
+from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
+from mrasfm_engine.mapping.refinement import Refinement, refine
+from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+
+UNITS = 20
+
+
+def lens_errors(xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Sum (n, 2) of what parameters of a lens model do, with an RMS of one each times its size (6,).
+
+    Calibrations find rotations and lens models together: what is left turns no camera.
+    """
+    (x, y), r2 = xy.T, (xy**2).sum(1)
+    tangential = [np.stack([2 * x * y, r2 + 2 * y**2], 1), np.stack([r2 + 2 * x**2, 2 * x * y], 1)]
+    fields = [xy, np.stack([0 * y, y], 1), xy * r2[:, None], xy * r2[:, None] ** 2, *tangential]
+    result: np.ndarray = np.sum([k * f / np.sqrt((f**2).sum(1).mean()) for k, f in zip(sizes, fields, strict=True)], 0)
+    return (result - result.mean(0)).astype(np.float32)
+
+
+def drive(
+    seed: int,
+    *,
+    straight: bool,
+    units: int = UNITS,
+    lens_px: float = LENS_SIGMA_PX,
+    turned_px: float = ROTATION_SIGMA_PX,
+) -> SimulatedDrive:
+    """A straight street and two cameras whose lens models and rotations are off by what calibrations leave."""
+    rng = np.random.default_rng([seed, 1])
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, straight=True, noise_px=0.2, seed=seed)
+    focal_px = float(simulated.truth.camera_params[0, 0])
+
+    features, sizes = [], rng.normal(size=(2, 6))
+    for image, found in zip(simulated.drive.images, simulated.features, strict=True):
+        xy = (found.xy_px - simulated.truth.camera_params[image.camera, 2:4]) / focal_px
+        features.append(replace(found, xy_px=found.xy_px + (lens_px * lens_errors(xy, sizes[image.camera]))))
+    cameras = []
+    for camera in simulated.drive.manifest.rig.cameras:
+        turn = se3.exp_so3(rng.normal(0, turned_px / focal_px, 3))
+        x, y, z, w = camera.rig_from_cam.rotation_xyzw
+        given = turn @ se3.rotation_from_quaternion(np.array([x, y, z, w]))
+        rotation = se3.quaternion_from_rotation(given).tolist()
+        pose = camera.rig_from_cam.model_copy(update={"rotation_xyzw": rotation})
+        cameras.append(camera.model_copy(update={"rig_from_cam": pose}))
+    rig = simulated.drive.manifest.rig.model_copy(update={"cameras": cameras})
+    manifest = simulated.drive.manifest.model_copy(update={"rig": rig})
+    return replace(simulated, features=features, drive=replace(simulated.drive, manifest=manifest))
+
+
+def refined(simulated: SimulatedDrive, *, free: bool = True) -> tuple[float, Refinement]:
+    """Error of the logarithm of the scale, and the refinement."""
+    settings = BundleAdjustmentConfig(refine_calibration=free)
+    mapper = with_true_poses(
+        make_model(simulated, config=EngineConfig(threads=1, bundle_adjustment=settings)),
+        simulated,
+        range(len(simulated.world_from_rig)),
+    )
+    result = refine(mapper)
+    found = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3])
+    return float(np.log(found.scale)), result
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_scale_is_better_known_than_by_either_and_as_well_as_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors of lens models and of rotations show in no residual."""
+    drives = [drive(seed) for seed in range(8)]
+    both, sigmas = [], []
+    for one in drives:
+        error, result = refined(one)
+        assert result.calibration.free
+        assert result.given_scale is not None
+        both.append(error)
+        sigmas.append(result.given_scale.sigma_scale)
+    held = [refined(one, free=False)[0] for one in drives]
+    monkeypatch.setattr(refinement, "scale_of_given_rotations", lambda *_, **__: None)
+    free = [refined(one)[0] for one in drives]
+    assert 1e-4 < rms(both) < min(rms(held), rms(free))
+    assert 0.5 < rms((np.array(both) / sigmas).tolist()) < 2.0
+
+
+def test_rotations_that_images_contradict_say_nothing_of_the_scale() -> None:
+    weights = []
+    for off_px in (0.2, 30.0):
+        error, result = refined(drive(1, lens_px=0.0, turned_px=off_px))
+        assert result.given_scale is not None
+        assert abs(error) < 0.02
+        weights.append(1.0 / result.given_scale.sigma)
+    assert 0 < weights[1] < 0.2 * weights[0]
