@@ -31,8 +31,6 @@ def lens_errors(xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 def drive(
     seed: int,
     *,
-    straight: bool,
-    units: int = UNITS,
     lens_px: float = LENS_SIGMA_PX,
     turned_px: float = ROTATION_SIGMA_PX,
 ) -> SimulatedDrive:
