@@ -97,8 +97,7 @@ class DriftModel:
         """
         between = (self.travelled_m >= self.travelled_m[earlier]) & (self.travelled_m <= self.travelled_m[later])
         arms_m = self.position_m[between] - self.position_m[later]
-        length_m = self.travelled_m[later] - self.travelled_m[earlier]
-        renewals = length_m / self.depth_m
+        length_m, renewals = self.travelled_m[later] - self.travelled_m[earlier], self.renewals(earlier, later)
         rotation = (renewals * self.sigma_rotation_rad) ** 2
         shift = (renewals * self.sigma_translation_m) ** 2
         shift += rotation * (arms_m**2).sum(1).mean() + (self.scale_sigma(earlier, later) * length_m) ** 2
@@ -106,8 +105,13 @@ class DriftModel:
 
     def scale_sigma(self, earlier: int, later: int) -> float:
         """Standard deviation of a unit's scale to an earlier one's: rays hand it on that turn by `TURN_RAD`."""
-        renewals = (self.travelled_m[later] - self.travelled_m[earlier]) / self.depth_m
-        return float(np.sqrt(renewals) * self.sigma_rotation_rad / TURN_RAD)
+        return float(np.sqrt(self.renewals(earlier, later)) * self.sigma_rotation_rad / TURN_RAD)
+
+    def renewals(self, earlier: int, later: int) -> float:
+        """How many registrations on other points a unit's pose rests on since an earlier one: its own, and one for
+        every viewing depth between.
+        """
+        return float(1.0 + (self.travelled_m[later] - self.travelled_m[earlier]) / self.depth_m)
 
     def step_sigmas(self, metres: Floats) -> Floats:
         """Standard deviations (n, 2), rotation (rad) and translation (m) per axis, of steps of some metres (n,)."""
