@@ -26,7 +26,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
 MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
 MIN_CAMERA_INLIER_RATIO = 0.25
-DESCENT = 4.0  # of the widest gate that a predicted pose may be off by
+PREDICTION_RAD = 0.05  # by which images turn from where constant velocity predicts them, on bends and bumps
 MIN_EXPECTED_INLIER_RATIO = 0.5  # with more, no pose elsewhere can have more points on its side
 NO_INFORMATION = 1e-9  # of all directions together: what a direction has that no point tells
 VOTE_BEATS_JOINT = 0.9  # of the joint pose's inliers: what the vote loses on a wrong camera it may lose
@@ -265,6 +265,7 @@ def _joint_pose(mapper: Mapper, matched: Correspondences2D3D) -> Floats | None:
 def _as_expected(mapper: Mapper, matched: Correspondences2D3D, expected: Floats) -> Floats | None:
     """world_from_rig near an expected pose."""
     views = CameraViews.from_keypoints(mapper, matched.camera, matched.band)
+    predicted_px = PREDICTION_RAD * float(mapper.state.camera_params[:, :2].mean())
     widest_px, noise_px = float(widest_gates_px(mapper)[matched.camera].mean()), observation_gate_px(mapper)
     return resect(
         expected,
@@ -274,7 +275,7 @@ def _as_expected(mapper: Mapper, matched: Correspondences2D3D, expected: Floats)
         views.rig_from_view,
         mapper.camera_kind[views.camera],
         mapper.state.camera_params[views.camera],
-        sigmas_px=(DESCENT * widest_px, widest_px, noise_px / 2.0),
+        sigmas_px=(predicted_px, widest_px, noise_px / 2.0),
     )
 
 
