@@ -68,7 +68,7 @@ def _own_poses(votes: list[Vote], world_from_rig: Floats) -> dict[int, Floats]:
         return {}
     poses = np.stack([vote.world_from_rig for vote in votes])
     relative = se3.inverse(world_from_rig) @ poses
-    same = agree(poses, world_from_rig)
+    same = agree(votes, world_from_rig)
     return {vote.camera: relative[k] for k, vote in enumerate(votes) if not same[k]}
 
 

@@ -8,6 +8,7 @@ the prediction is off count at first, and wrong points do not count in the end.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.types import Floats, Ints
 
-SIGMAS_PX = (32.0, 8.0, 2.0)  # of the Cauchy loss, one after the other
+SIGMAS_PX = (32.0, 8.0, 2.0)  # of the Cauchy loss, one after the other, where nothing else is known
+UNWEIGHTED_PX = 1e6  # of the Cauchy loss: beyond every error
 STEPS = 6  # with each, at most
 SMALL = 1e-5  # a step (rad, m) below this has arrived
 MIN_DEPTH_M = 1e-3
@@ -31,6 +33,7 @@ def resect(
     rig_from_view: Floats,
     view_kind: Ints,
     view_params: Floats,
+    sigmas_px: Sequence[float] = SIGMAS_PX,
 ) -> Floats | None:
     """The pose (4, 4) of a rig near an expected one (4, 4) that fits its observations; None where there is none.
 
@@ -40,11 +43,13 @@ def resect(
         Image points (n, 2), the scene's points (n, 3) that they show, and the view (n,) that observes each.
     rig_from_view, view_kind, view_params
         Poses (v, 4, 4) of the views, and their cameras as `pack_cameras` has them.
+    sigmas_px
+        Of the loss, from wide to narrow.
     """
     rotation, position = world_from_rig[:3, :3].copy(), world_from_rig[:3, 3].copy()
     views = np.ascontiguousarray(rig_from_view[:, :3, :3]), np.ascontiguousarray(rig_from_view[:, :3, 3])
     square, gradient = np.empty((6, 6)), np.empty(6)
-    for sigma_px in SIGMAS_PX:
+    for sigma_px in sigmas_px:
         for _ in range(STEPS):
             _pose_system(
                 rotation, position, *views, view_kind, view_params, view, xy_px, points_m, sigma_px, square, gradient
@@ -59,6 +64,26 @@ def resect(
             if np.abs(step).max() < SMALL:
                 break
     return se3.transform(rotation, position)
+
+
+def pose_information(
+    world_from_rig: Floats,
+    xy_px: Floats,
+    points_m: Floats,
+    view: Ints,
+    rig_from_view: Floats,
+    view_kind: Ints,
+    view_params: Floats,
+) -> Floats:
+    """Information J'J (6, 6), for errors of 1 px, of observations on steps [omega, tau] of the rig's pose; as `resect`.
+
+    R becomes exp(omega) R, t becomes t + tau, in world axes.
+    """
+    square, gradient = np.empty((6, 6)), np.empty(6)
+    pose = world_from_rig[:3, :3].copy(), world_from_rig[:3, 3].copy()
+    views = np.ascontiguousarray(rig_from_view[:, :3, :3]), np.ascontiguousarray(rig_from_view[:, :3, 3])
+    _pose_system(*pose, *views, view_kind, view_params, view, xy_px, points_m, UNWEIGHTED_PX, square, gradient)
+    return square * UNWEIGHTED_PX**2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})

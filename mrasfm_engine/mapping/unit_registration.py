@@ -16,16 +16,19 @@ import pycolmap
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import unpack_camera
+from mrasfm_engine.mapping.inlier_gates import gates_px, observation_gate_px, robust_sigma, widest_gates_px
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.per_camera_pnp import Vote, agree, largest_agreement
-from mrasfm_engine.mapping.resection import resect
+from mrasfm_engine.mapping.per_camera_pnp import Vote, agree, calibration_covariance, largest_agreement
+from mrasfm_engine.mapping.resection import pose_information, resect
+from mrasfm_engine.matching.simultaneous import INDEPENDENT_MATCHES, MIN_SIGMA_PX, calibration_sigmas
 from mrasfm_engine.types import Bools, Floats, Ints
 
-MAX_ERROR_PX = 8.0  # of an inlier; wider than elsewhere, as calibration may be off until it is refined
 MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
 MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
 MIN_CAMERA_INLIER_RATIO = 0.25
+PREDICTION_RAD = 0.05  # by which images turn from where constant velocity predicts them, on bends and bumps
 MIN_EXPECTED_INLIER_RATIO = 0.5  # with more, no pose elsewhere can have more points on its side
+NO_INFORMATION = 1e-9  # of all directions together: what a direction has that no point tells
 VOTE_BEATS_JOINT = 0.9  # of the joint pose's inliers: what the vote loses on a wrong camera it may lose
 
 
@@ -119,39 +122,73 @@ def register_from_correspondences(
     if len(matched.camera) < min_inliers:
         return failed(unit, matched, 0, f"it sees {len(matched.camera)} points of the scene, {min_inliers} are needed")
     sample = matched.select(_spread(len(matched.camera), MAX_CORRESPONDENCES))
-    pose = None if expected is None else _as_expected(mapper, sample, expected)
-    inlier = np.zeros(len(matched.camera), dtype=np.bool_)
-    if pose is not None:
-        inlier = _errors_px(mapper, pose, matched) < MAX_ERROR_PX
-        if inlier.mean() < MIN_EXPECTED_INLIER_RATIO or _disagreeing(mapper, matched, inlier):
-            pose = None
-    if pose is None:
-        pose = _joint_pose(mapper, sample)
-        inlier[:] = False
-        if pose is not None:
-            inlier = _errors_px(mapper, pose, matched) < MAX_ERROR_PX
-    disagreeing = _disagreeing(mapper, matched, inlier)
-    method = "joint"
-    votes: list[Vote] = []
-    if by_vote and (pose is None or disagreeing or inlier.mean() < mapper.config.mapping.min_pnp_inlier_ratio):
+    fit = _joint_fit(mapper, matched, sample, expected)
+    method, votes = "joint", list[Vote]()
+    required = mapper.config.mapping.min_pnp_inlier_ratio
+    if by_vote and (fit.inlier.mean() < required or _disagreeing(mapper, matched, fit.inlier)):
         votes = camera_votes(mapper, sample)
         average = largest_agreement(votes)
-        if average is not None:
-            agreeing = _errors_px(mapper, average.world_from_rig, matched) < MAX_ERROR_PX
-            if agreeing.sum() >= inlier.sum() * VOTE_BEATS_JOINT:
-                pose, inlier, method = average.world_from_rig, agreeing, "vote"
-    count = int(inlier.sum())
-    if pose is None or count < min_inliers or count < mapper.config.mapping.min_pnp_inlier_ratio * len(inlier):
-        return failed(unit, matched, count, f"only {count} of {len(inlier)} points agree with one pose")
+        by_votes = _Fit.to(mapper, None if average is None else average.world_from_rig, matched)
+        if average is not None and by_votes.holds_against(fit, matched.camera):
+            fit, method = by_votes, "vote"
+    count = int(fit.inlier.sum())
+    if fit.world_from_rig is None or count < min_inliers or count < required * len(fit.inlier):
+        return failed(unit, matched, count, f"only {count} of {len(fit.inlier)} points agree with one pose")
     return Registration(
         unit=unit,
-        world_from_rig=pose,
-        correspondences=len(inlier),
+        world_from_rig=fit.world_from_rig,
+        correspondences=len(fit.inlier),
         inliers=count,
         method=method,
-        voted_out=_others(mapper, votes, pose),
-        unclear=tuple(n for n in _disagreeing(mapper, matched, inlier) if n not in _names(mapper, votes)),
+        voted_out=_others(mapper, votes, fit.world_from_rig),
+        unclear=tuple(n for n in _disagreeing(mapper, matched, fit.inlier) if n not in _names(mapper, votes)),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fit:
+    """A pose of the unit, and how correspondences fit it."""
+
+    world_from_rig: Floats | None
+    errors_px: Floats  # (n,)
+    gates_px: Floats  # (cameras,)
+    inlier: Bools  # (n,)
+
+    @staticmethod
+    def to(mapper: Mapper, world_from_rig: Floats | None, matched: Correspondences2D3D) -> _Fit:
+        if world_from_rig is None:
+            errors_px = np.full(len(matched.camera), np.inf)
+        else:
+            errors_px = _errors_px(mapper, world_from_rig, matched)
+        gates = gates_px(mapper, errors_px, matched.camera)
+        return _Fit(
+            world_from_rig=world_from_rig,
+            errors_px=errors_px,
+            gates_px=gates,
+            inlier=errors_px < gates[matched.camera],
+        )
+
+    def holds_against(self, joint: _Fit, camera: Ints) -> bool:
+        """The pose of a vote has as many inliers as the joint one by the narrower gates: a compromise has wide ones."""
+        gates = np.minimum(self.gates_px, joint.gates_px)[camera]
+        own, other = (np.count_nonzero(fit.errors_px < gates) for fit in (self, joint))
+        return bool(own >= other * VOTE_BEATS_JOINT)
+
+
+def _joint_fit(
+    mapper: Mapper, matched: Correspondences2D3D, sample: Correspondences2D3D, expected: Floats | None
+) -> _Fit:
+    """The pose near an expected one; where there is none, or points or a camera disagree with it, by a search."""
+    if expected is not None:
+        fit = _Fit.to(mapper, _as_expected(mapper, sample, expected), matched)
+        if fit.inlier.mean() >= MIN_EXPECTED_INLIER_RATIO and not _disagreeing(mapper, matched, fit.inlier):
+            return fit
+    return _Fit.to(mapper, _joint_pose(mapper, sample), matched)
+
+
+def inliers_of(mapper: Mapper, world_from_rig: Floats, matched: Correspondences2D3D) -> Ints:
+    """Correspondences that agree with a pose (4, 4) of the unit."""
+    return np.flatnonzero(_Fit.to(mapper, world_from_rig, matched).inlier)
 
 
 def failed(unit: int, matched: Correspondences2D3D, inliers: int, reason: str) -> Registration:
@@ -202,9 +239,9 @@ def matrix_of(pose: pycolmap.Rigid3d) -> Floats:
     return se3.transform(pose.rotation.matrix(), pose.translation)
 
 
-def _ransac(mapper: Mapper) -> pycolmap.RANSACOptions:
+def _ransac(mapper: Mapper, max_error_px: float) -> pycolmap.RANSACOptions:
     options = pycolmap.RANSACOptions()
-    options.max_error = MAX_ERROR_PX
+    options.max_error = max_error_px
     options.min_num_trials, options.max_num_trials = 50, 10000
     options.min_inlier_ratio = mapper.config.mapping.min_pnp_inlier_ratio  # no longer search for less
     options.random_seed = mapper.config.seed
@@ -220,7 +257,7 @@ def _joint_pose(mapper: Mapper, matched: Correspondences2D3D) -> Floats | None:
         [int(i) for i in views.index],
         [rigid3d(m) for m in se3.inverse(views.rig_from_view)],
         [cameras[c] for c in views.camera],
-        estimation_options=_ransac(mapper),
+        estimation_options=_ransac(mapper, float(widest_gates_px(mapper)[matched.camera].mean())),
     )
     return None if result is None else se3.inverse(matrix_of(result["rig_from_world"]))
 
@@ -228,6 +265,8 @@ def _joint_pose(mapper: Mapper, matched: Correspondences2D3D) -> Floats | None:
 def _as_expected(mapper: Mapper, matched: Correspondences2D3D, expected: Floats) -> Floats | None:
     """world_from_rig near an expected pose."""
     views = CameraViews.from_keypoints(mapper, matched.camera, matched.band)
+    predicted_px = PREDICTION_RAD * float(mapper.state.camera_params[:, :2].mean())
+    widest_px, noise_px = float(widest_gates_px(mapper)[matched.camera].mean()), observation_gate_px(mapper)
     return resect(
         expected,
         matched.xy_px,
@@ -236,6 +275,7 @@ def _as_expected(mapper: Mapper, matched: Correspondences2D3D, expected: Floats)
         views.rig_from_view,
         mapper.camera_kind[views.camera],
         mapper.state.camera_params[views.camera],
+        sigmas_px=(predicted_px, widest_px, noise_px / 2.0),
     )
 
 
@@ -284,7 +324,7 @@ def _others(mapper: Mapper, votes: list[Vote], pose: Floats) -> tuple[str, ...]:
     """Names of the cameras that voted for another pose."""
     if not votes:
         return ()
-    same = agree(np.stack([vote.world_from_rig for vote in votes]), pose)
+    same = agree(votes, pose)
     return tuple(name for name, agrees in zip(_names(mapper, votes), same, strict=True) if not agrees)
 
 
@@ -292,23 +332,64 @@ def camera_votes(mapper: Mapper, matched: Correspondences2D3D) -> list[Vote]:
     """Poses of the unit, each from one camera's own PnP, of the cameras for which that succeeds."""
     votes = []
     rig_from_view = _rig_from_cameras(mapper, matched)
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac = _ransac(mapper)
+    gates_px, options = widest_gates_px(mapper), pycolmap.AbsolutePoseEstimationOptions()
     for c, camera in enumerate(cameras_of(mapper)):
-        rows = matched.camera == c
-        if rows.sum() < MIN_CAMERA_MATCHES:
+        rows = np.flatnonzero(matched.camera == c)
+        if len(rows) < MIN_CAMERA_MATCHES:
             continue
+        options.ransac = _ransac(mapper, float(gates_px[c]))
         result = pycolmap.estimate_and_refine_absolute_pose(
             matched.xy_px[rows], matched.points_m[rows], camera, estimation_options=options
         )
-        if result is None or result["num_inliers"] < MIN_CAMERA_INLIER_RATIO * rows.sum():
+        if result is None or result["num_inliers"] < MIN_CAMERA_INLIER_RATIO * len(rows):
             continue
-        world_from_cam = se3.inverse(matrix_of(result["cam_from_world"]))
-        votes.append(
-            Vote(
-                camera=c,
-                world_from_rig=world_from_cam @ se3.inverse(rig_from_view[c]),
-                inliers=int(result["num_inliers"]),
-            )
-        )
+        world_from_rig = se3.inverse(matrix_of(result["cam_from_world"])) @ se3.inverse(rig_from_view[c])
+        votes.append(_vote(mapper, c, world_from_rig, matched.select(rows[result["inlier_mask"]])))
     return votes
+
+
+def _vote(mapper: Mapper, camera: int, world_from_rig: Floats, seen: Correspondences2D3D) -> Vote:
+    """The vote of a camera for a pose that fits what it has seen."""
+    sigma_rotation_rad, sigma_translation_m = calibration_sigmas(mapper.drive, mapper.config.bundle_adjustment)
+    return Vote(
+        camera=camera,
+        world_from_rig=world_from_rig,
+        inliers=len(seen.camera),
+        pnp_covariance=pose_covariance(mapper, world_from_rig, seen),
+        calibration_covariance=calibration_covariance(
+            world_from_rig,
+            mapper.state.camera_position_m[camera],
+            sigma_rotation_rad=float(sigma_rotation_rad[camera]),
+            sigma_translation_m=float(sigma_translation_m[camera]),
+        ),
+    )
+
+
+def pose_covariance(mapper: Mapper, world_from_rig: Floats, seen: Correspondences2D3D) -> Floats:
+    """Covariance (6, 6) of a unit's pose by its inliers, of steps [omega, tau] in world axes.
+
+    Errors are as large as each camera's residuals say. Lens models and points err alike all over an image, so one image
+    says no more than `INDEPENDENT_MATCHES` independent observations, however many it has.
+    """
+    views = CameraViews.from_keypoints(mapper, seen.camera, seen.band)
+    errors_px = _errors_px(mapper, world_from_rig, seen)
+    information = np.zeros((6, 6))
+    for c in np.unique(seen.camera):
+        rows = np.flatnonzero((seen.camera == c) & np.isfinite(errors_px))
+        if not len(rows):
+            continue
+        own = pose_information(
+            world_from_rig,
+            seen.xy_px[rows],
+            seen.points_m[rows],
+            views.index[rows],
+            views.rig_from_view,
+            mapper.camera_kind[views.camera],
+            mapper.state.camera_params[views.camera],
+        )
+        variance_px2 = max(MIN_SIGMA_PX, robust_sigma(errors_px[rows])) ** 2
+        information += own * min(1.0, INDEPENDENT_MATCHES / len(rows)) / variance_px2
+    # Without points that tell a direction, it is as uncertain as this leaves it.
+    weakest = NO_INFORMATION * np.trace(information) + np.finfo(np.float64).tiny
+    result: Floats = np.linalg.inv(information + weakest * np.eye(6))
+    return result

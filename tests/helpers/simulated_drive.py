@@ -265,3 +265,28 @@ def scaled_rig(rig_from_cam: np.ndarray, scale: float) -> np.ndarray:
 def inverted(rig_from_cam: np.ndarray) -> np.ndarray:
     """The mistake of the trade: cam_from_rig where rig_from_cam is asked for."""
     return se3.inverse(rig_from_cam)
+
+
+def enlarged(simulated: SimulatedDrive, factor: int) -> SimulatedDrive:
+    """The same drive by sensors of `factor` times as many pixels a side: so is everything that pixels measure."""
+    truth, manifest = simulated.truth, simulated.drive.manifest
+    cameras = [
+        c.model_copy(
+            update={"width": factor * c.width, "height": factor * c.height, "params": [factor * v for v in c.params]}
+        )
+        for c in manifest.rig.cameras
+    ]
+    return replace(
+        simulated,
+        truth=replace(
+            truth,
+            camera_params=factor * truth.camera_params,
+            xy_px=factor * truth.xy_px,
+            image_size_px=(factor * truth.image_size_px[0], factor * truth.image_size_px[1]),
+        ),
+        drive=Drive(
+            simulated.drive.root,
+            manifest.model_copy(update={"rig": manifest.rig.model_copy(update={"cameras": cameras})}),
+        ),
+        features=[replace(f, xy_px=(factor * f.xy_px).astype(np.float32)) for f in simulated.features],
+    )

@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits, split_pairs
+from mrasfm_engine.mapping.loop_closure import (
+    DriftModel,
+    Revisit,
+    close_loops,
+    find_revisits,
+    split_pairs,
+    supported,
+)
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_graph import Edges, _linearise, optimise_pose_graph
 from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
+    enlarged,
     make_model,
     make_simulated_drive,
     true_matches,
@@ -110,14 +118,14 @@ def test_the_pose_graphs_jacobians_agree_with_differences() -> None:
 DRIFT = se3.transform(se3.exp_so3(np.radians([0.1, -0.2, 0.5])), [0.3, -0.25, 0.1])
 
 
-def drifted_model() -> tuple[SimulatedDrive, Mapper, list[PairMatches]]:
-    """A drive whose second half went off by DRIFT, and the matches across a larger gap."""
-    simulated = make_simulated_drive(units=16, cameras=2, points=1200, spacing_m=0.8)
+def drifted_model(drift: np.ndarray = DRIFT, *, factor: int = 1) -> tuple[SimulatedDrive, Mapper, list[PairMatches]]:
+    """A drive whose second half went off by a drift, and the matches across a larger gap."""
+    simulated = enlarged(make_simulated_drive(units=16, cameras=2, points=1200, spacing_m=0.8), factor)
     unit = np.array([i.unit for i in simulated.drive.images])
     near, far = split_pairs(true_matches(simulated, window=12), unit, window_units=4)
     mapper = with_true_poses(make_model(simulated, near), simulated, range(16))
     for late in range(8, 16):
-        mapper.set_pose(late, DRIFT @ simulated.world_from_rig[late])
+        mapper.set_pose(late, drift @ simulated.world_from_rig[late])
     return simulated, mapper, [p for p in far if unit[p.image_a] < 4 and unit[p.image_b] >= 8]
 
 
@@ -168,3 +176,85 @@ def test_alike_places_are_not_believed() -> None:
     revisits, tried = find_revisits(mapper, wrong)
     assert 4 <= tried <= 6
     assert revisits == []
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_drift_that_calibration_and_way_cannot_explain_is_not_believed(factor: int) -> None:
+    for size, believed in ((1.0, True), (6.0, False)):
+        drift = se3.transform(se3.exp_so3(size * se3.log_so3(DRIFT[:3, :3])), size * DRIFT[:3, 3])
+        _, mapper, far = drifted_model(drift, factor=factor)
+        revisits, tried = find_revisits(mapper, far)
+        assert tried > 20
+        assert (len(revisits) > 0.9 * tried) if believed else not revisits
+
+
+def straight_model(spacing_m: float, length_m: float = 100.0, depth_m: float = 10.0) -> DriftModel:
+    travelled_m = np.arange(0.0, length_m + 1e-9, spacing_m)
+    return DriftModel(
+        travelled_m=travelled_m,
+        position_m=travelled_m[:, None] * [1.0, 0.0, 0.0],
+        depth_m=depth_m,
+        sigma_rotation_rad=0.001,
+        sigma_translation_m=0.01,
+    )
+
+
+def test_drift_is_uncertain_by_the_metres_and_not_by_the_units() -> None:
+    sigmas = []
+    for spacing_m in (0.5, 4.0):
+        model = straight_model(spacing_m)
+        last = len(model.travelled_m) - 1
+        covariance = model.covariance(0, last)
+        sigmas.append(np.sqrt(np.diagonal(covariance)[[0, 3]]))
+        half = np.sqrt(np.diagonal(model.covariance(last // 2, last))[[0, 3]])
+        assert half[0] == pytest.approx(6 / 11 * sigmas[-1][0], rel=0.04)
+        assert 0.2 < half[1] / sigmas[-1][1] < 0.5
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.03)
+    assert sigmas[0][0] == pytest.approx(11 * 0.001)
+    # 11 mrad over an arm of 58 m in the mean square; scale off by 2.2 %, eleven times 1 cm.
+    assert sigmas[0][1] == pytest.approx(np.sqrt(0.635**2 + 2.211**2 + 0.11**2), rel=0.02)
+    # Where points are farther away, the same ones are seen for longer.
+    assert np.diagonal(straight_model(0.5, depth_m=20.0).covariance(0, 200))[0] == pytest.approx(0.006**2)
+
+
+def test_a_vehicle_that_stands_leaves_steps_certain_but_not_without_error() -> None:
+    sigmas = straight_model(1.0).step_sigmas(np.array([0.0, 10.0, 40.0]))
+    np.testing.assert_allclose(sigmas[1:], [[0.001, 0.01], [0.002, 0.02]])
+    assert (sigmas[0] > 0).all()
+    assert (sigmas[0] < 0.1 * sigmas[1]).all()
+
+
+def revisit(model: DriftModel, earlier: int, later: int, *, off: float) -> Revisit:
+    """One whose drift is off from none by so many sigmas of a registration (of 0.1 deg, 2 cm)."""
+    sigma = np.repeat([np.radians(0.1), 0.02], 3)
+    at_m = model.position_m[later]
+    about = se3.transform(se3.exp_so3([0.0, 0.0, off * sigma[0]]), np.zeros(3))
+    drift = se3.transform(about[:3, :3], at_m - about[:3, :3] @ at_m)
+    return Revisit(
+        earlier=earlier,
+        later=later,
+        world_from_rig=drift @ se3.transform(np.eye(3), at_m),
+        drift=drift,
+        covariance=np.diag(sigma**2),
+    )
+
+
+@pytest.mark.parametrize("spacing_m", [0.5, 2.0])
+def test_neighbours_support_one_another_within_a_viewing_depth(spacing_m: float) -> None:
+    model = straight_model(spacing_m)
+
+    def at(metres: float) -> int:
+        return round(metres / spacing_m)
+
+    for apart_m, believed in ((8.0, True), (12.0, False)):
+        pairs = [(at(k * apart_m), at(60.0 + k * apart_m)) for k in range(-1, 2)]
+        shifted = [(a + at(12.0), b) for a, b in pairs]
+        assert len(supported([revisit(model, a, b, off=0.0) for a, b in shifted], model)) == (1 if believed else 0)
+
+
+def test_neighbours_support_one_another_if_their_drifts_differ_by_chance() -> None:
+    model = straight_model(1.0)
+    for off, believed in ((2.0, 4), (12.0, 3)):
+        revisits = [revisit(model, k, 60 + k, off=off if k == 3 else 0.0) for k in range(4)]
+        assert len(supported(revisits, model)) == believed
+    assert supported([revisit(model, k, 60 + k, off=0.0) for k in range(2)], model) == []

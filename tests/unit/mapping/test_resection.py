@@ -6,8 +6,8 @@ import pytest
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping import unit_registration
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.resection import resect
-from mrasfm_engine.mapping.unit_registration import correspondences_of_unit, register_unit
+from mrasfm_engine.mapping.resection import pose_information, resect
+from mrasfm_engine.mapping.unit_registration import cameras_of, correspondences_of_unit, register_unit
 from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
 
 UNIT = 5
@@ -54,6 +54,28 @@ def test_a_pose_is_found_from_one_that_is_some_way_off(wrong: float) -> None:
     position_m, rotation_deg = off(pose, true[UNIT])
     assert 1e-5 < position_m < 0.03
     assert 1e-5 < rotation_deg < 0.05
+
+
+def test_the_information_of_a_pose_is_that_of_its_pixels_derivatives() -> None:
+    true, mapper = scene(cameras=2, points=300)
+    matched, state = correspondences_of_unit(mapper, UNIT), mapper.state
+    pose = true[UNIT]
+    views = matched.camera, state.rig_from_cam, mapper.camera_kind, state.camera_params
+    found = pose_information(pose, matched.xy_px, matched.points_m, *views)
+
+    def pixels(step: np.ndarray) -> np.ndarray:
+        moved_pose = se3.transform(se3.exp_so3(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])
+        result = np.empty((len(matched.camera), 2))
+        for c, camera in enumerate(cameras_of(mapper)):
+            rows = matched.camera == c
+            cam_from_world = se3.inverse(moved_pose @ state.rig_from_cam[c])
+            result[rows] = camera.img_from_cam(se3.apply(cam_from_world, matched.points_m[rows]))
+        return result.ravel()
+
+    steps = 1e-5 * np.eye(6)
+    jacobian = np.stack([(pixels(step) - pixels(-step)) / 2e-5 for step in steps], axis=1)
+    np.testing.assert_allclose(found, jacobian.T @ jacobian, rtol=1e-5, atol=1e-6 * np.abs(found).max())
+    assert np.linalg.eigvalsh(found)[0] > 0
 
 
 def test_nothing_in_front_of_any_camera_gives_no_pose() -> None:

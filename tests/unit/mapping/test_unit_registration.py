@@ -6,8 +6,17 @@ import pytest
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping import unit_registration
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.unit_registration import cameras_of, matrix_of, register_unit, rigid3d
-from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+from mrasfm_engine.mapping.per_camera_pnp import largest_agreement
+from mrasfm_engine.mapping.unit_registration import (
+    camera_votes,
+    cameras_of,
+    correspondences_of_unit,
+    matrix_of,
+    pose_covariance,
+    register_unit,
+    rigid3d,
+)
+from tests.helpers.simulated_drive import SimulatedDrive, enlarged, make_model, make_simulated_drive, with_true_poses
 
 UNIT = 5
 
@@ -24,6 +33,12 @@ def scene(**kwargs: object) -> tuple[SimulatedDrive, Mapper]:
     simulated = make_simulated_drive(**{"units": 9, "cameras": 6, "points": 1500, **kwargs})
     mapper = make_model(simulated)
     return simulated, with_true_poses(mapper, simulated, [u for u in range(9) if u != UNIT])
+
+
+def larger_scene(factor: int) -> tuple[SimulatedDrive, Mapper]:
+    """The same by sensors of more pixels."""
+    simulated = enlarged(make_simulated_drive(units=9, cameras=6, points=1500), factor)
+    return simulated, with_true_poses(make_model(simulated), simulated, [u for u in range(9) if u != UNIT])
 
 
 def turn_camera(mapper: Mapper, camera: int, deg: float) -> None:
@@ -59,6 +74,67 @@ def test_a_camera_with_a_wrong_extrinsic_is_voted_out_by_name(camera: int, error
     position_m, rotation_deg = errors(result.world_from_rig, simulated)
     assert 1e-5 < position_m < 0.1
     assert 1e-5 < rotation_deg < 0.3
+
+
+@pytest.mark.parametrize("turned", [{}, {5: 3.0}, {0: 1.0, 2: 1.0}])
+def test_the_same_drive_in_more_pixels_is_registered_alike(turned: dict[int, float]) -> None:
+    found = []
+    for factor in (1, 2, 4):
+        simulated, mapper = larger_scene(factor)
+        for camera, deg in turned.items():
+            turn_camera(mapper, camera, deg)
+        result = register_unit(mapper, UNIT)
+        assert result.world_from_rig is not None
+        assert errors(result.world_from_rig, simulated)[0] < 0.1
+        found.append(result)
+    assert len({(r.method, r.voted_out, r.unclear) for r in found}) == 1
+    shares = [r.inliers / r.correspondences for r in found]
+    assert max(shares) - min(shares) < 0.05
+    assert min(shares) > 0.5
+
+
+def test_cameras_that_are_off_as_their_prior_says_are_not_voted_out() -> None:
+    """3 deg are too much where all others agree, and not where all are off by some degrees."""
+    for others_deg, agrees in ((0.0, False), (1.5, True)):
+        simulated, mapper = scene()
+        rng = np.random.default_rng(4)
+        for camera in range(6):
+            turn = np.array([0.0, 0.0, 3.0]) if camera == 0 else rng.normal(size=3) * others_deg
+            mapper.state.camera_rotation[camera] = se3.exp_so3(np.radians(turn)) @ mapper.state.camera_rotation[camera]
+        votes = camera_votes(mapper, correspondences_of_unit(mapper, UNIT))
+        agreement = largest_agreement(votes)
+        assert agreement is not None
+        assert [v.camera for v in votes] == list(range(6))
+        assert agreement.agreeing[0] == agrees
+        assert agreement.agreeing[1:].all()
+        assert 1e-4 < errors(agreement.world_from_rig, simulated)[1] < 1.5
+
+
+def test_votes_err_as_their_covariances_say() -> None:
+    squares = []
+    for seed in range(8):
+        simulated, mapper = scene(seed=seed)
+        true = simulated.world_from_rig[UNIT]
+        for vote in camera_votes(mapper, correspondences_of_unit(mapper, UNIT)):
+            turn = se3.log_so3(vote.world_from_rig[:3, :3] @ true[:3, :3].T)
+            step = np.concatenate([turn, vote.world_from_rig[:3, 3] - true[:3, 3]])
+            squares.append(step @ np.linalg.solve(vote.pnp_covariance, step))
+    # Points are as good as noise leaves them here: an image says more than the few observations that it counts for.
+    assert 0.02 * 6 < np.mean(squares) < 6
+
+
+def test_more_points_make_a_pose_no_surer_than_lens_models_allow() -> None:
+    simulated, mapper = scene(cameras=1)
+    matched, pose = correspondences_of_unit(mapper, UNIT), simulated.world_from_rig[UNIT]
+    sigmas = [
+        np.sqrt(np.diagonal(pose_covariance(mapper, pose, matched.select(np.arange(0, len(matched.camera), step)))))
+        for step in (1, 4)
+    ]
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.35)
+    assert (np.degrees(sigmas[0][:3]) > 0.01).all()
+    assert (np.degrees(sigmas[0][:3]) < 0.2).all()
+    few = pose_covariance(mapper, pose, matched.select(np.arange(3)))
+    assert (np.sqrt(np.diagonal(few)) > 1.5 * sigmas[0]).any()
 
 
 def test_an_occluded_camera_gets_its_pose_from_the_unit() -> None:
