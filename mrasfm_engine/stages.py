@@ -48,7 +48,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 5}
+VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 3, Stage.MAPPING: 5}
 
 
 @dataclass
@@ -264,6 +264,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             run.config.matching,
             run.config.bundle_adjustment,
             threads=run.config.threads,
+            prior=known,
             progress=run.step(Stage.MATCHES),
             cancel=run.cancel,
         )
@@ -271,8 +272,17 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
         contradicted = contradiction(names, run.drive.rig_from_cam, result.rig)
         return pack_pairs(result.pairs), {
             "candidate_pairs": len(pairs),
-            "verified_pairs": len(result.pairs),
-            "rejected_pairs": {"few matches": result.few_matches, "few inliers": result.few_inliers},
+            "verified_pairs": len(result.pairs) - result.against_calibration,
+            "rejected_pairs": {
+                "few matches": result.few_matches,
+                "few inliers": result.few_inliers,
+                "against the calibration": result.against_calibration,
+            },
+            "prior": {
+                "pairs_predicted": result.prior.predicted,
+                "pairs_against_the_prior": result.prior.against,
+                "left_out": result.prior.left_out,
+            },
             "dropped_between_classes": result.across_classes,
             "matches": sum(len(p.matches) for p in result.pairs),
             "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),

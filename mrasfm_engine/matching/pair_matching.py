@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,12 +13,22 @@ from threadpoolctl import threadpool_limits
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.matching.simultaneous import RigEstimate, SimultaneousMatches, are_simultaneous, rig_of_drive
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.matching.prior_verification import PriorVerdict, verified_by_prior
+from mrasfm_engine.matching.simultaneous import (
+    RigEstimate,
+    are_simultaneous,
+    max_error_rad,
+    rig_of_drive,
+    verified_in_rig,
+)
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import may_match
 from mrasfm_engine.types import Cancel, CountProgress, Floats, Ints, Ints32
+
+NO_PRIOR = PriorTrajectory(source="none", world_from_rig=None)
 
 
 class Matcher(Protocol):
@@ -37,11 +47,17 @@ class Matcher(Protocol):
 class SearchResult:
     """Verified pairs and what became of the others."""
 
-    pairs: list[PairMatches]
+    pairs: list[PairMatches]  # those of simultaneous images that contradict the calibration have no inliers
     few_matches: int  # pairs with too few matches
     few_inliers: int  # pairs whose matches fit no geometry
     across_classes: int  # matches that were dropped because their ends are of different semantic classes
     rig: RigEstimate  # as simultaneous images show it
+    prior: PriorVerdict
+
+    @property
+    def against_calibration(self) -> int:
+        """Pairs of simultaneous images that keep no inlier, as their matches contradict the calibration."""
+        return sum(not pair.inliers.any() for pair in self.pairs)
 
 
 def match_pairs(
@@ -53,6 +69,7 @@ def match_pairs(
     calibration: BundleAdjustmentConfig,
     *,
     threads: int,
+    prior: PriorTrajectory = NO_PRIOR,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> SearchResult:
@@ -60,8 +77,9 @@ def match_pairs(
 
     An essential matrix must explain the matches of a pair. Between simultaneous images of one unit the calibration
     gives the geometry: all of their matches together correct it where they contradict it (see `simultaneous`), and
-    matches far from the epipolar lines that follow, or behind a camera, are out as well. Matches between different
-    semantic classes are dropped before either.
+    matches far from the epipolar lines that follow, or behind a camera, are out as well. Between units the prior
+    trajectory does the same where images do not contradict it (see `prior_verification`). Matches between different
+    semantic classes are dropped before all that.
     """
     cameras = [drive.cameras[i.camera] for i in drive.images]
     prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
@@ -110,38 +128,27 @@ def match_pairs(
             raise
 
     def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
-        a, b = pair.matches[pair.inliers].T
+        a, b = pair.matches.T
         return rays[pair.image_a][a], rays[pair.image_b][b]
 
-    rig = rig_of_drive(drive, found, rays_of, config, calibration)
-    checked = [
-        _in_rig(
-            drive,
-            pair,
-            rays_of(pair),
-            rig,
-            max_error=config.max_error_px / focal[[drive.images[i].camera for i in (pair.image_a, pair.image_b)]].min(),
-        )
-        if are_simultaneous(drive, pair.image_a, pair.image_b)
-        else pair
-        for pair in found
-    ]
-    kept = [pair for pair in checked if pair.inliers.sum() >= config.min_matches]
+    def inlier_rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+        a, b = rays_of(pair)
+        return a[pair.inliers], b[pair.inliers]
+
+    rig = rig_of_drive(drive, found, inlier_rays_of, config, calibration)
+    by_prior = verified_by_prior(drive, found, rays_of, prior, rig, focal_px=focal, config=config, threads=threads)
+    kept = []
+    for pair in by_prior.pairs:
+        if are_simultaneous(drive, pair.image_a, pair.image_b):
+            max_error = max_error_rad(drive, pair, focal, config)
+            kept.append(verified_in_rig(drive, pair, rays_of(pair), rig, max_error=max_error, config=config))
+        elif pair.inliers.sum() >= config.min_matches:
+            kept.append(pair)
     return SearchResult(
         pairs=kept,
         few_matches=lost["few matches"],
         few_inliers=lost["few inliers"] + len(found) - len(kept),
         across_classes=int(across_classes.sum()),
         rig=rig,
+        prior=by_prior,
     )
-
-
-def _in_rig(
-    drive: Drive, pair: PairMatches, rays: tuple[Floats, Floats], rig: RigEstimate, *, max_error: float
-) -> PairMatches:
-    """A simultaneous pair with those inliers that agree with the rig."""
-    a, b = (drive.images[image].camera for image in (pair.image_a, pair.image_b))
-    inliers = pair.inliers.copy()
-    found = SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays[0], rays_b=rays[1])
-    inliers[pair.inliers] = rig.fits(found, max_error=max_error)
-    return replace(pair, inliers=inliers)
