@@ -204,7 +204,7 @@ class MedianSpread:
 class NarrowingSpread:
     """The spread of all errors first, halved from step to step down to a known one.
 
-    So errors far off find their way before they count as those of wrong matches.
+    So a pose far off is corrected before the matches that contradict it count as wrong.
     """
 
     at_last: float

@@ -27,7 +27,7 @@ def simulated_drive() -> SimulatedDrive:
 
 
 def receiver(*, late_s: float = 0.0, swapped: bool = False, sigma_m: float = 0.02) -> Gnss:
-    """A good receiver that has been on for half a minute, also on the ways before the drive's."""
+    """A good receiver that has been on for half a minute, also on the path before the drive's."""
     t_s = np.arange(-30.0, 8.0, 0.1)
     # Before the drive the car went at two thirds of its speed, so that another time is another motion.
     along_m = np.where(t_s < 0, 0.66, 1.0) * SPEED_M_PER_S * (t_s - late_s)

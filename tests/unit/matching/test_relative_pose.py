@@ -11,7 +11,7 @@ PIXEL_RAD = 1 / 700
 
 
 def views(rng: np.random.Generator, count: int, noise_px: float) -> tuple[RelativePose, np.ndarray, np.ndarray]:
-    """Two cameras a metre apart, looking across their way, and their rays to points beside it."""
+    """Two cameras a metre apart, looking across their path, and their rays to points beside it."""
     poses = [np.eye(4), se3.transform(se3.exp_so3([0.01, 0.04, -0.01]), [1.0, 0.05, 0.3])]
     points = rng.uniform([-6, -4, 5], [6, 4, 15], (count, 3))
     rays = [se3.apply(se3.inverse(pose), points) for pose in poses]
