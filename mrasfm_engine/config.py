@@ -62,13 +62,14 @@ class PairConfig(_Section):
 
     selection: bool = Field(
         True,
-        description="pairs are selected by overlap; `false` matches all images of units at most `window_units` apart",
+        description="pairs are selected by motion and overlap; `false` matches all images of units at most "
+        "`window_units` apart",
     )
     window_units: Count = Field(
-        4, description="without a prior trajectory: number of following units that a camera is matched with"
+        4, description="largest number of following units, spaced by the vehicle's motion, that a unit is matched with"
     )
     cross_window_units: Annotated[int, Field(ge=0)] = Field(
-        2, description="the same across cameras that look in similar directions"
+        2, description="without a prior trajectory: the same across cameras that look in similar directions"
     )
     pairs_per_image: Count = Field(16, description="with GNSS or rough poses: the pairs of largest overlap per image")
     max_depth_m: Positive = Field(50.0, description="viewing frustums end here")
@@ -77,7 +78,7 @@ class PairConfig(_Section):
         0.08, description="smallest share of one image's frustum samples that the other image sees"
     )
     revisit_pairs_per_unit: Annotated[int, Field(ge=0)] = Field(
-        3, description="without a prior trajectory: similar units outside the window"
+        3, description="without a prior trajectory: similar units farther along the path"
     )
 
 

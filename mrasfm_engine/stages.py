@@ -27,10 +27,9 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.calibration_check import require_calibration_direction
+from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import match_pairs
-from mrasfm_engine.matching.pair_selection import pairs_from_poses, pairs_from_window, pairs_without_selection
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
-from mrasfm_engine.matching.retrieval import revisit_pairs
 from mrasfm_engine.matching.simultaneous import contradiction
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
@@ -49,7 +48,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 2, Stage.MAPPING: 6}
+VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 3, Stage.MAPPING: 6}
 
 
 @dataclass
@@ -250,30 +249,35 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
     """Candidate pairs by the prior (or by window and similarity), matched and verified."""
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        if not run.config.pairs.selection:
-            pairs = pairs_without_selection(run.drive, run.config.pairs)
-        elif known.world_from_rig is not None:
-            pairs = pairs_from_poses(run.drive, known.world_from_rig, run.config.pairs)
-        else:
-            window = pairs_from_window(run.drive, run.config.pairs)
-            pairs = np.unique(np.concatenate([window, revisit_pairs(run.drive, found, run.config.pairs)]), axis=0)
+        chosen = PairChoice(run.drive, found, known, run.config)
         result = match_pairs(
             run.drive,
             found,
-            pairs,
+            chosen.first,
             run.components.matcher,
             run.config.matching,
             run.config.bundle_adjustment,
             threads=run.config.threads,
+            prior=known,
+            further=chosen.further,
             progress=run.step(Stage.MATCHES),
             cancel=run.cancel,
         )
         names = [camera.name for camera in run.drive.cameras]
         contradicted = contradiction(names, run.drive.rig_from_cam, result.rig)
-        return pack_pairs(result.pairs), {
-            "candidate_pairs": len(pairs),
-            "verified_pairs": len(result.pairs),
-            "rejected_pairs": {"few matches": result.few_matches, "few inliers": result.few_inliers},
+        return pack_pairs(chosen.with_revisits(result.pairs)), {
+            "candidate_pairs": result.candidates,
+            "verified_pairs": len(result.pairs) - result.against_calibration,
+            "rejected_pairs": {
+                "few matches": result.few_matches,
+                "few inliers": result.few_inliers,
+                "against the calibration": result.against_calibration,
+            },
+            "prior": {
+                "pairs_predicted": result.prior.predicted,
+                "pairs_against_the_prior": result.prior.against,
+                "left_out": result.prior.left_out,
+            },
             "dropped_between_classes": result.across_classes,
             "matches": sum(len(p.matches) for p in result.pairs),
             "verified_matches": sum(int(p.inliers.sum()) for p in result.pairs),
@@ -307,6 +311,7 @@ def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
         "ends": np.array([(p.image_a, p.image_b, len(p.matches)) for p in pairs], dtype=np.int64).reshape(-1, 3),
         "matches": np.concatenate([p.matches for p in pairs] or [np.zeros((0, 2), np.int32)]),
         "inliers": np.concatenate([p.inliers for p in pairs] or [np.zeros(0, np.bool_)]),
+        "is_revisit": np.array([p.is_revisit for p in pairs], dtype=np.bool_),
     }
 
 
@@ -319,8 +324,9 @@ def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
             image_b=int(b),
             matches=arrays["matches"][hi - n : hi],
             inliers=arrays["inliers"][hi - n : hi],
+            is_revisit=bool(is_revisit),
         )
-        for (a, b, n), hi in zip(arrays["ends"], stops, strict=True)
+        for (a, b, n), hi, is_revisit in zip(arrays["ends"], stops, arrays["is_revisit"], strict=True)
     ]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,8 @@ from scipy.spatial import cKDTree
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.matching.pair_selection import pairs_from_window
-from mrasfm_engine.matching.retrieval import MIN_GAP_UNITS
+from mrasfm_engine.matching.image_motion import Motion, are_following
+from mrasfm_engine.matching.pair_selection import pairs_from_window, units_ahead
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.synthetic.long_route import LongRoute
@@ -63,7 +63,8 @@ def simulate_matches(
 ) -> list[PairMatches]:
     """Verified matches of the route's image pairs; `drive` has one image for each of the route's."""
     views = list(_views(route))
-    window = pairs_from_window(drive, config.pairs)
+    motion = Motion.from_travelled(drive, route.travelled_m)
+    window = pairs_from_window(drive, config.pairs, motion)
     true, false = revisits(views, route, config.pairs.revisit_pairs_per_unit, rng)
     result = []
     pairs = np.unique(np.concatenate([window, true]), axis=0)
@@ -77,6 +78,10 @@ def simulate_matches(
         matches = _chance_matches(views[a], views[b], config, rng)
         if len(matches) >= config.matching.min_matches:
             result.append(_verified(a, b, matches))
+    unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+    a, b = np.array([(pair.image_a, pair.image_b) for pair in result], dtype=np.int64).reshape(-1, 2).T
+    follows = are_following(units_ahead(motion, config.pairs), unit[a], unit[b])
+    result = [replace(pair, is_revisit=not near) for pair, near in zip(result, follows, strict=True)]
     return sorted(result, key=lambda pair: (pair.image_a, pair.image_b))
 
 
@@ -114,7 +119,7 @@ def revisits(views: list[_View], route: LongRoute, per_unit: int, rng: np.random
     near: dict[int, list[int]] = defaultdict(list)
     travelled_m = route.travelled_m
     for u, v in cKDTree(route.world_from_rig[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray").tolist():
-        if v - u >= MIN_GAP_UNITS and travelled_m[v] - travelled_m[u] > REVISIT_WAY_M:
+        if travelled_m[v] - travelled_m[u] > REVISIT_WAY_M:
             near[u].append(v)
             near[v].append(u)
     true: set[tuple[int, int]] = set()
@@ -127,7 +132,11 @@ def revisits(views: list[_View], route: LongRoute, per_unit: int, rng: np.random
                     pairs = [(i - i % cameras + c, j - j % cameras + c) for c in range(cameras)]
                 true |= {(min(pair), max(pair)) for pair in pairs}
         other = int(rng.integers(units))
-        if rng.random() < FALSE_REVISITS and abs(other - u) >= MIN_GAP_UNITS and other not in near[u]:
+        if (
+            rng.random() < FALSE_REVISITS
+            and abs(travelled_m[other] - travelled_m[u]) > REVISIT_WAY_M
+            and other not in near[u]
+        ):
             i, j = (cameras * unit + int(rng.integers(cameras)) for unit in sorted((u, other)))
             false.add((i, j))
     as_array = [np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2) for pairs in (true, false - true)]

@@ -14,6 +14,9 @@ NEIGHBOURS = 5  # samples on each side that a sample is compared with
 NEIGHBOUR_SPAN_S = 3.0
 MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
 HEADING_WINDOWS_S = (0.5, 1.0, 2.0, 4.0, 8.0)  # half widths tried, the narrowest that shows a direction is used
+# Of roll, pitch, and the heading against the antenna's track: roads climb by up to 10 % and lean by some per cent, and
+# an antenna 1.5 m before the rear axle moves 3 degrees across the heading where the car turns on a radius of 30 m.
+ATTITUDE_SIGMA_RAD = np.radians(3.0)
 MIN_WAY_M, MIN_WAY_SIGMAS = 1.0, 6.0  # in a window, below which it may be the receiver's drift while the car stands
 
 
@@ -80,11 +83,27 @@ def _line_at(dt: Floats, position: Floats) -> Floats:
     return result
 
 
-def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Floats) -> Floats | None:
-    """Poses `world_from_rig` (m, 4, 4) from positions alone: heading along the track, level, lever arm applied.
+@dataclass(frozen=True, kw_only=True)
+class RoughTrajectory:
+    """Poses from positions alone, NaN for times that the track does not cover.
 
-    Where the car stands, it keeps the heading it came with (or leaves with). NaN for times that the track does not
-    cover; None where it shows no direction at all, or does not cover most of the times.
+    Attributes
+    ----------
+    world_from_rig
+        (m, 4, 4)
+    sigma
+        (m, 6) standard deviations of the rotation about the axes of the world (rad), and of the position (m).
+    """
+
+    world_from_rig: Floats
+    sigma: Floats
+
+
+def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Floats) -> RoughTrajectory | None:
+    """Poses at some times (m,): heading along the track, level, lever arm applied.
+
+    Where the car stands, it keeps the heading it came with (or leaves with): there, any is possible. None where the
+    track shows no direction at all, or does not cover most of the times.
     """
     t, p = track.timestamps_us[track.good] / 1e6, track.position_m[track.good]
     if len(t) < 3:
@@ -92,17 +111,25 @@ def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Fl
     noise = float(np.median(track.sigma_m[track.good, :2]))
     times = np.clip(timestamps_us / 1e6, t[0], t[-1])
     position, heading = np.empty((len(times), 3)), np.full(len(times), np.nan)
+    sigma = np.full((len(times), 6), ATTITUDE_SIGMA_RAD)
+    sigma[:, 2] = np.pi
     for i, now in enumerate(times):
+        sigma[i, 3:] = track.sigma_m[track.good][np.abs(t - now).argmin()]
         for half in HEADING_WINDOWS_S:
             near = np.flatnonzero(np.abs(t - now) <= half)
             if len(near) < 3:
                 continue
-            centre, velocity = _fit_motion(t[near] - now, p[near])
+            centre, velocity, left_m = _fit_motion(t[near] - now, p[near])
             position[i] = centre
             spread = float(np.sqrt(((t[near] - t[near].mean()) ** 2).sum()))
             speed = float(np.linalg.norm(velocity[:2]))
             if speed * spread > 3.0 * noise and speed * np.ptp(t[near]) > max(MIN_WAY_M, MIN_WAY_SIGMAS * noise):
                 heading[i] = np.arctan2(velocity[1], velocity[0])
+                # Noise averages out over a window, a bend does not.
+                across_m = np.sqrt(np.mean((left_m @ [-velocity[1], velocity[0]] / speed) ** 2))
+                turn = np.hypot(noise / spread, across_m / np.std(t[near])) / speed
+                sigma[i, 2] = np.hypot(ATTITUDE_SIGMA_RAD, turn)
+                sigma[i, 3:] = np.hypot(sigma[i, 3:], np.sqrt((left_m**2).sum(1).mean()))
                 break
         else:
             position[i] = np.array([np.interp(now, t, p[:, k]) for k in range(3)])
@@ -116,12 +143,12 @@ def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Fl
     beyond = np.abs(times - timestamps_us / 1e6) > MAX_BEYOND_S
     if beyond.mean() > 0.5:
         return None
-    poses[beyond] = np.nan
-    return poses
+    poses[beyond], sigma[beyond] = np.nan, np.nan
+    return RoughTrajectory(world_from_rig=poses, sigma=sigma)
 
 
-def _fit_motion(dt: Floats, position: Floats) -> tuple[Floats, Floats]:
-    """Position at dt = 0 and mean velocity by least squares."""
+def _fit_motion(dt: Floats, position: Floats) -> tuple[Floats, Floats, Floats]:
+    """Position at dt = 0 and mean velocity by least squares, and what is left of the horizontal positions (n, 2)."""
     a = np.stack([np.ones_like(dt), dt], 1)
     line = np.linalg.lstsq(a, position, rcond=None)[0]
-    return line[0], line[1]
+    return line[0], line[1], (position - a @ line)[:, :2]

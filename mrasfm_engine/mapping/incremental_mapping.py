@@ -135,7 +135,7 @@ def map_units(
         Where `cancel` answers True.
     """
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
-    near, far = split_pairs(pairs, image_unit, config.pairs.window_units)
+    near, far = split_pairs(pairs)
     image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
     still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, near)
     sound = without_keypoints(near, keypoints.first, still) if still.any() else near

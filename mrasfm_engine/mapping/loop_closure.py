@@ -32,7 +32,7 @@ from mrasfm_engine.mapping.unit_registration import (
 )
 from mrasfm_engine.matching.simultaneous import calibration_sigmas
 from mrasfm_engine.scene.scene import PairMatches
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Floats
 
 MIN_INLIERS = 30
 MIN_SUPPORT = 3  # pairs of units that report one drift
@@ -120,16 +120,9 @@ class DriftModel:
         return result
 
 
-def split_pairs(
-    pairs: Sequence[PairMatches], image_unit: Ints, window_units: int
-) -> tuple[list[PairMatches], list[PairMatches]]:
-    """Pairs of neighbouring units, and pairs across larger gaps."""
-    near: list[PairMatches] = []
-    far: list[PairMatches] = []
-    for pair in pairs:
-        gap = abs(int(image_unit[pair.image_a]) - int(image_unit[pair.image_b]))
-        (near if gap <= window_units else far).append(pair)
-    return near, far
+def split_pairs(pairs: Sequence[PairMatches]) -> tuple[list[PairMatches], list[PairMatches]]:
+    """Pairs of units that follow one another, and pairs that may be revisits."""
+    return [pair for pair in pairs if not pair.is_revisit], [pair for pair in pairs if pair.is_revisit]
 
 
 def find_revisits(mapper: Mapper, far_pairs: Sequence[PairMatches]) -> tuple[list[Revisit], int]:

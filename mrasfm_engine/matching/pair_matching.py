@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.matching.simultaneous import RigEstimate, SimultaneousMatches, are_simultaneous, rig_of_drive
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.matching.prior_verification import PriorVerdict, verified_by_prior
+from mrasfm_engine.matching.simultaneous import (
+    RigEstimate,
+    are_simultaneous,
+    max_error_rad,
+    rig_of_drive,
+    verified_in_rig,
+)
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import may_match
 from mrasfm_engine.types import Cancel, CountProgress, Floats, Ints, Ints32
+
+# Further pairs (n, 2) from those that matched so far, and the viewing rays of a pair's inliers.
+Further = Callable[[Sequence[PairMatches], Callable[[PairMatches], tuple[Floats, Floats]]], Ints]
+NO_PRIOR = PriorTrajectory(source="none", world_from_rig=None)
 
 
 class Matcher(Protocol):
@@ -37,11 +48,18 @@ class Matcher(Protocol):
 class SearchResult:
     """Verified pairs and what became of the others."""
 
-    pairs: list[PairMatches]
+    pairs: list[PairMatches]  # those of simultaneous images that contradict the calibration have no inliers
+    candidates: int  # pairs that were tried
     few_matches: int  # pairs with too few matches
     few_inliers: int  # pairs whose matches fit no geometry
     across_classes: int  # matches that were dropped because their ends are of different semantic classes
     rig: RigEstimate  # as simultaneous images show it
+    prior: PriorVerdict
+
+    @property
+    def against_calibration(self) -> int:
+        """Pairs of simultaneous images that keep no inlier, as their matches contradict the calibration."""
+        return sum(not pair.inliers.any() for pair in self.pairs)
 
 
 def match_pairs(
@@ -53,15 +71,18 @@ def match_pairs(
     calibration: BundleAdjustmentConfig,
     *,
     threads: int,
+    prior: PriorTrajectory = NO_PRIOR,
+    further: Further | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> SearchResult:
-    """Match and verify image pairs (n, 2).
+    """Match and verify image pairs (n, 2), and those that `further` adds by what these show.
 
     An essential matrix must explain the matches of a pair. Between simultaneous images of one unit the calibration
     gives the geometry: all of their matches together correct it where they contradict it (see `simultaneous`), and
-    matches far from the epipolar lines that follow, or behind a camera, are out as well. Matches between different
-    semantic classes are dropped before either.
+    matches far from the epipolar lines that follow, or behind a camera, are out as well. Between units the prior
+    trajectory does the same where images do not contradict it (see `prior_verification`). Matches between different
+    semantic classes are dropped before all that.
     """
     cameras = [drive.cameras[i.camera] for i in drive.images]
     prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
@@ -71,77 +92,72 @@ def match_pairs(
         for i, f in zip(drive.images, features, strict=True)
     ]
     focal = params[:, :2].mean(1)
-    across_classes = np.zeros(len(pairs), dtype=np.int64)
+    across_classes = 0
 
-    def one(index: int, pair: Ints) -> PairMatches | str:
+    def one(pair: Ints) -> tuple[PairMatches | str, int]:
         if cancel is not None and cancel():
             raise CancelledError
         a, b = int(pair[0]), int(pair[1])
         matches = matcher.match(prepared[a], prepared[b])
+        across = 0
         if config.same_class:
             fits = may_match(features[a].classes[matches[:, 0]], features[b].classes[matches[:, 1]])
-            across_classes[index] = len(fits) - int(fits.sum())
+            across = len(fits) - int(fits.sum())
             matches = matches[fits]
         if len(matches) < config.min_matches:
-            return "few matches"
+            return "few matches", across
         ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
         ca, cb = drive.images[a].camera, drive.images[b].camera
         inliers = essential_inliers(ra, rb, max_error=config.max_error_px / min(focal[ca], focal[cb]))
         if inliers.sum() < config.min_matches:
-            return "few inliers"
-        return PairMatches(image_a=a, image_b=b, matches=matches, inliers=inliers)
+            return "few inliers", across
+        return PairMatches(image_a=a, image_b=b, matches=matches, inliers=inliers), across
+
+    def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+        a, b = pair.matches.T
+        return rays[pair.image_a][a], rays[pair.image_b][b]
+
+    def inlier_rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+        a, b = rays_of(pair)
+        return a[pair.inliers], b[pair.inliers]
 
     found: list[PairMatches] = []
     lost = {"few matches": 0, "few inliers": 0}
     # Every thread multiplies matrices on its own core.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(one, index, pair) for index, pair in enumerate(pairs)]
+        futures = [pool.submit(one, pair) for pair in pairs]
         try:
-            for done, future in enumerate(futures, 1):
-                result = future.result()
+            done = 0
+            while done < len(futures):
+                result, across = futures[done].result()
+                done, across_classes = done + 1, across_classes + across
                 if isinstance(result, str):
                     lost[result] += 1
                 else:
                     found.append(result)
+                if done == len(pairs) and further is not None:
+                    futures += [pool.submit(one, pair) for pair in further(found, inlier_rays_of)]
                 if progress is not None:
                     progress(done, len(futures))
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
 
-    def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
-        a, b = pair.matches[pair.inliers].T
-        return rays[pair.image_a][a], rays[pair.image_b][b]
-
-    rig = rig_of_drive(drive, found, rays_of, config, calibration)
-    checked = [
-        _in_rig(
-            drive,
-            pair,
-            rays_of(pair),
-            rig,
-            max_error=config.max_error_px / focal[[drive.images[i].camera for i in (pair.image_a, pair.image_b)]].min(),
-        )
-        if are_simultaneous(drive, pair.image_a, pair.image_b)
-        else pair
-        for pair in found
-    ]
-    kept = [pair for pair in checked if pair.inliers.sum() >= config.min_matches]
+    rig = rig_of_drive(drive, found, inlier_rays_of, config, calibration)
+    by_prior = verified_by_prior(drive, found, rays_of, prior, rig, focal_px=focal, config=config, threads=threads)
+    kept = []
+    for pair in by_prior.pairs:
+        if are_simultaneous(drive, pair.image_a, pair.image_b):
+            max_error = max_error_rad(drive, pair, focal, config)
+            kept.append(verified_in_rig(drive, pair, rays_of(pair), rig, max_error=max_error, config=config))
+        elif pair.inliers.sum() >= config.min_matches:
+            kept.append(pair)
     return SearchResult(
-        pairs=kept,
+        pairs=sorted(kept, key=lambda pair: (pair.image_a, pair.image_b)),
+        candidates=len(futures),
         few_matches=lost["few matches"],
         few_inliers=lost["few inliers"] + len(found) - len(kept),
-        across_classes=int(across_classes.sum()),
+        across_classes=across_classes,
         rig=rig,
+        prior=by_prior,
     )
-
-
-def _in_rig(
-    drive: Drive, pair: PairMatches, rays: tuple[Floats, Floats], rig: RigEstimate, *, max_error: float
-) -> PairMatches:
-    """A simultaneous pair with those inliers that agree with the rig."""
-    a, b = (drive.images[image].camera for image in (pair.image_a, pair.image_b))
-    inliers = pair.inliers.copy()
-    found = SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays[0], rays_b=rays[1])
-    inliers[pair.inliers] = rig.fits(found, max_error=max_error)
-    return replace(pair, inliers=inliers)

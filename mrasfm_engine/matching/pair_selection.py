@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -11,13 +11,20 @@ from scipy.spatial import cKDTree
 from mrasfm_engine.config import PairConfig
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.geometry.frustum import view_overlap
+from mrasfm_engine.matching.image_motion import (
+    NEXT_UNITS,
+    Motion,
+    are_following,
+    following_units,
+    next_in_time,
+    spacing_m,
+)
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import Bools, Floats, Ints
 
-ASSUMED_STEP_M = 1.5  # how far a car may have gone from one unit to the next, where nothing else is known
 REVISIT_PATH_M = 20.0  # units farther apart along the route than this, but near one another, are a revisit;
 REVISIT_DIRECT = 0.5  # near: by less than this share of the trajectory between them
-SMOOTHED_UNITS = 9
+SMOOTHED_S = 0.9  # of a receiver's noise, by which even a standing car seems to move
 REVISIT_SHARE = 0.4  # of an image's pairs that revisits may take
 
 
@@ -49,24 +56,34 @@ def _axis_angle_ok(pairs: Ints, world_from_cam: Floats, max_angle_deg: float) ->
     return result
 
 
-def pairs_from_window(drive: Drive, config: PairConfig) -> Ints:
-    """Pairs (n, 2) within a window of units, without any prior: the same camera, and cameras that can see the same
-    things if the car stands or goes some way forward or back.
+def units_ahead(motion: Motion, config: PairConfig) -> list[Ints]:
+    """The units after each one that it is paired with, unless views say otherwise."""
+    return following_units(motion.travelled_m, spacing_m=spacing_m(config.max_depth_m), count=config.window_units)
+
+
+def pairs_from_window(drive: Drive, config: PairConfig, motion: Motion, *, min_matches: int = 0) -> Ints:
+    """Pairs (n, 2) of units and those that follow them, without any prior: the same camera, as long as so many matches
+    are expected, and cameras that can see the same things if the car goes forward or back by the distance between them.
     """
     views = _Views.from_drive(drive)
-    cameras = len(drive.cameras)
     index = {(int(u), int(c)): i for i, (u, c) in enumerate(zip(views.unit, views.camera, strict=True))}
-    gaps = range(max(config.window_units, config.cross_window_units) + 1)
-    linked = {gap: _cameras_with_common_view(drive, views, gap, config) for gap in gaps}
+    linked = _CommonViews(drive, views, config)
     pairs = set()
-    for (u, a), i in index.items():
-        for gap in gaps:
-            for b in range(cameras):
-                same_in_window = a == b and 0 < gap <= config.window_units
-                cross_in_window = a != b and gap <= config.cross_window_units and linked[gap][a, b]
-                j = index.get((u + gap, b))
-                if j is not None and (same_in_window or cross_in_window):
-                    pairs.add((min(i, j), max(i, j)))
+    for unit, ahead in enumerate(units_ahead(motion, config)):
+        for place, other in enumerate([unit, *ahead.tolist()]):
+            near = place <= config.cross_window_units
+            common = linked.after(motion.travelled_m[other] - motion.travelled_m[unit]) if near else None
+            for a in range(len(drive.cameras)):
+                for b in range(len(drive.cameras)):
+                    i, j = index.get((unit, a)), index.get((other, b))
+                    if i is None or j is None or i == j:
+                        continue
+                    if a == b:
+                        good = place <= NEXT_UNITS or motion.expected_matches(a, unit, other) >= min_matches
+                    else:
+                        good = common is not None and bool(common[a, b])
+                    if good:
+                        pairs.add((min(i, j), max(i, j)))
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
@@ -78,27 +95,44 @@ def pairs_without_selection(drive: Drive, config: PairConfig) -> Ints:
     return np.concatenate(pairs or [np.zeros((0, 2))]).astype(np.int64)
 
 
-def _cameras_with_common_view(drive: Drive, views: _Views, gap: int, config: PairConfig) -> Bools:
-    """(cameras, cameras): which of now and which of `gap` units later may see the same."""
-    n = len(drive.cameras)
-    result = np.zeros((n, n), dtype=np.bool_)
-    for shift in (-gap * ASSUMED_STEP_M, 0.0, gap * ASSUMED_STEP_M):
-        later = drive.rig_from_cam.copy()
-        later[:, 0, 3] += shift
-        poses = np.concatenate([drive.rig_from_cam, later])
-        pairs = np.stack(np.meshgrid(np.arange(n), n + np.arange(n), indexing="ij"), -1).reshape(-1, 2)
-        overlap = view_overlap(
-            pairs,
-            world_from_cam=poses,
-            camera=np.tile(np.arange(n), 2),
-            kind=views.kind,
-            params=views.params,
-            size_px=views.size_px,
-            max_depth_m=config.max_depth_m,
-        )
-        good = (overlap >= config.min_overlap) & _axis_angle_ok(pairs, poses, config.max_view_angle_deg)
-        result |= good.reshape(n, n)
-    return result
+@dataclass(frozen=True)
+class _CommonViews:
+    """Cameras that may see the same before and after some distance."""
+
+    drive: Drive
+    views: _Views
+    config: PairConfig
+    known: dict[int, Bools] = field(default_factory=dict)
+
+    def after(self, travelled_m: float) -> Bools:
+        """(cameras, cameras): which of now and which of `travelled_m` later, to the nearest half spacing of units."""
+        step_m = 0.5 * spacing_m(self.config.max_depth_m)
+        steps = round(travelled_m / step_m)
+        if steps not in self.known:
+            self.known[steps] = self._seen(steps * step_m)
+        return self.known[steps]
+
+    def _seen(self, travelled_m: float) -> Bools:
+        n = len(self.drive.cameras)
+        result = np.zeros((n, n), dtype=np.bool_)
+        for shift in {-travelled_m, 0.0, travelled_m}:
+            later = self.drive.rig_from_cam.copy()
+            later[:, 0, 3] += shift
+            poses = np.concatenate([self.drive.rig_from_cam, later])
+            pairs = np.stack(np.meshgrid(np.arange(n), n + np.arange(n), indexing="ij"), -1).reshape(-1, 2)
+            overlap = view_overlap(
+                pairs,
+                world_from_cam=poses,
+                camera=np.tile(np.arange(n), 2),
+                kind=self.views.kind,
+                params=self.views.params,
+                size_px=self.views.size_px,
+                max_depth_m=self.config.max_depth_m,
+            )
+            good = overlap >= self.config.min_overlap
+            good &= _axis_angle_ok(pairs, poses, self.config.max_view_angle_deg)
+            result |= good.reshape(n, n)
+        return result
 
 
 def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -> Ints:
@@ -117,15 +151,16 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     tree = cKDTree(centres)
     pairs = tree.query_pairs(config.max_depth_m, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     pairs.sort(axis=1)
-    travelled_m = _travelled_m(world_from_rig[:, :3, 3])
-    gap = np.abs(views.unit[pairs[:, 0]] - views.unit[pairs[:, 1]])
-    between_m = np.abs(travelled_m[views.unit[pairs[:, 0]]] - travelled_m[views.unit[pairs[:, 1]]])
+    motion = motion_from_poses(drive, world_from_rig)
+    travelled_m = motion.travelled_m
+    unit_a, unit_b = views.unit[pairs].T
+    near = are_following(units_ahead(motion, config), unit_a, unit_b)
+    between_m = np.abs(travelled_m[unit_a] - travelled_m[unit_b])
     position = world_from_rig[views.unit, :3, 3]
     apart = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
-    revisit = (gap > config.window_units) & (between_m > REVISIT_PATH_M) & (apart < REVISIT_DIRECT * between_m)
-    keep = (gap <= config.window_units) | revisit
-    keep &= _axis_angle_ok(pairs, world_from_cam, config.max_view_angle_deg)
-    pairs, gap, revisit = pairs[keep], gap[keep], revisit[keep]
+    revisit = ~near & (between_m > REVISIT_PATH_M) & (apart < REVISIT_DIRECT * between_m)
+    keep = (near | revisit) & _axis_angle_ok(pairs, world_from_cam, config.max_view_angle_deg)
+    pairs, revisit = pairs[keep], revisit[keep]
     overlap = view_overlap(
         pairs,
         world_from_cam=world_from_cam,
@@ -135,10 +170,9 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
         size_px=views.size_px,
         max_depth_m=config.max_depth_m,
     )
-    neighbours = _next_in_time(views)
     quota = round(config.pairs_per_image * REVISIT_SHARE)
     chosen = [
-        neighbours,
+        next_in_time(drive),
         _best_per_image(pairs, np.where(revisit, 0.0, overlap), config.pairs_per_image - quota, config.min_overlap),
         _best_per_image(pairs, np.where(revisit, overlap, 0.0), quota, config.min_overlap),
     ]
@@ -150,27 +184,31 @@ def _pairs_where_known(drive: Drive, world_from_rig: Floats, known: Bools, confi
     units = np.flatnonzero(known)
     nearest = units[np.abs(np.arange(len(known))[:, None] - units[None]).argmin(1)]
     by_overlap = pairs_from_poses(drive, world_from_rig[nearest], config)
-    by_window = pairs_from_window(drive, config)
+    by_window = pairs_from_window(drive, config, motion_unknown(drive, config))
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     both = known[unit[by_overlap]].all(axis=1)
     one = ~known[unit[by_window]].all(axis=1)
     return np.unique(np.concatenate([by_overlap[both], by_window[one]]), axis=0)
 
 
-def _travelled_m(position_m: Floats) -> Floats:
-    """Way driven up to each unit (units,); smoothed, as a receiver's noise from unit to unit is no way."""
-    smooth = np.stack([uniform_filter1d(position_m[:, k], SMOOTHED_UNITS, mode="nearest") for k in range(3)], axis=1)
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+def motion_from_poses(drive: Drive, world_from_rig: Floats) -> Motion:
+    """Motion by the prior trajectory (units, 4, 4), smoothed, and steady across units of which it knows nothing."""
+    times_s = drive.timestamps_us / 1e6
+    known = np.flatnonzero(np.isfinite(world_from_rig[:, 0, 3]))
+    travelled_m: Floats = np.zeros(len(times_s))
+    if len(known) > 1:
+        position_m = np.stack([np.interp(times_s, times_s[known], world_from_rig[known, k, 3]) for k in range(3)], 1)
+        size = max(1, round(SMOOTHED_S / float(np.median(np.diff(times_s)))))
+        smooth = uniform_filter1d(position_m, size, axis=0, mode="nearest")
+        travelled_m[1:] = np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))
+    return Motion.from_travelled(drive, travelled_m)
 
 
-def _next_in_time(views: _Views) -> Ints:
-    """Each image with the two next of its camera: however wrong the prior is, these overlap."""
-    pairs = []
-    for camera in np.unique(views.camera):
-        images = np.flatnonzero(views.camera == camera)
-        for gap in (1, 2):
-            pairs.append(np.stack([images[:-gap], images[gap:]], 1))
-    return np.concatenate(pairs).astype(np.int64) if pairs else np.zeros((0, 2), dtype=np.int64)
+def motion_unknown(drive: Drive, config: PairConfig) -> Motion:
+    """Motion of which nothing is known: each unit is as far from the last one as gives depth."""
+    return Motion.from_travelled(
+        drive, spacing_m(config.max_depth_m) * np.arange(len(drive.timestamps_us), dtype=np.float64)
+    )
 
 
 def _best_per_image(pairs: Ints, overlap: Floats, count: int, minimum: float) -> Ints:

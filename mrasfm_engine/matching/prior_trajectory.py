@@ -9,7 +9,7 @@ import numpy as np
 from mrasfm_engine.config import GnssConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import geodesy, se3
-from mrasfm_engine.geometry.gnss_track import GnssTrack, find_gross_errors, rough_trajectory
+from mrasfm_engine.geometry.gnss_track import GnssTrack, RoughTrajectory, find_gross_errors, rough_trajectory
 from mrasfm_engine.io.heights import ellipsoidal_heights
 from mrasfm_engine.scene.drive import Drive, matrix_from_pose
 from mrasfm_engine.scene.scene import Georeference
@@ -29,6 +29,7 @@ class PriorTrajectory:
 
     source: str  # "rough poses", "GNSS" or "none"
     world_from_rig: Floats | None  # (units, 4, 4)
+    sigma: Floats | None = None  # (units, 6) of rotations about the world's axes (rad) and of positions (m)
     gnss: GnssTrack | None = None
     antenna_in_rig_m: Floats | None = None
     georeference: Georeference | None = None
@@ -47,20 +48,30 @@ def prior_trajectory(drive: Drive, config: GnssConfig, *, use_gnss: bool) -> Pri
     if drive.manifest.rough_poses is not None:
         rough, rough_world_from_local = _rough(drive)
     antenna = None if gnss is None else np.array(gnss.antenna_in_rig_m)
-    poses, source = rough, "rough poses"
-    if poses is not None and np.isnan(poses[:, 0, 3]).mean() > 0.5:
-        poses = None  # too few to choose pairs by
-    if poses is None and track is not None and antenna is not None:
-        poses, source = rough_trajectory(track, drive.timestamps_us, antenna), "GNSS"
+    found, source = _with_sigmas(drive, rough), "rough poses"
+    if found is not None and np.isnan(found.world_from_rig[:, 0, 3]).mean() > 0.5:
+        found = None  # too few to choose pairs by
+    if found is None and track is not None and antenna is not None:
+        found, source = rough_trajectory(track, drive.timestamps_us, antenna), "GNSS"
     return PriorTrajectory(
-        source="none" if poses is None else source,
-        world_from_rig=poses,
+        source="none" if found is None else source,
+        world_from_rig=None if found is None else found.world_from_rig,
+        sigma=None if found is None else found.sigma,
         gnss=track,
         antenna_in_rig_m=antenna,
         georeference=georeference,
         rough_world_from_rig=rough,
         rough_world_from_local=rough_world_from_local,
     )
+
+
+def _with_sigmas(drive: Drive, rough: Floats | None) -> RoughTrajectory | None:
+    """The manifest's rough poses at the units' times with its sigmas."""
+    declared = drive.manifest.rough_poses
+    if rough is None or declared is None:
+        return None
+    sigma = [*[np.radians(declared.sigma_rotation_deg)] * 3, *[declared.sigma_translation_m] * 3]
+    return RoughTrajectory(world_from_rig=rough, sigma=np.tile(sigma, (len(rough), 1)))
 
 
 def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:

@@ -9,6 +9,8 @@ import numpy as np
 
 from mrasfm_engine.config import PairConfig
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE
+from mrasfm_engine.matching.image_motion import Motion
+from mrasfm_engine.matching.pair_selection import REVISIT_PATH_M, units_ahead
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bytes, Floats32, Ints
@@ -16,28 +18,36 @@ from mrasfm_engine.types import Bytes, Floats32, Ints
 WORDS = 64
 TRAINING_DESCRIPTORS = 30_000
 KEYPOINTS_PER_IMAGE = 1000
-MIN_GAP_UNITS = 12  # nearer units are alike because they are neighbours
 MIN_LIKENESS = 0.5  # of what images at the edge of the window have with each other
 
 
-def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairConfig) -> Ints:
-    """Image pairs (n, 2) of units far apart in time that look alike: candidates, still to be matched and verified.
+def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairConfig, motion: Motion) -> Ints:
+    """Image pairs (n, 2) of units far apart along the path that look alike: candidates, to be matched and verified.
+
+    Units nearer than `REVISIT_PATH_M`, or in each other's window, are alike because they are neighbours.
 
     Images are compared by VLAD (Jegou et al., CVPR 2010) over a vocabulary learned from the drive itself. Of every unit
     the most alike images are kept; where two units have a pair, their images of one camera are paired as well.
     """
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     camera = np.array([image.camera for image in drive.images], dtype=np.int64)
-    if config.revisit_pairs_per_unit == 0 or unit.max(initial=0) < MIN_GAP_UNITS:
+    travelled_m = motion.travelled_m[unit]
+    ahead = units_ahead(motion, config)
+    if config.revisit_pairs_per_unit == 0 or np.ptp(travelled_m) <= REVISIT_PATH_M:
         return np.zeros((0, 2), dtype=np.int64)
     vectors = _vlad(features)
     likeness = vectors @ vectors.T
-    gap = np.abs(unit[:, None] - unit[None, :])
-    edge = (gap == config.window_units) & (camera[:, None] == camera[None, :])
+    last = np.array([units[-1] if len(units) else -1 for units in ahead], dtype=np.int64)
+    edge = (last[unit][:, None] == unit[None, :]) & (camera[:, None] == camera[None, :])
     if not edge.any():
         return np.zeros((0, 2), dtype=np.int64)
     limit = MIN_LIKENESS * float(np.median(likeness[edge]))
-    likeness[gap < MIN_GAP_UNITS] = -1.0
+    likeness[np.abs(travelled_m[:, None] - travelled_m[None, :]) <= REVISIT_PATH_M] = -1.0
+    first = np.searchsorted(unit, np.arange(len(ahead) + 1))  # images are in the order of their units
+    for u, units in enumerate(ahead):
+        for v in units:
+            here, there = slice(first[u], first[u + 1]), slice(first[v], first[v + 1])
+            likeness[here, there] = likeness[there, here] = -1.0
     chosen: set[tuple[int, int]] = set()
     where = {(int(u), int(c)): i for i, (u, c) in enumerate(zip(unit, camera, strict=True))}
     for u in np.unique(unit):

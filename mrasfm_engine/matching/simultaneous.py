@@ -6,43 +6,44 @@ a degree off its given rotation is found before its matches are thrown away for 
 
 Corrections x of the cameras' rotations minimise
 
-    sum of rho(e^2 / variance) + x' P^-1 x      e = t . (g_a x g_b) / sqrt(|t x g_a|^2 + |t x g_b|^2)
+    sum of rho(e^2 / variance) + x' P^-1 x
 
-with rays g in rig axes, t from camera b to camera a, and P the prior. e is the Sampson distance in radians [Hartley and
-Zisserman, Multiple View Geometry, 11.4.3]; its variance is the keypoints' and what the prior of t adds: cameras of
-different places say little of t. Of the result only what the images demand is used: along the principal directions of
-their information against the prior, those corrections that are significant. A rig that is given well enough stays
-exactly as given.
+with the Sampson distances e of `relative_pose` and the prior P. The variance is the keypoints' and what the prior of
+the cameras' places adds: matches say little of these. Of the result only what the images demand is used: along the
+principal directions of their information against the prior, those corrections that are significant. A rig that is given
+well enough stays exactly as given.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
-from mrasfm_engine.matching.verification import signed_parallax
+from mrasfm_engine.matching.relative_pose import (
+    Errors,
+    MedianSpread,
+    UncertainRig,
+    epipolar_derivatives,
+    most_likely_correction,
+)
+from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
-from mrasfm_engine.types import Bools, Floats
+from mrasfm_engine.types import Floats
 from schemas.findings import Finding, warning
 
 SIMULTANEOUS_US = 2_000  # cameras less apart than this are one rig: a fast car goes 6 cm
-GATE_SIGMAS = 3.0
 SIGNIFICANT_SIGMAS = 3.0
 MAX_MATCHES = 2_000  # of a pair of cameras, spread over its units
 # Lens models are off by the same in all images, in about as many patterns as they have parameters. So matches of two
 # cameras, however many, say no more than these many independent ones.
 INDEPENDENT_MATCHES = 10
 MIN_SIGMA_PX = 0.5  # of a coordinate: keypoints are not better
-ITERATIONS = 40
-INITIAL_DAMPING = 1e-3
-CONVERGED = 1e-3  # of a prior's standard deviation
-SETTLED = 0.99  # of the spread that errors had before
 CLEARLY_GIVEN = 0.5  # share of the matches: one that most contradict is not the rig's calibration
 
 
@@ -57,54 +58,20 @@ class SimultaneousMatches:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigEstimate:
+class RigEstimate(UncertainRig):
     """The cameras' poses with the corrections that simultaneous images demand, and what is left uncertain.
 
     Attributes
     ----------
-    rig_from_cam
-        (c, 4, 4)
-    covariance_rad2
-        (3 c, 3 c) of rotations in rig axes, camera by camera.
-    variance_translation_m2
-        (c,) of each axis, by the prior.
     matches
         How many took part.
     fitted_as_given, fitted
         Shares of them that lie near their epipolar lines under the given calibration, and under the estimate.
     """
 
-    rig_from_cam: Floats
-    covariance_rad2: Floats
-    variance_translation_m2: Floats
     matches: int
     fitted_as_given: float
     fitted: float
-
-    def fits(self, found: SimultaneousMatches, *, max_error: float) -> Bools:
-        """Mask (n,) of the matches that meet in front of both cameras, near their epipolar lines.
-
-        `max_error` (rad) is what keypoints may be off; to it comes what the poses are uncertain by.
-        """
-        a, b = found.camera_a, found.camera_b
-        rig_from_a, rig_from_b = self.rig_from_cam[a], self.rig_from_cam[b]
-        error, by_rotation, by_shift, normal = epipolar_derivatives(rig_from_a, rig_from_b, found.rays_a, found.rays_b)
-        rows = np.concatenate([3 * a + np.arange(3), 3 * b + np.arange(3)])
-        covariance = self.covariance_rad2[np.ix_(rows, rows)]
-        shift_m2 = self.variance_translation_m2[[a, b]].sum()
-        variance = _forms(covariance, np.concatenate(by_rotation, axis=1)) + shift_m2 * (by_shift**2).sum(1)
-        near = error**2 < max_error**2 + GATE_SIGMAS**2 * variance
-        # A turn about the epipolar plane's normal lets rays cross nearer or farther, or behind.
-        slack = max_error**2 + GATE_SIGMAS**2 * _forms(covariance, np.concatenate([normal, -normal], axis=1))
-        b_from_a = se3.inverse(rig_from_b) @ rig_from_a
-        result: Bools = near & (signed_parallax(b_from_a, found.rays_a, found.rays_b) > -np.sqrt(slack))
-        return result
-
-
-def _forms(covariance: Floats, rows: Floats) -> Floats:
-    """Variances (n,) of linear functions, given by rows (n, k), of what has a covariance (k, k)."""
-    result: Floats = ((rows @ covariance) * rows).sum(1)
-    return result
 
 
 def contradiction(names: Sequence[str], given: Floats, rig: RigEstimate) -> Finding | None:
@@ -155,6 +122,62 @@ def rig_of_drive(
         focal_px=pack_cameras(drive.cameras)[1][:, :2].mean(1),
         max_error_px=match_config.max_error_px,
     )
+
+
+def verified_again(
+    drive: Drive,
+    pairs: Sequence[PairMatches],
+    rays_of: Callable[[PairMatches], tuple[Floats, Floats]],
+    rig: UncertainRig,
+    *,
+    focal_px: Floats,
+    config: MatchConfig,
+) -> list[PairMatches]:
+    """The pairs, those of simultaneous images with the inliers that follow from another rig than the one so far.
+
+    All matches of a pair are judged, by the essential matrix and by the rig: those come back that an earlier rig threw
+    away. Pairs with too few inliers have none, and stay, to be judged again.
+
+    Parameters
+    ----------
+    rays_of
+        Viewing rays (n, 3) of all of a pair's matches in image_a and image_b, through the cameras' lenses as of now.
+    rig
+        Poses of the cameras as of now, and their covariance.
+    focal_px
+        Of the cameras (c,).
+    """
+    result = []
+    for pair in pairs:
+        if are_simultaneous(drive, pair.image_a, pair.image_b):
+            rays = rays_of(pair)
+            max_error = max_error_rad(drive, pair, focal_px, config)
+            essential = replace(pair, inliers=essential_inliers(*rays, max_error=max_error))
+            result.append(verified_in_rig(drive, essential, rays, rig, max_error=max_error, config=config))
+        else:
+            result.append(pair)
+    return result
+
+
+def verified_in_rig(
+    drive: Drive,
+    pair: PairMatches,
+    rays: tuple[Floats, Floats],
+    rig: UncertainRig,
+    *,
+    max_error: float,
+    config: MatchConfig,
+) -> PairMatches:
+    """A pair of simultaneous images with those inliers that agree with the rig; with none where these are too few."""
+    a, b = (drive.images[image].camera for image in (pair.image_a, pair.image_b))
+    inliers = pair.inliers & rig.relative_pose(a, b).fits(*rays, max_error=max_error)
+    enough = int(inliers.sum()) >= config.min_matches
+    return replace(pair, inliers=inliers if enough else np.zeros_like(inliers))
+
+
+def max_error_rad(drive: Drive, pair: PairMatches, focal_px: Floats, config: MatchConfig) -> float:
+    """Epipolar distance (rad) that a pair's keypoints may have, by the camera with the coarser pixels."""
+    return float(config.max_error_px / focal_px[[drive.images[i].camera for i in (pair.image_a, pair.image_b)]].min())
 
 
 def calibration_sigmas(drive: Drive, settings: BundleAdjustmentConfig) -> tuple[Floats, Floats]:
@@ -209,34 +232,30 @@ def estimate_rig(
         variance_translation_m2=sigma_translation_m**2,
         focal_px=focal_px,
     )
-    x, spread_px, damping = np.zeros(3 * len(rig_from_cam)), problem.spread_px(rig_from_cam), INITIAL_DAMPING
-    for _ in range(ITERATIONS):
-        information, gradient, cost = problem.linearise(x, spread_px)
-        damped = information + np.diag(1.0 + damping * np.diag(information))
-        step = -np.linalg.solve(damped, gradient + x)
-        if problem.linearise(x + step, spread_px)[2] > cost:
-            damping *= 10.0
-            continue
-        x, damping = x + step, 0.1 * damping
-        narrower = np.minimum(spread_px, problem.spread_px(problem.corrected(x)))
-        settled = bool((narrower > SETTLED * spread_px).all())
-        spread_px = narrower
-        if settled and np.abs(step).max(initial=0.0) < CONVERGED:
-            break
-    known, directions = np.linalg.eigh(problem.linearise(x, spread_px)[0])
+    at_least = MIN_SIGMA_PX * np.array([problem.pixel_rad(one) for one in problem.found])
+    correction = most_likely_correction(problem.errors, 3 * len(rig_from_cam), MedianSpread(at_least))
+    known, directions = np.linalg.eigh(correction.information)
     posterior = 1.0 / np.sqrt(1.0 + np.maximum(known, 0.0))
-    along = directions.T @ x
+    along = directions.T @ correction.x
     demanded = np.abs(along) > SIGNIFICANT_SIGMAS * posterior
     refined = problem.corrected(directions[:, demanded] @ along[demanded])
     spread = (directions * posterior) * problem.sigma_rad[:, None]
     return RigEstimate(
         rig_from_cam=refined,
-        covariance_rad2=spread @ spread.T,
-        variance_translation_m2=sigma_translation_m**2,
+        covariance=_of_poses(spread @ spread.T, sigma_translation_m**2),
         matches=sum(len(one.rays_a) for one in problem.found),
         fitted_as_given=problem.share_that_fits(rig_from_cam, max_error_px),
         fitted=problem.share_that_fits(refined, max_error_px),
     )
+
+
+def _of_poses(covariance_rad2: Floats, variance_translation_m2: Floats) -> Floats:
+    """Covariance (6 c, 6 c) of poses from that of rotations (3 c, 3 c), and each axis' variance of positions (c,)."""
+    c = len(variance_translation_m2)
+    result = np.zeros((c, 6, c, 6))
+    result[:, :3, :, :3] = covariance_rad2.reshape(c, 3, c, 3)
+    result[:, 3:, :, 3:] = np.einsum("a,ab,ij->aibj", variance_translation_m2, np.eye(c), np.eye(3))
+    return result.reshape(6 * c, 6 * c)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,38 +273,32 @@ class _RotationProblem:
         turned = se3.exp_so3((x * self.sigma_rad).reshape(-1, 3)) @ self.rig_from_cam[:, :3, :3]
         return se3.transform(turned, self.rig_from_cam[:, :3, 3])
 
-    def linearise(self, x: Floats, spread_px: Floats) -> tuple[Floats, Floats, float]:
-        """J' W J and J' W r of the matches, and half the cost with the prior's.
-
-        There is a Cauchy loss, and no more information than of `INDEPENDENT_MATCHES` of each pair of cameras.
-        """
-        rig, size = self.corrected(x), len(x)
-        information, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.5 * float(x @ x)
-        for one, spread in zip(self.found, spread_px, strict=True):
+    def errors(self, x: Floats) -> list[Errors]:
+        """Errors of each pair of cameras, with no more information than of `INDEPENDENT_MATCHES`."""
+        rig, result = self.corrected(x), []
+        for one in self.found:
             a, b = one.camera_a, one.camera_b
             error, by_rotation, by_shift, _ = epipolar_derivatives(rig[a], rig[b], one.rays_a, one.rays_b)
-            shift_m2 = self.variance_translation_m2[[a, b]].sum()
-            variance = (spread * self._pixel_rad(one)) ** 2 + shift_m2 * (by_shift**2).sum(1)
-            count = min(1.0, INDEPENDENT_MATCHES / len(error))
-            weight = count / (variance + error**2)
             rows = np.concatenate([3 * a + np.arange(3), 3 * b + np.arange(3)])
-            jacobian = np.concatenate([by_rotation[0], by_rotation[1]], axis=1) * self.sigma_rad[rows]
-            information[np.ix_(rows, rows)] += jacobian.T @ (weight[:, None] * jacobian)
-            gradient[rows] += jacobian.T @ (weight * error)
-            cost += 0.5 * count * float(np.log1p(error**2 / variance).sum())
-        return information, gradient, cost
-
-    def spread_px(self, rig_from_cam: Floats) -> Floats:
-        """Standard deviation of the errors of each pair of cameras (p,), from their median."""
-        medians = [np.median(_errors(rig_from_cam, one)) / self._pixel_rad(one) for one in self.found]
-        return np.maximum(MIN_SIGMA_PX, np.array(medians) / 0.6745)
+            shift_m2 = self.variance_translation_m2[[a, b]].sum()
+            result.append(
+                Errors(
+                    rows=rows,
+                    error=error,
+                    jacobian=np.concatenate(by_rotation, axis=1) * self.sigma_rad[rows],
+                    variance=shift_m2 * (by_shift**2).sum(1),
+                    weight=min(1.0, INDEPENDENT_MATCHES / len(error)),
+                )
+            )
+        return result
 
     def share_that_fits(self, rig_from_cam: Floats, max_error_px: float) -> float:
         """Share of all matches that lie near their epipolar lines."""
-        fits = [(_errors(rig_from_cam, one) < max_error_px * self._pixel_rad(one)).sum() for one in self.found]
+        fits = [(_errors(rig_from_cam, one) < max_error_px * self.pixel_rad(one)).sum() for one in self.found]
         return float(sum(fits) / max(sum(len(one.rays_a) for one in self.found), 1))
 
-    def _pixel_rad(self, one: SimultaneousMatches) -> float:
+    def pixel_rad(self, one: SimultaneousMatches) -> float:
+        """Angle of a pixel of the coarser of two cameras."""
         return float(1.0 / self.focal_px[[one.camera_a, one.camera_b]].min())
 
 
@@ -293,20 +306,3 @@ def _errors(rig_from_cam: Floats, one: SimultaneousMatches) -> Floats:
     poses = rig_from_cam[one.camera_a], rig_from_cam[one.camera_b]
     result: Floats = np.abs(epipolar_derivatives(*poses, one.rays_a, one.rays_b)[0])
     return result
-
-
-def epipolar_derivatives(
-    rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: Floats
-) -> tuple[Floats, tuple[Floats, Floats], Floats, Floats]:
-    """Sampson distances (n,) in rad of rays (n, 3) of two cameras, and their derivatives.
-
-    These are (n, 3) each, in the rotations of a and b and in the place of a against b, all in rig axes; the last are
-    the unit normals (n, 3) of the epipolar planes.
-    """
-    a, b = rays_a @ rig_from_a[:3, :3].T, rays_b @ rig_from_b[:3, :3].T
-    t = rig_from_a[:3, 3] - rig_from_b[:3, 3]
-    across, ta, tb = np.cross(a, b), np.cross(t, a), np.cross(t, b)
-    length = np.maximum(np.sqrt((ta**2).sum(1) + (tb**2).sum(1)), 1e-12)[:, None]
-    normal = ta / np.maximum(np.linalg.norm(ta, axis=1), 1e-12)[:, None]
-    by_rotation = -np.cross(a, tb) / length, np.cross(b, ta) / length
-    return across @ t / length[:, 0], by_rotation, across / length, normal

@@ -44,6 +44,7 @@ class PairMatches:
     image_b: int
     matches: NDArray[np.int32]  # (m, 2) keypoint indices, before verification
     inliers: Bools  # (m,) which of them passed geometric verification
+    is_revisit: bool = False  # whether their units do not follow one another: a place that is seen again, if it is one
 
 
 @dataclass(frozen=True, kw_only=True)

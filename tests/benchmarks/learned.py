@@ -13,7 +13,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.matching.pair_matching import match_pairs
-from mrasfm_engine.matching.pair_selection import pairs_from_window
+from mrasfm_engine.matching.pair_selection import motion_unknown, pairs_from_window
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.registry import load_components
 from tests.benchmarks.colmap import THREADS
@@ -72,7 +72,7 @@ def changing_light(data: Path, work: Path, models: Path) -> Iterator[Figure]:
         config = EngineConfig.model_validate({**settings, "models": {"folder": models}})
         components = load_components(config, None)
         features = extract_features(drive, components.extractor, threads=THREADS)
-        pairs = pairs_from_window(drive, config.pairs)
+        pairs = pairs_from_window(drive, config.pairs, motion_unknown(drive, config.pairs))
         found = match_pairs(
             drive, features, pairs, components.matcher, config.matching, config.bundle_adjustment, threads=THREADS
         )

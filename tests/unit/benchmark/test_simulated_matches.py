@@ -58,7 +58,7 @@ def rays(route: LongRoute, image: int, keypoints: np.ndarray) -> np.ndarray:
 
 
 def test_a_tenth_is_wrong(route: LongRoute, pairs: list[PairMatches]) -> None:
-    near = [pair for pair in pairs if gap(pair) <= CONFIG.pairs.window_units]
+    near = [pair for pair in pairs if not pair.is_revisit]
     assert len(near) > 400
     total = sum(len(pair.matches) for pair in near)
     wrong = sum(len(pair.matches) * (1 - true_share(route, pair)) for pair in near) / total
@@ -94,7 +94,7 @@ def test_wrong_matches_pass_verification(route: LongRoute, pairs: list[PairMatch
 
 
 def test_revisits_are_found_missed_and_mistaken(route: LongRoute, pairs: list[PairMatches]) -> None:
-    far = [pair for pair in pairs if gap(pair) > CONFIG.pairs.window_units]
+    far = [pair for pair in pairs if pair.is_revisit]
     true = [pair for pair in far if true_share(route, pair) > 0.5]
     false = [pair for pair in far if true_share(route, pair) < 0.1]
     assert len(true) + len(false) == len(far)

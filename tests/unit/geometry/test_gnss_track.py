@@ -114,8 +114,9 @@ def test_the_rough_trajectory_applies_the_lever_arm() -> None:
     rig, heading = bend(t)
     rotation = se3.exp_so3(heading[:, None] * [0.0, 0.0, 1.0])
     antenna = rig + rotation @ ARM_M + rng.normal(size=rig.shape) * 0.02
-    poses = rough_trajectory(track(t, antenna, 0.02), t, ARM_M)
-    assert poses is not None
+    found = rough_trajectory(track(t, antenna, 0.02), t, ARM_M)
+    assert found is not None
+    poses = found.world_from_rig
     inner = slice(10, 90)
     off = np.linalg.norm(poses[inner, :3, 3] - rig[inner], axis=1)
     assert 1e-4 < np.sqrt((off**2).mean()) < 0.15
@@ -134,8 +135,9 @@ def test_a_standing_car_keeps_the_heading_it_came_with(sigma_m: float, drift: bo
         for k in range(1, 400):
             noise[k] = 0.98 * noise[k - 1] + 0.2 * noise[k]
     antenna = along[:, None] * np.array([0.6, 0.8, 0.0]) + noise
-    poses = rough_trajectory(track(t, antenna, sigma_m), t, np.zeros(3))
-    assert poses is not None
+    found = rough_trajectory(track(t, antenna, sigma_m), t, np.zeros(3))
+    assert found is not None
+    poses = found.world_from_rig
     heading = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
     expected = np.degrees(np.arctan2(0.8, 0.6))
     assert 0.01 < np.abs((heading - expected + 180) % 360 - 180).max() < (12.0 if sigma_m < 0.1 else 40.0)
@@ -149,8 +151,9 @@ def test_gross_errors_are_left_out_of_the_rough_trajectory() -> None:
     antenna[20] += [100.0, 0.0, 0.0]
     good = np.ones(60, dtype=np.bool_)
     good[20] = False
-    poses = rough_trajectory(track(t, antenna, good=good), t, np.zeros(3))
-    assert poses is not None
+    found = rough_trajectory(track(t, antenna, good=good), t, np.zeros(3))
+    assert found is not None
+    poses = found.world_from_rig
     assert np.linalg.norm(poses[:, :3, 3] - rig, axis=1).max() < 0.5
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -118,22 +120,27 @@ def test_the_pose_graphs_jacobians_agree_with_differences() -> None:
 DRIFT = se3.transform(se3.exp_so3(np.radians([0.1, -0.2, 0.5])), [0.3, -0.25, 0.1])
 
 
+def marked(pairs: list[PairMatches], unit: np.ndarray) -> list[PairMatches]:
+    """The pairs, those of units more than four apart as revisits."""
+    return [replace(p, is_revisit=bool(unit[p.image_b] - unit[p.image_a] > 4)) for p in pairs]
+
+
 def drifted_model(drift: np.ndarray = DRIFT, *, factor: int = 1) -> tuple[SimulatedDrive, Mapper, list[PairMatches]]:
     """A drive whose second half went off by a drift, and the matches across a larger gap."""
     simulated = enlarged(make_simulated_drive(units=16, cameras=2, points=1200, spacing_m=0.8), factor)
     unit = np.array([i.unit for i in simulated.drive.images])
-    near, far = split_pairs(true_matches(simulated, window=12), unit, window_units=4)
+    near, far = split_pairs(marked(true_matches(simulated, window=12), unit))
     mapper = with_true_poses(make_model(simulated, near), simulated, range(16))
     for late in range(8, 16):
         mapper.set_pose(late, drift @ simulated.world_from_rig[late])
     return simulated, mapper, [p for p in far if unit[p.image_a] < 4 and unit[p.image_b] >= 8]
 
 
-def test_pairs_are_split_by_the_gap_between_their_units() -> None:
+def test_pairs_are_split_by_what_matching_took_for_revisits() -> None:
     simulated = make_simulated_drive(units=8, cameras=2, points=500)
     unit = np.array([i.unit for i in simulated.drive.images])
-    pairs = true_matches(simulated, window=7)
-    near, far = split_pairs(pairs, unit, window_units=4)
+    pairs = marked(true_matches(simulated, window=7), unit)
+    near, far = split_pairs(pairs)
     assert len(near) + len(far) == len(pairs)
     assert {int(unit[p.image_b] - unit[p.image_a]) for p in near} == {0, 1, 2, 3, 4}
     assert {int(unit[p.image_b] - unit[p.image_a]) for p in far} == {5, 6, 7}

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +11,22 @@ from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
 from mrasfm_engine.matching.pair_matching import match_pairs
-from mrasfm_engine.matching.pair_selection import pairs_from_window
+from mrasfm_engine.matching.pair_selection import motion_unknown, pairs_from_window
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import make_simulated_drive
 
 CALIBRATION = BundleAdjustmentConfig()
 
 
+def window_pairs(drive: Drive) -> np.ndarray:
+    return pairs_from_window(drive, PairConfig(), motion_unknown(drive, PairConfig()))
+
+
 def test_matches_are_verified_and_nothing_is_lost_silently() -> None:
     simulated = make_simulated_drive(units=4, cameras=2, points=600)
     config, calls = MatchConfig(), []
-    candidates = pairs_from_window(simulated.drive, PairConfig())
+    candidates = window_pairs(simulated.drive)
     result = match_pairs(
         simulated.drive,
         simulated.features,
@@ -77,16 +84,20 @@ def test_inside_a_unit_the_calibration_must_agree(turned_deg: float, share: floa
 
     right = make_simulated_drive(units=3, cameras=2, points=600)
     simulated = make_simulated_drive(units=3, cameras=2, points=600, given=given)
-    pairs = pairs_from_window(simulated.drive, PairConfig())
+    pairs = window_pairs(simulated.drive)
     counts = []
     for drive in (right.drive, simulated.drive):
-        found = match_pairs(
+        result = match_pairs(
             drive, simulated.features, pairs, NearestNeighbourMatcher(config), config, CALIBRATION, threads=1
-        ).pairs
-        inside = [p for p in found if drive.images[p.image_a].unit == drive.images[p.image_b].unit]
-        counts.append((sum(int(p.inliers.sum()) for p in inside), sum(int(p.inliers.sum()) for p in found)))
+        )
+        found = result.pairs
+        inside_pairs = [p for p in found if drive.images[p.image_a].unit == drive.images[p.image_b].unit]
+        counts.append((sum(int(p.inliers.sum()) for p in inside_pairs), sum(int(p.inliers.sum()) for p in found)))
     (inside, over_all), (inside_turned, over_all_turned) = counts
     assert inside > 100
+    # What contradicts the calibration stays, to be verified again once that has moved.
+    assert len(inside_pairs) == 3
+    assert result.against_calibration == (3 if share == 0 else 0)
     assert inside_turned == pytest.approx(share * inside, abs=0.1 * inside)
     assert over_all_turned - inside_turned == pytest.approx(over_all - inside, rel=0.05)
 
@@ -98,7 +109,7 @@ def test_cancelling() -> None:
         match_pairs(
             simulated.drive,
             simulated.features,
-            pairs_from_window(simulated.drive, PairConfig()),
+            window_pairs(simulated.drive),
             NearestNeighbourMatcher(config),
             config,
             CALIBRATION,
@@ -112,7 +123,7 @@ def test_matches_between_classes_are_dropped_before_verification_and_counted() -
     rng = np.random.default_rng(0)
     # A third of the keypoints has no class, the others have any.
     features = [replace(f, classes=rng.integers(0, 3, len(f.xy_px)).astype(np.uint8)) for f in simulated.features]
-    candidates = pairs_from_window(simulated.drive, PairConfig())
+    candidates = window_pairs(simulated.drive)
     found = {}
     for same_class in (True, False):
         config = MatchConfig(same_class=same_class)
@@ -132,7 +143,7 @@ def test_matches_between_classes_are_dropped_before_verification_and_counted() -
 
 def test_without_classes_nothing_changes() -> None:
     simulated = make_simulated_drive(units=2, cameras=2, points=400)
-    candidates = pairs_from_window(simulated.drive, PairConfig())
+    candidates = window_pairs(simulated.drive)
     results = []
     for same_class in (True, False):
         config = MatchConfig(same_class=same_class)
@@ -144,3 +155,23 @@ def test_without_classes_nothing_changes() -> None:
     for a, b in zip(results[0].pairs, results[1].pairs, strict=True):
         np.testing.assert_array_equal(a.matches, b.matches)
         np.testing.assert_array_equal(a.inliers, b.inliers)
+
+
+def test_further_pairs_follow_from_what_the_first_show() -> None:
+    simulated = make_simulated_drive(units=4, cameras=1, points=600)
+    config, calls, asked = MatchConfig(), [], []
+
+    def further(
+        found: Sequence[PairMatches], rays_of: Callable[[PairMatches], tuple[np.ndarray, np.ndarray]]
+    ) -> np.ndarray:
+        asked.append([(pair.image_a, pair.image_b, len(rays_of(pair)[0]) == pair.inliers.sum()) for pair in found])
+        return np.array([[0, 2], [1, 3]], dtype=np.int64)
+
+    result = match_pairs(
+        simulated.drive, simulated.features, np.array([[0, 1], [2, 3], [1, 2]]), NearestNeighbourMatcher(config),
+        config, CALIBRATION, threads=2, further=further, progress=lambda done, total: calls.append((done, total)),
+    )  # fmt: skip
+    assert asked == [[(0, 1, True), (2, 3, True), (1, 2, True)]]
+    assert [(p.image_a, p.image_b) for p in result.pairs] == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
+    assert result.candidates == 5
+    assert calls == [(1, 3), (2, 3), (3, 5), (4, 5), (5, 5)]

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mrasfm_engine.config import PairConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.matching.pair_selection import pairs_from_poses, pairs_from_window, pairs_without_selection
+from mrasfm_engine.matching.pair_selection import (
+    motion_from_poses,
+    motion_unknown,
+    pairs_from_poses,
+    pairs_without_selection,
+)
+from mrasfm_engine.matching.pair_selection import pairs_from_window as pairs_by_motion
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.synthetic.rigs import true_cameras
 from tests.helpers.simulated_drive import make_drive
@@ -20,6 +28,10 @@ def drive_of(cameras: int, units: int, **kwargs: object) -> Drive:
         names=[c.name for c in rig],
         **kwargs,
     )
+
+
+def pairs_from_window(drive: Drive, config: PairConfig) -> np.ndarray:
+    return pairs_by_motion(drive, config, motion_unknown(drive, config))
 
 
 def straight_road(units: int, step_m: float = 1.1) -> np.ndarray:
@@ -117,6 +129,42 @@ def test_a_route_that_returns_has_loop_pairs() -> None:
     second_round = set(range(int(units / 1.1) + 3, units))
     assert second_round <= set(unit[loop, 1].tolist())
     assert len(pairs) < units * 6 * 17
+
+
+@pytest.mark.parametrize("prior", [True, False])
+@pytest.mark.parametrize(
+    ("step_m", "last"),
+    [(0.17, (7, 18)), (1.1, (3, 4)), (7.5, (2, 4))],  # 5 m/s at 30 Hz, 11 m/s at 10 Hz, 15 m/s at 2 Hz
+)
+def test_windows_count_metres(prior: bool, step_m: float, last: tuple[int, int]) -> None:
+    """The next two units, and others as far apart as depth needs, however many units that is."""
+    units, config = 60, PairConfig()
+    drive, poses = drive_of(2, units), straight_road(units, step_m)
+    motion = motion_from_poses(drive, poses)
+    pairs = pairs_from_poses(drive, poses, config) if prior else pairs_by_motion(drive, config, motion)
+    unit, camera = units_and_cameras(drive, pairs)
+    same = camera[:, 0] == camera[:, 1]
+    inner = same & (unit[:, 0] >= 10) & (unit[:, 0] < 30) & (camera[:, 0] == 0)
+    gap = unit[inner, 1] - unit[inner, 0]
+    assert {1, 2} <= set(gap.tolist())
+    assert last[0] <= gap.max() <= last[1]
+    assert 2 * 20 <= inner.sum() <= config.window_units * 20
+    beyond = np.diff(sorted(set(unit[inner & (unit[:, 0] == 20), 1])))[1:]
+    assert (beyond * step_m >= 0.8).all()
+
+
+def test_a_window_ends_where_no_matches_are_expected() -> None:
+    """At 2 Hz on a motorway the third unit shows hardly anything of the first."""
+    drive = drive_of(1, 20)
+    known = motion_from_poses(drive, straight_road(20, 15.0))
+    gaps = {}
+    for lost_per_m in (0.01, 0.2):
+        motion = replace(
+            known, lost_per_m=np.full_like(known.lost_per_m, lost_per_m), matches=np.full_like(known.matches, 120.0)
+        )
+        unit, _ = units_and_cameras(drive, pairs_by_motion(drive, PairConfig(), motion, min_matches=15))
+        gaps[lost_per_m] = int((unit[:, 1] - unit[:, 0]).max())
+    assert gaps == {0.01: 4, 0.2: 2}
 
 
 def test_a_standing_car_has_neighbours_and_no_more() -> None:

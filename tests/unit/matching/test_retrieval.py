@@ -6,12 +6,23 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import PairConfig
-from mrasfm_engine.matching.retrieval import MIN_GAP_UNITS, revisit_pairs
+from mrasfm_engine.matching.image_motion import Motion
+from mrasfm_engine.matching.pair_selection import REVISIT_PATH_M
+from mrasfm_engine.matching.retrieval import revisit_pairs as revisits_of_motion
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import make_drive, random_descriptors
 
 UNITS, WORDS = 40, 60
+STEP_M = 1.7
+MIN_GAP_UNITS = 12  # so many steps are more than REVISIT_PATH_M
+
+
+def revisit_pairs(
+    drive: Drive, features: list[ImageFeatures], config: PairConfig, step_m: float = STEP_M
+) -> np.ndarray:
+    motion = Motion.from_travelled(drive, step_m * np.arange(len(drive.timestamps_us)))
+    return revisits_of_motion(drive, features, config, motion)
 
 
 def drive_of(cameras: int, units: int = UNITS) -> Drive:
@@ -106,3 +117,13 @@ def test_a_networks_descriptors_find_the_place_again_too() -> None:
     ]
     pairs = revisit_pairs(drive, features, PairConfig(revisit_pairs_per_unit=2))
     assert unit_pairs <= set(map(tuple, pairs.tolist()))
+
+
+def test_neighbours_along_the_path_are_no_revisits_at_any_rate() -> None:
+    """The same drive at a tenth of the step is near itself everywhere, at ten times the step nowhere but in windows."""
+    drive, features = drive_of(1), features_of(places_of_a_loop(), 1)
+    assert UNITS * 0.17 < REVISIT_PATH_M
+    assert len(revisit_pairs(drive, features, PairConfig(), step_m=0.17)) == 0
+    unit = np.array([i.unit for i in drive.images])[revisit_pairs(drive, features, PairConfig(), step_m=17.0)]
+    assert (unit[:, 1] - unit[:, 0]).min() > PairConfig().window_units
+    assert {(a, a + 30) for a in range(10)} <= set(map(tuple, unit.tolist()))

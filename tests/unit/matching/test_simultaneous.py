@@ -1,18 +1,22 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.matching.relative_pose import UncertainRig
 from mrasfm_engine.matching.simultaneous import (
     RigEstimate,
     SimultaneousMatches,
     contradiction,
-    epipolar_derivatives,
     estimate_rig,
     rig_of_drive,
+    verified_again,
 )
 from mrasfm_engine.matching.verification import signed_parallax
 from mrasfm_engine.scene.scene import PairMatches
@@ -31,7 +35,8 @@ def turned(camera: int, rotation_deg: list[float]) -> SimulatedDrive:
     return make_simulated_drive(units=6, cameras=6, points=3000, given=given)
 
 
-def estimate(simulated: SimulatedDrive, *, wrong: int = 0, **calibration: bool) -> RigEstimate:
+def rays_of_matches(simulated: SimulatedDrive) -> Callable[[PairMatches], tuple[np.ndarray, np.ndarray]]:
+    """Viewing rays of all matches of a pair."""
     kinds, params = pack_cameras(simulated.drive.cameras)
 
     def rays(image: int, keypoints: np.ndarray) -> np.ndarray:
@@ -39,9 +44,14 @@ def estimate(simulated: SimulatedDrive, *, wrong: int = 0, **calibration: bool) 
         return unproject_pixels(int(kinds[camera]), params[camera], simulated.features[image].xy_px[keypoints])
 
     def rays_of(pair: PairMatches) -> tuple[np.ndarray, np.ndarray]:
-        a, b = pair.matches[pair.inliers].T
+        a, b = pair.matches.T
         return rays(pair.image_a, a), rays(pair.image_b, b)
 
+    return rays_of
+
+
+def estimate(simulated: SimulatedDrive, *, wrong: int = 0, **calibration: bool) -> RigEstimate:
+    rays_of = rays_of_matches(simulated)
     pairs = true_matches(simulated, window=0, wrong=wrong)
     return rig_of_drive(simulated.drive, pairs, rays_of, MatchConfig(), BundleAdjustmentConfig(**calibration))
 
@@ -80,8 +90,7 @@ def test_what_was_found_is_said_where_most_matches_contradict_the_calibration() 
     estimated = given.copy()
     estimated[1, :3, :3] = estimated[1, :3, :3] @ se3.exp_so3(np.array([1.5, 0.0, 0.0]) * DEG)
     rig = RigEstimate(
-        rig_from_cam=estimated, covariance_rad2=np.eye(6), variance_translation_m2=np.ones(2), matches=800,
-        fitted_as_given=0.02, fitted=0.99,
+        rig_from_cam=estimated, covariance=np.eye(12), matches=800, fitted_as_given=0.02, fitted=0.99,
     )  # fmt: skip
     found = contradiction(["front", "left"], given, rig)
     assert found is not None
@@ -95,7 +104,7 @@ def test_settings_that_hold_the_calibration_hold_it_here_too() -> None:
     np.testing.assert_array_equal(rig.rig_from_cam, simulated.drive.rig_from_cam)
     assert rig.matches == 0
     # Nothing is known but the prior, so the gate is as wide as that.
-    assert np.sqrt(rig.covariance_rad2[0, 0]) == pytest.approx(2.0 * DEG)
+    np.testing.assert_allclose(np.sqrt(np.diag(rig.covariance)), np.tile([2.0 * DEG] * 3 + [0.05] * 3, 6))
 
 
 def test_cameras_at_one_place_and_matches_of_nothing_do_no_harm() -> None:
@@ -114,30 +123,7 @@ def test_cameras_at_one_place_and_matches_of_nothing_do_no_harm() -> None:
         np.linalg.norm(se3.log_so3(rig.rig_from_cam[:, :3, :3] @ given[:, :3, :3].swapaxes(1, 2)), axis=1)
     )
     assert turned_deg.max() < 6.0
-    assert np.isfinite(rig.covariance_rad2).all()
-
-
-def test_derivatives_are_those_of_the_error() -> None:
-    rng = np.random.default_rng(0)
-    poses = np.stack([se3.transform(se3.exp_so3(rng.normal(0, 0.2, 3)), rng.normal(0, 0.5, 3)) for _ in range(2)])
-    points = rng.uniform(-2, 2, (20, 3)) + np.array([0, 0, 8])
-    rays = [se3.apply(se3.inverse(pose), points) for pose in poses]
-    rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
-    # Off the epipolar lines by so little that what the derivatives leave out, the length's, does not show.
-    rays[0] = rays[0] @ se3.exp_so3(np.array([1e-7, 2e-7, -1e-7])).T
-    at, by_rotation, by_shift, _ = epipolar_derivatives(*poses, *rays)
-    step = 1e-7
-    for axis in range(3):
-        delta = step * np.eye(3)[axis]
-        for camera in range(2):
-            moved = poses.copy()
-            moved[camera, :3, :3] = se3.exp_so3(delta) @ moved[camera, :3, :3]
-            change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
-            np.testing.assert_allclose(by_rotation[camera][:, axis], change, atol=1e-5)
-        moved = poses.copy()
-        moved[0, :3, 3] += delta
-        change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
-        np.testing.assert_allclose(by_shift[:, axis], change, atol=1e-5)
+    assert np.isfinite(rig.covariance).all()
 
 
 def test_parallax_has_the_sign_of_the_side_on_which_rays_meet() -> None:
@@ -153,3 +139,56 @@ def test_parallax_has_the_sign_of_the_side_on_which_rays_meet() -> None:
     backward[:3, 3] *= -1
     np.testing.assert_allclose(signed_parallax(backward, rays_a, rays_b), -front, rtol=1e-6)
     assert np.abs(signed_parallax(b_from_a, rays_a, rays_a @ b_from_a[:3, :3].T)).max() < 1e-9
+
+
+def exactly_known(rig_from_cam: np.ndarray) -> UncertainRig:
+    sigma = np.tile([0.05 * DEG] * 3 + [0.01] * 3, len(rig_from_cam))
+    return UncertainRig(rig_from_cam=rig_from_cam, covariance=np.diag(sigma**2))
+
+
+def test_matches_come_back_when_the_rig_has_moved_to_where_it_is() -> None:
+    """By a calibration ten sigmas off they are gone, by the true one all are there but the wrong ones."""
+    simulated = turned(1, [30.0, 0.0, 0.0])
+    rays_of, config = rays_of_matches(simulated), MatchConfig()
+    focal_px = pack_cameras(simulated.drive.cameras)[1][:, 0]
+    matched = true_matches(simulated, window=1, wrong=10)
+    counts = []
+    first = verified_again(
+        simulated.drive, matched, rays_of, exactly_known(simulated.drive.rig_from_cam), focal_px=focal_px, config=config
+    )
+    again = verified_again(
+        simulated.drive, first, rays_of, exactly_known(simulated.truth.rig_from_cam), focal_px=focal_px, config=config
+    )
+    for pairs in (first, again):
+        assert [(p.image_a, p.image_b) for p in pairs] == [(p.image_a, p.image_b) for p in matched]
+        inside, right, wrong = 0, 0, 0
+        for pair, whole in zip(pairs, matched, strict=True):
+            a, b = (simulated.drive.images[i] for i in (pair.image_a, pair.image_b))
+            if a.unit != b.unit:
+                assert pair is whole  # the vehicle's motion is no matter of the rig
+            elif 1 in (a.camera, b.camera):
+                inside += len(whole.matches) - 10
+                right += int(pair.inliers[:-10].sum())
+                wrong += int(pair.inliers[-10:].sum())
+            assert not pair.inliers.any() or pair.inliers.sum() >= config.min_matches
+        counts.append((inside, right, wrong))
+    (inside, before, _), (_, after, wrong) = counts
+    assert inside > 500
+    assert before < 0.05 * inside
+    assert 0.95 * inside < after < inside
+    assert wrong < 0.01 * after
+
+
+def test_a_rig_that_has_not_moved_keeps_its_inliers() -> None:
+    simulated = turned(1, [0.0, 0.0, 0.0])
+    rays_of, config = rays_of_matches(simulated), MatchConfig()
+    focal_px = pack_cameras(simulated.drive.cameras)[1][:, 0]
+    rig = exactly_known(simulated.drive.rig_from_cam)
+    matched = [p for p in true_matches(simulated, window=0) if len(p.matches) > 30]
+    emptied = [replace(p, inliers=np.zeros_like(p.inliers)) for p in matched]
+    results = [
+        verified_again(simulated.drive, p, rays_of, rig, focal_px=focal_px, config=config) for p in (matched, emptied)
+    ]
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_array_equal(one.inliers, other.inliers)
+        assert 0.9 < one.inliers.mean() <= 1.0

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.relative_pose import RelativePose, UncertainRig, epipolar_derivatives
+
+DEG = np.pi / 180
+PIXEL_RAD = 1 / 700
+
+
+def views(rng: np.random.Generator, count: int, noise_px: float) -> tuple[RelativePose, np.ndarray, np.ndarray]:
+    """Two cameras a metre apart, looking across their path, and their rays to points beside it."""
+    poses = [np.eye(4), se3.transform(se3.exp_so3([0.01, 0.04, -0.01]), [1.0, 0.05, 0.3])]
+    points = rng.uniform([-6, -4, 5], [6, 4, 15], (count, 3))
+    rays = [se3.apply(se3.inverse(pose), points) for pose in poses]
+    rays = [r / r[:, 2:] + rng.normal(0, noise_px * PIXEL_RAD, (count, 3)) * [1, 1, 0] for r in rays]
+    rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
+    sigma = np.array([2.0 * DEG] * 6 + [0.1] * 3)
+    return RelativePose(base_from_a=poses[0], base_from_b=poses[1], covariance=np.diag(sigma**2)), rays[0], rays[1]
+
+
+@pytest.mark.parametrize("sigmas", [0.0, 1.0])
+def test_matches_correct_a_pose_within_its_covariance(sigmas: float) -> None:
+    """A pose that is off by its own sigma is corrected: all matches fit, and wrong ones don't."""
+    rng = np.random.default_rng(0)
+    true, rays_a, rays_b = views(rng, 200, 0.4)
+    rays_b[180:] = rays_b[rng.permutation(np.arange(180, 200))]
+    start = true.corrected(sigmas * np.sqrt(np.diag(true.covariance)) * rng.choice([-1, 1], 9))
+    refined, correction = start.refined(rays_a, rays_b, sigma_rad=0.7 * PIXEL_RAD)
+    assert correction < 9.0 * sigmas + 5.0  # nine directions were off by a sigma each
+    fits = refined.fits(rays_a, rays_b, max_error=2 * PIXEL_RAD)
+    assert fits[:180].mean() > 0.97
+    assert fits[180:].mean() < 0.3
+    # As predicted, without the matches' own correction, the gate is as wide as the covariance.
+    wide = start.fits(rays_a, rays_b, max_error=2 * PIXEL_RAD)
+    assert wide[:180].mean() > 0.97
+    assert wide[180:].mean() > fits[180:].mean() + 0.1
+    rotation = (true.b_from_a @ se3.inverse(refined.b_from_a))[:3, :3]
+    assert 0.0 < se3.rotation_angle_deg(rotation) < 0.2
+    assert np.trace(refined.covariance[:3, :3]) < np.trace(start.covariance[:3, :3])
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.8])
+def test_a_pose_that_matches_contradict_needs_an_unlikely_correction(off_m: float) -> None:
+    true, rays_a, rays_b = views(np.random.default_rng(1), 200, 0.4)
+    start = true.corrected(np.array([0.0] * 7 + [off_m, 0.0]))
+    correction = start.refined(rays_a, rays_b, sigma_rad=0.7 * PIXEL_RAD)[1]
+    assert correction < 5.0 if off_m == 0 else correction > 20.0
+
+
+def test_what_is_known_of_units_and_cameras_becomes_the_covariance_of_their_relative_pose() -> None:
+    """The covariance is that of a sample of units and rigs."""
+    rng = np.random.default_rng(2)
+    units = np.stack(
+        [se3.transform(se3.exp_so3([0.0, 0.1, yaw]), [x, 1.0, 0.0]) for yaw, x in ((0.5, 0.0), (0.9, 4.0))]
+    )
+    mounts = np.stack([se3.transform(se3.exp_so3([0.0, 0.0, c]), [1.0 + c, 0.5, 1.5]) for c in (0.0, 1.0)])
+    of_units, of_rig = (root @ root.T for root in (1e-3 * rng.normal(size=(12, 12)), 1e-3 * rng.normal(size=(12, 12))))
+    rig = UncertainRig(rig_from_cam=mounts, covariance=of_rig)
+
+    def moved(pose: np.ndarray, by: np.ndarray) -> np.ndarray:
+        return se3.transform(se3.exp_so3(by[:3]) @ pose[:3, :3], pose[:3, 3] + by[3:])
+
+    for a, b in ((0, 1), (1, 1)):
+        sample = []
+        for _ in range(4000):
+            unit, cam = (rng.multivariate_normal(np.zeros(12), c).reshape(2, 6) for c in (of_units, of_rig))
+            ends = [moved(units[k], unit[k]) @ moved(mounts[c], cam[c]) for k, c in ((0, a), (1, b))]
+            turns = [
+                se3.log_so3(end[:3, :3] @ (units[k] @ mounts[c])[:3, :3].T)
+                for end, (k, c) in zip(ends, ((0, a), (1, b)), strict=True)
+            ]
+            sample.append(np.concatenate([*turns, ends[0][:3, 3] - ends[1][:3, 3]]))
+        found = rig.relative_pose_between(a, b, units, of_units)
+        expected = np.cov(np.array(sample).T)
+        assert np.abs(found.covariance - expected).max() < 0.1 * np.abs(expected).max()
+        np.testing.assert_allclose(found.base_from_a, units[0] @ mounts[a])
+    # Cameras of one unit: its motion plays no part.
+    inside = rig.relative_pose(0, 1)
+    np.testing.assert_allclose(inside.b_from_a, se3.inverse(mounts[1]) @ mounts[0])
+    np.testing.assert_allclose(inside.covariance[:3, :3], of_rig[:3, :3])
+
+
+def test_derivatives_are_those_of_the_error() -> None:
+    rng = np.random.default_rng(0)
+    poses = np.stack([se3.transform(se3.exp_so3(rng.normal(0, 0.2, 3)), rng.normal(0, 0.5, 3)) for _ in range(2)])
+    points = rng.uniform(-2, 2, (20, 3)) + np.array([0, 0, 8])
+    rays = [se3.apply(se3.inverse(pose), points) for pose in poses]
+    rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
+    # Off the epipolar lines by so little that what the derivatives leave out, the length's, does not show.
+    rays[0] = rays[0] @ se3.exp_so3(np.array([1e-7, 2e-7, -1e-7])).T
+    at, by_rotation, by_shift, _ = epipolar_derivatives(*poses, *rays)
+    step = 1e-7
+    for axis in range(3):
+        delta = step * np.eye(3)[axis]
+        for camera in range(2):
+            moved = poses.copy()
+            moved[camera, :3, :3] = se3.exp_so3(delta) @ moved[camera, :3, :3]
+            change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
+            np.testing.assert_allclose(by_rotation[camera][:, axis], change, atol=1e-5)
+        moved = poses.copy()
+        moved[0, :3, 3] += delta
+        change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
+        np.testing.assert_allclose(by_shift[:, axis], change, atol=1e-5)
