@@ -35,8 +35,7 @@ MIN_POSITIONS = 3
 MIN_WHITE = 0.01  # of the declared sigma: of a receiver that filters, positions scatter by nothing that shows
 STEADY = 1.5
 KNOTS = 20  # in the correlation time of what wanders: less often than its filter lets a receiver change its mind
-USUAL_LOG_WANDER = np.log(2.0)  # standard deviation of the logarithm of what wanders over what is declared,
-BROAD_LOG_WHITE = np.log(10.0)  # and of what scatters: some declare the one, some the other
+USUAL_LOG_SIGMA = np.log(2.0)  # standard deviation of the logarithm of a receiver's errors over what it declares
 MOST_RESIDUALS, MIN_FOR_LIKELIHOOD = 150, 8
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
@@ -300,8 +299,8 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
     """The sizes of both kinds of errors that residuals make most likely, and what was declared.
 
     Where the scene lies, how it is turned and how large it is takes no part in it, and, if `clock_varies`, nor does
-    when its images were taken. Receivers that wander by twice or
-    half of what they declare are usual. What wanders is at most what residuals exceed their sigmas by: more, the scene
+    when its images were taken. Receivers that err by twice or half
+    of what they declare are usual. What wanders is at most what residuals exceed their sigmas by: more, the scene
     makes of errors of its own.
     """
     begin = receiver_errors(mapper, placement)
@@ -309,8 +308,8 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
     good = good[:: max(begin.positions_a_sample, -(-len(good) // MOST_RESIDUALS))]
     whitened = placement.off_m[good] / placement.known_sigma_m[placement.units[good]]
     good = good[_among_neighbours(whitened, mapper.config.gnss.outlier_sigmas)]
-    if len(good) < MIN_FOR_LIKELIHOOD:
-        return begin
+    if len(good) < MIN_FOR_LIKELIHOOD or begin.wander == 0.0:
+        return begin  # what scatters by as much as is declared leaves nothing that wanders
     units, off_m = placement.units[good], placement.off_m[good]
     place_m = _antenna_m(mapper, units, placement.lever_arm_m)
     place_m = place_m - place_m.mean(0)
@@ -337,7 +336,7 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
     def unlikelihood(log_sizes: Floats) -> float:
         white, wander = np.exp(np.clip(log_sizes, least, most))
         sizes = {"sigma_m": white * sigma_m, "wander_m": wander * sigma_m}
-        declared = float(log_sizes[1] / USUAL_LOG_WANDER) ** 2 + float(log_sizes[0] / BROAD_LOG_WHITE) ** 2
+        declared = float(np.log(np.hypot(white, wander)) / USUAL_LOG_SIGMA) ** 2
         return 0.5 * declared - replace(declared_errors, **sizes).restricted_log_likelihood(off_m, moves)
 
     start = np.log([max(begin.white, MIN_WHITE), max(begin.wander, 0.3)])
