@@ -356,7 +356,7 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
 
 
 def absolute_priors(known: PriorTrajectory) -> AbsolutePriors:
-    """What the manifest says of the units' poses in the world, for the adjustments."""
+    """Absolute poses that the manifest knows, for the adjustments."""
     return AbsolutePriors(
         gnss=known.gnss,
         antenna_in_rig_m=known.antenna_in_rig_m,

@@ -268,7 +268,7 @@ class TimePrior:
 
 @dataclass(frozen=True, kw_only=True)
 class ScalePrior:
-    """What given rotations of the cameras say of the scale: the residual is their corrections' effect on it over sigma.
+    """Prior of the scale by given rotations of the cameras: the residual is their corrections' effect on it over sigma.
 
     All else about the rotations is left to other terms.
     """

@@ -196,16 +196,16 @@ class ReceiverPositions:
         if not self.wander_m.any():
             return
         count, (before, after, share) = len(self.knots_s), self._places
-        coupling = np.zeros((layout.num_units, count, UNIT_DOF, AXES))
+        with_units = np.zeros((layout.num_units, count, UNIT_DOF, AXES))
         for knot, part in ((before, 1.0 - share), (after, share)):
-            np.add.at(coupling, (slots, knot[free]), -j_w * (self._gain * part[:, None])[free, None, :])
-        coupling = np.moveaxis(coupling, 1, 3)
+            np.add.at(with_units, (slots, knot[free]), -j_w * (self._gain * part[:, None])[free, None, :])
+        with_units = np.moveaxis(with_units, 1, 3)
         square = np.zeros((AXES * count, AXES * count))
         for axis in range(AXES):
             off, diagonal = self._by_knots(w, axis)
             own = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
             square[axis * count : (axis + 1) * count, axis * count : (axis + 1) * count] = own
-        extra.add_auxiliary(coupling.reshape(-1, AXES * count), square)
+        extra.add_auxiliary(with_units.reshape(-1, AXES * count), square)
 
     def information(self, columns: Floats) -> Floats:
         """Information X' C^-1 X (m, m) on m ways (n, 3, m) in which the antenna may be moved in metres.

@@ -35,20 +35,20 @@ TINY = 1e-12  # damps what nothing observes
 class Auxiliary:
     """Unknowns of the terms themselves, which are at their best."""
 
-    coupling: Floats  # (6 units, x) with the units
+    with_units: Floats  # (6 units, x) with the units
     square: Floats  # (x, x) of their own
 
     @staticmethod
     def none(layout: Layout) -> Auxiliary:
         """No unknowns."""
-        return Auxiliary(coupling=np.zeros((UNIT_DOF * layout.num_units, 0)), square=np.zeros((0, 0)))
+        return Auxiliary(with_units=np.zeros((UNIT_DOF * layout.num_units, 0)), square=np.zeros((0, 0)))
 
-    def eliminated(self, coupling: Floats) -> Floats:
-        """What is lost of the information (m, m) on others that are coupled (m, x) with them."""
+    def eliminated(self, with_units: Floats) -> Floats:
+        """Loss of information (m, m) on others that have blocks (m, x) with them."""
         if not len(self.square):
-            return np.zeros((len(coupling), len(coupling)))
+            return np.zeros((len(with_units), len(with_units)))
         factor = scipy.linalg.cho_factor(self.square, lower=True, check_finite=False)
-        result: Floats = coupling @ scipy.linalg.cho_solve(factor, coupling.T, check_finite=False)
+        result: Floats = with_units @ scipy.linalg.cho_solve(factor, with_units.T, check_finite=False)
         return result
 
 
@@ -61,10 +61,10 @@ class Extra:
     gradient: Floats  # (n,)
     auxiliary: Auxiliary
 
-    def add_auxiliary(self, coupling: Floats, square: Floats) -> None:
-        """Add unknowns (x,) of a term, with their coupling (6 units, x) and their own matrix (x, x)."""
+    def add_auxiliary(self, with_units: Floats, square: Floats) -> None:
+        """Add unknowns (x,) of a term, with their block `with_units` (6 units, x) and their own matrix (x, x)."""
         self.auxiliary = Auxiliary(
-            coupling=np.concatenate([self.auxiliary.coupling, coupling], axis=1),
+            with_units=np.concatenate([self.auxiliary.with_units, with_units], axis=1),
             square=scipy.linalg.block_diag(self.auxiliary.square, square),
         )
 
@@ -83,7 +83,7 @@ class Extra:
         """All of it (n, n), for small problems."""
         result: Floats = scipy.linalg.block_diag(*self.units, self.cameras)
         split = UNIT_DOF * len(self.units)
-        result[:split, :split] -= self.auxiliary.eliminated(self.auxiliary.coupling)
+        result[:split, :split] -= self.auxiliary.eliminated(self.auxiliary.with_units)
         return result
 
     @staticmethod
@@ -157,7 +157,7 @@ class ReducedCameraSystem:
         columns = (UNIT_DOF * self.structure.pattern.column_of_block())[:, None, None] + steps[None, :]
         result[rows, columns] = self.units
         result[columns, rows] = self.units
-        result[:split, :split] -= self.auxiliary.eliminated(self.auxiliary.coupling)
+        result[:split, :split] -= self.auxiliary.eliminated(self.auxiliary.with_units)
         result[split:, :split] = self._border_rows()
         result[:split, split:] = result[split:, :split].T
         result[split:, split:] = self.cameras
@@ -202,7 +202,7 @@ class ReducedCameraSystem:
         if factor is None:
             return None
         free = np.setdiff1d(np.arange(layout.camera_dof * layout.num_cameras), layout.held() - split)
-        border = np.concatenate([self._border_rows()[free], self.auxiliary.coupling.T])
+        border = np.concatenate([self._border_rows()[free], self.auxiliary.with_units.T])
         coupled = factor.solve(np.ascontiguousarray(border.T))
         own = self.cameras[np.ix_(free, free)] + np.diag(damped[split:][free])
         square = scipy.linalg.block_diag(own, self.auxiliary.square) - border @ coupled

@@ -77,10 +77,10 @@ class RigidGroups:
         np.add.at(diagonal, of, np.einsum("nji,nj->ni", maps**2, system.diagonal[:split].reshape(-1, UNIT_DOF)))
         matrix = np.swapaxes(square, 1, 2).reshape(self.size, self.size)
         states = len(system.auxiliary.square)
-        coupling = np.zeros((self.count, UNIT_DOF, states))
-        coupling_of_units = system.auxiliary.coupling.reshape(layout.num_units, UNIT_DOF, states)
-        np.add.at(coupling, of, np.swapaxes(maps, 1, 2) @ coupling_of_units)
-        matrix = matrix - system.auxiliary.eliminated(coupling.reshape(self.size, states))
+        with_units = np.zeros((self.count, UNIT_DOF, states))
+        of_units = system.auxiliary.with_units.reshape(layout.num_units, UNIT_DOF, states)
+        np.add.at(with_units, of, np.swapaxes(maps, 1, 2) @ of_units)
+        matrix = matrix - system.auxiliary.eliminated(with_units.reshape(self.size, states))
         return matrix, gradient.ravel(), diagonal.ravel()
 
     def step(self, system: ReducedCameraSystem, state: State, damping: float) -> Floats | None:

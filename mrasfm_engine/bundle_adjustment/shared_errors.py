@@ -61,5 +61,5 @@ def _of_terms(problem: Problem, state: State, columns: Floats) -> Floats:
     split = UNIT_DOF * problem.layout.num_units
     units, cameras = columns[:split].reshape(-1, UNIT_DOF, columns.shape[1]), columns[split:]
     result: Floats = np.einsum("uik,uij,ujl->kl", units, extra.units, units, optimize=True)
-    result = result - extra.auxiliary.eliminated(columns[:split].T @ extra.auxiliary.coupling)
+    result = result - extra.auxiliary.eliminated(columns[:split].T @ extra.auxiliary.with_units)
     return result + cameras.T @ extra.cameras @ cameras

@@ -30,7 +30,7 @@ LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adju
 
 @dataclass(kw_only=True)
 class AbsolutePriors:
-    """What is known of the units' poses in the world, and how it fits the scene.
+    """Knowledge of the units' poses in the world, and its fit to the scene.
 
     Attributes
     ----------

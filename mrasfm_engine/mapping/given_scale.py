@@ -1,4 +1,4 @@
-"""What the given rotations of the cameras say of the scale, beside what the drive says.
+"""Scale by the given rotations of the cameras, weighed against the scale by the drive's images.
 
 Two cameras that are turned against each other by a little see all points nearer or farther: along a straight street
 that looks like another scale, and only lens models, which err by the same in all images, tell the two apart. A turn
@@ -104,6 +104,12 @@ def _moved_px(mapper: Mapper) -> Floats:
     moved = moved * mapper.state.camera_params[:, :2].mean(axis=1)[:, None]
     result: Floats = moved - (np.median(moved, axis=0) if len(moved) > 2 else moved.mean(axis=0))
     return result
+
+
+def turned_px(mapper: Mapper) -> float:
+    """Largest angle by which the drive has turned two cameras against one another, in pixels."""
+    moved = _moved_px(mapper)
+    return float(np.linalg.norm(moved[:, None] - moved[None], axis=2).max())
 
 
 def _rotation_sigma_px(moved_px: Floats, by_rotation: Floats) -> float:

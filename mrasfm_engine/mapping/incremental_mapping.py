@@ -20,6 +20,7 @@ from mrasfm_engine.mapping.calibration import (
     scale_with_baselines,
 )
 from mrasfm_engine.mapping.dynamic_objects import find_moving_along, units_to_doubt, without_keypoints
+from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, turned_px
 from mrasfm_engine.mapping.initialization import Initialisation, initialise
 from mrasfm_engine.mapping.keyframes import select_keyframes
 from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits, split_pairs
@@ -28,6 +29,8 @@ from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.mapping.static_images import find_still_keypoints
 from mrasfm_engine.mapping.unit_registration import Registration, register_unit
+from mrasfm_engine.matching.relative_pose import UncertainRig
+from mrasfm_engine.matching.simultaneous import calibration_sigmas, verified_again
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
@@ -53,6 +56,7 @@ class MappingLog:
     revisits_tried: int = 0  # pairs of units across a gap that were compared
     revisits: list[tuple[int, int]] = field(default_factory=list)  # those that were believed
     loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
+    verified_again: bool = False  # whether matches within units were judged anew, by a calibration that had moved
     covered_images: dict[int, float] = field(default_factory=dict)  # by image, the share of keypoints that move along
 
 
@@ -148,6 +152,11 @@ def map_units(
     log = run_incremental_mapping(
         mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
     )
+    again = _verified_again(mapper, near)
+    if again is not near:
+        near, log.verified_again = again, True
+        sound = without_keypoints(near, keypoints.first, still) if still.any() else near
+        mapper = _with_tracks_of(mapper, sound)
     # Only the poses of all cameras together separate dynamic objects reliably, so mapping comes before the cleaning.
     moving = find_moving_along(mapper, near)
     if moving.any:
@@ -166,6 +175,27 @@ def map_units(
     closed = _with_tracks_of(mapper, [*near, *across])
     adjust_globally(closed, log, cancel)
     return closed, log
+
+
+def _verified_again(mapper: Mapper, pairs: list[PairMatches]) -> list[PairMatches]:
+    """The pairs with matches of simultaneous images judged by the calibration as it is now; as they are, if it stayed.
+
+    It stayed where no camera has turned against another by more than an inlier may be off.
+    """
+    focal_px = mapper.state.camera_params[:, :2].mean(axis=1)
+    if turned_px(mapper) < mapper.config.matching.max_error_px:
+        return pairs
+    sigma = np.empty((len(focal_px), 6))
+    sigma[:, :3] = LENS_SIGMA_PX / focal_px[:, None]  # what an adjustment may still be off by
+    sigma[:, 3:] = calibration_sigmas(mapper.drive, mapper.config.bundle_adjustment)[1][:, None]
+    rig = UncertainRig(rig_from_cam=mapper.state.rig_from_cam, covariance=np.diag(sigma.ravel() ** 2))
+
+    def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+        first = mapper.keypoints.first
+        a, b = first[pair.image_a] + pair.matches[:, 0], first[pair.image_b] + pair.matches[:, 1]
+        return mapper.keypoints.rays[a], mapper.keypoints.rays[b]
+
+    return verified_again(mapper.drive, pairs, rays_of, rig, focal_px=focal_px, config=mapper.config.matching)
 
 
 def _registered_anew(

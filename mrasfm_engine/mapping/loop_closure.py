@@ -108,8 +108,9 @@ class DriftModel:
         return float(np.sqrt(self.renewals(earlier, later)) * self.sigma_rotation_rad / TURN_RAD)
 
     def renewals(self, earlier: int, later: int) -> float:
-        """How many registrations on other points a unit's pose rests on since an earlier one: its own, and one for
-        every viewing depth between.
+        """Number of registrations on other points that a unit's pose rests on since an earlier one.
+
+        Its own, and one for every viewing depth between.
         """
         return float(1.0 + (self.travelled_m[later] - self.travelled_m[earlier]) / self.depth_m)
 

@@ -60,6 +60,7 @@ def describe(mapper: Mapper, log: MappingLog) -> dict[str, Any]:
             "unit_pairs_believed": len(log.revisits),
             "moved_at_most_m": log.loop_moved_m,
         },
+        "matches_within_units_verified_again": log.verified_again,
         "local_adjustments": log.local_adjustments,
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
         "road_points_dropped": [0 if isinstance(j, str) else int((~j.is_inlier).sum()) for j in log.roads],

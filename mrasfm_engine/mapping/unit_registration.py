@@ -168,10 +168,10 @@ class _Fit:
             inlier=errors_px < gates[matched.camera],
         )
 
-    def holds_against(self, joint: _Fit, camera: Ints) -> bool:
+    def holds_against(self, together: _Fit, camera: Ints) -> bool:
         """The pose of a vote has as many inliers as the joint one by the narrower gates: a compromise has wide ones."""
-        gates = np.minimum(self.gates_px, joint.gates_px)[camera]
-        own, other = (np.count_nonzero(fit.errors_px < gates) for fit in (self, joint))
+        gates = np.minimum(self.gates_px, together.gates_px)[camera]
+        own, other = (np.count_nonzero(fit.errors_px < gates) for fit in (self, together))
         return bool(own >= other * VOTE_BEATS_JOINT)
 
 
