@@ -13,6 +13,7 @@ import numpy as np
 from mrasfm_engine.bundle_adjustment.priors import RotationPrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import MOST, SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import (
@@ -25,6 +26,7 @@ from mrasfm_engine.mapping.placement import (
 )
 from mrasfm_engine.types import Bools, Floats, Ints
 
+BENT = 1.5  # factor by which residuals exceed their sigmas where a scene does not have the shape of its positions
 LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adjustment, that take part in it
 
 
@@ -66,7 +68,13 @@ class AbsolutePriors:
         return self.positions is not None or self.rough is not None
 
     def place(self, mapper: Mapper) -> None:
-        """Move the scene to where positions, or else rough poses, say that it is; both become terms."""
+        """Move the scene to where positions, or else rough poses, say that it is; both become terms.
+
+        What they say of its scale is compared with the rig as given: positions may have changed it while it grew.
+        """
+        settings = mapper.config.bundle_adjustment
+        if settings.priors and settings.reassessment and not mapper.drive.has_single_camera:
+            scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
         if self.gnss is not None and self.antenna_in_rig_m is not None:
             self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m, thorough=True)
         sigma = mapper.drive.manifest.rough_poses
@@ -79,18 +87,18 @@ class AbsolutePriors:
     def renew(self, mapper: Mapper) -> None:
         """Judge them by the scene as it is now, and place the scene if that is not done yet.
 
-        Positions of which most contradict a scene are none of it: it is placed anew when it has grown.
+        Positions that contradict a scene take no part in it until it has grown, be it their fault or the calibration's.
         """
         settings = mapper.config.bundle_adjustment
         if not (settings.priors and settings.reassessment):
             return
         if self.positions is not None:
             self.reassess(mapper, thorough=False)
-            assert self.placement is not None
-            if self.placement.inlier.mean() < MOST:
-                self.placement = None
         elif self.gnss is not None and self.antenna_in_rig_m is not None:
             self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m)
+        fit = self.placement
+        if fit is not None and fit.prior is not None and (fit.noise_factor > BENT or fit.inlier.mean() < MOST):
+            self.placement = None
         self._renew_rough(mapper)
 
     def reassess(self, mapper: Mapper, *, thorough: bool = True) -> None:

@@ -20,13 +20,17 @@ SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not a
 SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
 HYPOTHESES = 300
 LEAST_SCALE_RANGE = 1.25  # of the receiver's trajectory against the rig's, where the baselines are known better
-SCALE_SIGMAS = 3.0
+SCALE_SIGMAS = 2.5
 MIN_CONSENSUS = 0.3  # of the positions
 # A trajectory whose calibration is off a little bends, by so much of its extent; a good receiver sees that first. The
 # least of these is taken under which most positions agree.
 BENDS = (0.01, 0.03, 0.1)
 MOST = 0.7
 MIRRORED = (1, 0, 2)  # axes of measured positions whose latitude and longitude are swapped
+CONTRADICTED = 1.5  # factor by which residuals exceed their sigmas, beyond which mirror images are looked at
+# Degrees of longitude are shorter than those of latitude, and not by as much at the place that swapped ones name.
+STRETCHES = (0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0)
+ANY_SCALE = (1e-4, 1e4)
 MIRRORED_SHARE = 0.5  # of the residuals as measured: a bend by chance agrees with the mirror image less often
 LOSS_SCALE = 2.0
 SINGULAR = 1e-10  # eigenvalue of a matrix of unit diagonal that is rounding
@@ -111,6 +115,9 @@ def align_with_gnss(
         inlier, factor = assess_residuals(off_m, sigma_m, inlier, outlier_sigmas=outlier_sigmas)
         if inlier.sum() < 3:
             return "no consistent set of positions was found"
+    off_median_m = float(np.median(np.linalg.norm(off_m[:, :2], axis=1)))
+    if factor > CONTRADICTED and _mirrored(a, measured_m, sigma_m, outlier_sigmas, rng, off_median_m):
+        return "the trajectory has the shape of the positions' mirror image: latitude and longitude are swapped"
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
     rotation, weight = similarity[:3, :3] / scale, 1.0 / (sigma_m[inlier] ** 2).mean(1)
     centre = np.average(antenna_m[inlier], axis=0, weights=weight)
@@ -164,14 +171,23 @@ def _bent(
     for bend in BENDS:
         wide_m = np.hypot(sigma, bend * extent_m)
         start, inlier = _best_yaw(a, measured, wide_m, outlier_sigmas, rng, scale_range)
-        mirrored = measured[:, MIRRORED]
-        image, image_inlier = _best_yaw(a, mirrored, wide_m, outlier_sigmas, rng, scale_range)
-        closer = _median_residual_m(image, a, mirrored) < MIRRORED_SHARE * _median_residual_m(start, a, measured)
-        if image_inlier.mean() >= MOST and closer:
+        if _mirrored(a, measured, wide_m, outlier_sigmas, rng, _median_residual_m(start, a, measured)):
             return None
         if inlier.mean() >= MOST:
             return start, inlier
     return None
+
+
+def _mirrored(
+    a: Floats, measured: Floats, sigma: Floats, outlier_sigmas: float, rng: np.random.Generator, off_m: float
+) -> bool:
+    """True where the mirror image of most positions fits clearly better than positions do, by their median residual."""
+    for stretch in STRETCHES:
+        mirrored = measured[:, MIRRORED] * [stretch, 1.0, 1.0]
+        image, inlier = _best_yaw(a, mirrored, sigma, outlier_sigmas, rng, ANY_SCALE)
+        if inlier.mean() >= MOST and _median_residual_m(image, a, mirrored) < MIRRORED_SHARE * off_m:
+            return True
+    return False
 
 
 def _median_residual_m(similarity: Floats, a: Floats, measured: Floats) -> float:
@@ -190,7 +206,7 @@ def _why_not(
     a: Floats, measured: Floats, sigma: Floats, inlier: Bools, outlier_sigmas: float, rng: np.random.Generator
 ) -> str:
     """Reason for which positions do not fit: perhaps only the rig's units."""
-    wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, (1e-4, 1e4))
+    wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, ANY_SCALE)
     if fitting.mean() >= 2 * MIN_CONSENSUS:
         return _scale_is_off(float(np.cbrt(np.linalg.det(wide[:3, :3]))))
     return (

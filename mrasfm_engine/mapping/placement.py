@@ -28,7 +28,7 @@ from schemas.findings import Finding, warning
 
 MIN_CLOCK_OFFSET_S = 0.05
 CLOCK_OFFSET_SIGMAS = 5.0
-MAX_SCALE_DISAGREEMENT = 0.05  # and as many sigmas of the rig's and the receiver's scale:
+MAX_SCALE_DISAGREEMENT = 0.05  # rigs are better known, whatever the default prior says; and as many of the receiver's
 SCALE_DISAGREEMENT_SIGMAS = 3.0
 MIN_ROUGH_POSES = 2
 MIN_POSITIONS = 3
@@ -381,13 +381,15 @@ def _findings(mapper: Mapper, alignment: GnssAlignment, positions: ReceiverPosit
         )
     _, sigma_rig = scale_of_baselines(mapper)
     known = positions.information_given(centred_m, rigid_motions(centred_m))
-    sigma = float(np.hypot(sigma_rig, 1.0 / np.sqrt(max(known, 1e-12))))
+    sigma = 1.0 / np.sqrt(max(known, 1e-12))
     if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
         findings.append(
             warning(
                 "scale-disagreement",
-                f"GNSS makes the way {alignment.scale:.3f} times as long as the rig does",
-                "Check the baselines in rig.cameras (metres), and the receiver's positions.",
+                f"GNSS makes the way {alignment.scale:.3f} times as long as the rig as given does, whose baselines are "
+                f"taken to be known to {sigma_rig:.1%}",
+                "Check the baselines in rig.cameras (metres), and the receiver's positions (are latitude and longitude "
+                "swapped?). Declare sigma_translation_m of the cameras.",
             )
         )
     return findings

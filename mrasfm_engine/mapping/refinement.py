@@ -14,7 +14,7 @@ from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
-from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.absolute_priors import BENT, AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
     FEW_UNITS,
     CalibrationDecision,
@@ -55,7 +55,6 @@ from schemas.findings import Finding
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
 MAX_ROUNDS = 6  # and while the weights of positions change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
-BENT = 1.5  # by such a factor on their sigmas,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together

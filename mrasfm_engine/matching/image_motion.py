@@ -86,12 +86,12 @@ def are_following(following: Sequence[Ints], unit_a: Ints, unit_b: Ints) -> Bool
     return result
 
 
-def next_in_time(drive: Drive) -> Ints:
-    """Pairs (n, 2) of each image with those that come next of its camera."""
+def next_in_time(drive: Drive, usable: Bools | None = None) -> Ints:
+    """Pairs (n, 2) of each image with those that come next of its camera, among usable images (i,), by default all."""
     camera = np.array([image.camera for image in drive.images], dtype=np.int64)
     pairs = [np.zeros((0, 2), dtype=np.int64)]
     for one in range(len(drive.cameras)):
-        images = np.flatnonzero(camera == one)
+        images = np.flatnonzero((camera == one) & (True if usable is None else usable))
         pairs += [np.stack([images[:-gap], images[gap:]], 1) for gap in range(1, NEXT_UNITS + 1)]
     return np.concatenate(pairs).astype(np.int64)
 

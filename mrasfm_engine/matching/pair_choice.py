@@ -23,7 +23,7 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.retrieval import revisit_pairs
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Bools, Floats, Ints
 
 
 @dataclass
@@ -52,8 +52,13 @@ class PairChoice:
         if not self.config.pairs.selection:
             return pairs_without_selection(self.drive, self.config.pairs)
         if self.prior.world_from_rig is None:
-            return next_in_time(self.drive)
-        return pairs_from_poses(self.drive, self.prior.world_from_rig, self.config.pairs)
+            return next_in_time(self.drive, self._usable)
+        return pairs_from_poses(self.drive, self.prior.world_from_rig, self.config.pairs, self._usable)
+
+    @property
+    def _usable(self) -> Bools:
+        """Images (i,) that were not left out: the others count as never recorded."""
+        return np.array([found.left_out is None for found in self.features], dtype=np.bool_)
 
     @property
     def further(self) -> Further | None:
@@ -68,7 +73,7 @@ class PairChoice:
         window = pairs_from_window(self.drive, pairs, self.motion, min_matches=self.config.matching.min_matches)
         revisits = revisit_pairs(self.drive, self.features, pairs, self.motion)
         every = np.unique(np.concatenate([window, revisits]), axis=0)
-        done = set(map(tuple, next_in_time(self.drive).tolist()))
+        done = set(map(tuple, next_in_time(self.drive, self._usable).tolist()))
         return every[[tuple(pair) not in done for pair in every.tolist()]]
 
     def with_revisits(self, pairs: Sequence[PairMatches]) -> list[PairMatches]:
@@ -80,7 +85,7 @@ class PairChoice:
         travelled_m = self.motion.travelled_m[unit[ends]]
         far = np.abs(travelled_m[:, 0] - travelled_m[:, 1]) > REVISIT_PATH_M
         far &= ~are_following(units_ahead(self.motion, self.config.pairs), *unit[ends].T)
-        at_once = set(map(tuple, next_in_time(self.drive).tolist()))
+        at_once = set(map(tuple, next_in_time(self.drive, self._usable).tolist()))
         return [
             replace(pair, is_revisit=bool(is_far) and (pair.image_a, pair.image_b) not in at_once)
             for pair, is_far in zip(pairs, far, strict=True)

@@ -135,15 +135,16 @@ class _CommonViews:
         return result
 
 
-def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -> Ints:
+def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig, usable: Bools | None = None) -> Ints:
     """Pairs (n, 2) by overlap of viewing frustums under prior poses (units, 4, 4), revisits included.
 
     An image keeps its best pairs by overlap; neighbours in time and cameras of the same unit come first, and images of
     a part of the route that is driven again have a share of their own, so that many neighbours don't crowd them out.
+    Images that are not usable (i,) are in none.
     """
     known = np.isfinite(world_from_rig[:, 0, 3])
     if not known.all():
-        return _pairs_where_known(drive, world_from_rig, known, config)
+        return _pairs_where_known(drive, world_from_rig, known, config, usable)
     views = _Views.from_drive(drive)
     world_from_cam = world_from_rig[views.unit] @ drive.rig_from_cam[views.camera]
     # Frustums meet half way at the latest; poses far apart need no look.
@@ -151,6 +152,8 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     tree = cKDTree(centres)
     pairs = tree.query_pairs(config.max_depth_m, output_type="ndarray").astype(np.int64).reshape(-1, 2)
     pairs.sort(axis=1)
+    if usable is not None:
+        pairs = pairs[usable[pairs].all(axis=1)]
     motion = motion_from_poses(drive, world_from_rig)
     travelled_m = motion.travelled_m
     unit_a, unit_b = views.unit[pairs].T
@@ -172,18 +175,20 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig) -
     )
     quota = round(config.pairs_per_image * REVISIT_SHARE)
     chosen = [
-        next_in_time(drive),
+        next_in_time(drive, usable),
         _best_per_image(pairs, np.where(revisit, 0.0, overlap), config.pairs_per_image - quota, config.min_overlap),
         _best_per_image(pairs, np.where(revisit, overlap, 0.0), quota, config.min_overlap),
     ]
     return np.unique(np.concatenate(chosen), axis=0)
 
 
-def _pairs_where_known(drive: Drive, world_from_rig: Floats, known: Bools, config: PairConfig) -> Ints:
+def _pairs_where_known(
+    drive: Drive, world_from_rig: Floats, known: Bools, config: PairConfig, usable: Bools | None
+) -> Ints:
     """Pairs by overlap among units with a prior, and by window where one of the units has none."""
     units = np.flatnonzero(known)
     nearest = units[np.abs(np.arange(len(known))[:, None] - units[None]).argmin(1)]
-    by_overlap = pairs_from_poses(drive, world_from_rig[nearest], config)
+    by_overlap = pairs_from_poses(drive, world_from_rig[nearest], config, usable)
     by_window = pairs_from_window(drive, config, motion_unknown(drive, config))
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     both = known[unit[by_overlap]].all(axis=1)

@@ -204,6 +204,17 @@ def test_a_track_of_another_shape_gets_a_reason(flip: str) -> None:
     assert "swapped" in found
 
 
+@pytest.mark.parametrize("latitude_deg", [10.0, 49.0, 65.0])
+def test_swapped_coordinates_are_told_wherever_the_drive_is(latitude_deg: float) -> None:
+    """A degree of longitude has another length than one of latitude, where the drive is and where swapped ones are."""
+    t = track(units=120, spacing_m=2.0, sigma_m=0.5)
+    here, there = np.cos(np.radians([latitude_deg, 8.0]))
+    t.measured_m = t.measured_m[:, [1, 0, 2]] * [there, 1.0 / here, 1.0]
+    found = t.align()
+    assert isinstance(found, str)
+    assert "swapped" in found
+
+
 @pytest.mark.parametrize("units", [0, 1, 2])
 def test_too_few_positions_are_a_reason(units: int) -> None:
     t = track(units=max(units, 1))
