@@ -197,7 +197,7 @@ class GnssConfig(_Section):
     """Use of the receiver's positions."""
 
     correlation_time_s: Positive = Field(
-        1.0, description="samples closer in time share what they do not scatter by; in a map, most of their error"
+        1.0, description="errors that wander stay the same for so long; in a map, samples closer in time count once"
     )
     wander_time_s: Positive = Field(
         60.0,

@@ -13,7 +13,7 @@ from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibratio
 from mrasfm_engine.types import Floats
 from schemas import CAMERA_MODELS, Camera, Pose
 
-OBSERVED, ONLY_PRIOR = "observed", "only the prior"
+OBSERVED, ONLY_PRIOR, HELD = "observed", "only the prior", "held"
 
 
 def calibration_document(scene: Scene) -> dict[str, Any]:
@@ -22,7 +22,8 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
     A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
     Where time offsets varied, `refined` has `time_offset_us`: images were taken so much later than their timestamps
-    say, each camera's against the mean of all unless positions tell that too.
+    say, each camera's against the mean of all unless positions tell that too. Where intrinsics were asked for,
+    `observed` and `verdict` have `focal`: of a focal length that the drive does not observe the given value is held.
     `common` are the motions of all cameras together, of which no direction says anything: `observed` of a camera is
     always among the others.
     """
@@ -46,8 +47,8 @@ def _common(observability: CalibrationObservability) -> dict[str, Any]:
     if np.isfinite(observability.sigma_scale):
         scale["sigma_relative"] = observability.sigma_scale
     return {
-        "rotation": {"observed": [False] * 3, "verdict": ["held"] * 3},
-        "translation": {"observed": [False] * 3, "verdict": ["held"] * 3},
+        "rotation": {"observed": [False] * 3, "verdict": [HELD] * 3},
+        "translation": {"observed": [False] * 3, "verdict": [HELD] * 3},
         "scale": scale | {"verdict": observability.scale_rests_on},
     }
 
@@ -97,11 +98,14 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         "translation_m": refined.sigma_translation_m,
         "focal_px": np.array(refined.sigma_focal_px),
     }
-    time: dict[str, dict[str, Any]] = {"refined": {}, "observed": {}, "verdict": {}}
+    asked: dict[str, dict[str, Any]] = {"refined": {}, "observed": {}, "verdict": {}}
+    if refined.focal_observed is not None:
+        asked["observed"]["focal"] = refined.focal_observed
+        asked["verdict"]["focal"] = OBSERVED if refined.focal_observed else HELD
     if refined.time_offset_s is not None:
-        time["refined"] = {"time_offset_us": 1e6 * refined.time_offset_s}
-        time["observed"] = {"time_offset": refined.time_offset_observed}
-        time["verdict"] = {"time_offset": OBSERVED if refined.time_offset_observed else ONLY_PRIOR}
+        asked["refined"] = {"time_offset_us": 1e6 * refined.time_offset_s}
+        asked["observed"]["time_offset"] = refined.time_offset_observed
+        asked["verdict"]["time_offset"] = OBSERVED if refined.time_offset_observed else ONLY_PRIOR
         sigma["time_offset_us"] = np.array(1e6 * refined.sigma_time_offset_s)
     return {
         "model": camera.model,
@@ -112,7 +116,7 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         "refined": {
             "rig_from_cam": pose_from_matrix(refined.rig_from_cam).model_dump(),
             "params": refined.params.tolist(),
-            **time["refined"],
+            **asked["refined"],
         },
         "difference": _difference(given, refined.rig_from_cam)
         | {
@@ -120,7 +124,7 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         },
         "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},
         "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()}
-        | time["observed"],
-        "verdict": {"rotation": words[:3], "translation": words[3:]} | time["verdict"],
+        | asked["observed"],
+        "verdict": {"rotation": words[:3], "translation": words[3:]} | asked["verdict"],
         "wrong": refined.is_wrong,
     }

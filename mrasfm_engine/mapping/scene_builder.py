@@ -104,11 +104,13 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
     prior: CalibrationPrior = calibration_prior(mapper)
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
     focal = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
+    intrinsics = refinement.intrinsics
+    asked = intrinsics is not None and intrinsics.asked
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
         # A camera that is held is as good as what was given, whatever the drive would know of it.
         sigma = np.where(refinement.recalibrated[:, None], refinement.certainty.sigma_camera[:, :6], sigma)
-        if refinement.intrinsics is not None and refinement.intrinsics.asked:
+        if asked:
             focal = refinement.certainty.sigma_camera[:, 6] * mapper.state.camera_params[:, 0]
     if refinement.directions is not None:
         observed = refinement.directions.observed & refinement.recalibrated[:, None]
@@ -122,6 +124,7 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
             sigma_focal_px=float(focal[c]),
             observed=observed[c],
             is_wrong=c in wrong,
+            focal_observed=bool(intrinsics.free[c, 0]) if intrinsics is not None and asked else None,
             **_time_offset(mapper, refinement, c),
         )
         for c, camera in enumerate(mapper.drive.cameras)

@@ -77,6 +77,7 @@ class CameraCalibration:
     time_offset_s: float | None = None  # its images were taken so much later than their timestamps say; None: not asked
     sigma_time_offset_s: float = float("nan")
     time_offset_observed: bool = False
+    focal_observed: bool | None = None  # whether the focal length varied, as the drive observes it; None: not asked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -278,6 +278,13 @@ def test_a_time_offset_is_told_where_it_was_estimated(scene: Scene) -> None:
     assert "time_offset_us" not in second["refined"]
 
 
+def test_a_focal_length_has_a_verdict_where_intrinsics_were_asked_for(scene: Scene) -> None:
+    asked = [replace(scene.calibration[0], focal_observed=True), replace(scene.calibration[1], focal_observed=False)]
+    for calibration, words in ((asked, ["observed", "held"]), (scene.calibration, [None, None])):
+        cameras = calibration_document(replace(scene, calibration=calibration))["cameras"]
+        assert [cameras[camera.name]["verdict"].get("focal") for camera in scene.drive.cameras[:2]] == words
+
+
 def test_what_all_cameras_share_is_never_called_observed(scene: Scene) -> None:
     observability = CalibrationObservability(
         adjusted=True, reason="GNSS", scale_observed=True, scale_rests_on="observed by positions", sigma_scale=0.004
