@@ -132,8 +132,9 @@ def _with_readouts_as_declared(
 ) -> tuple[Floats, Floats, Floats]:
     """Columns and covariance as `_with_scale` has them where readouts vary, for readouts that stay as they are.
 
-    And the covariance that it adds to time offsets that readouts are not what was declared [a consider covariance:
-    Bierman, Factorization Methods for Discrete Sequential Estimation, 1977]: rows of another time pass for one.
+    And the covariance that it adds that readouts are not what was declared [a consider covariance: Bierman,
+    Factorization Methods for Discrete Sequential Estimation, 1977]: rows of another time pass for a time offset, and
+    turn and move cameras.
     """
     dof = problem.layout.camera_dof
     of_readouts = np.zeros_like(covariance)
@@ -142,8 +143,8 @@ def _with_readouts_as_declared(
         return columns, covariance, of_readouts
     known = next(term for term in problem.terms if isinstance(term, ReadoutPrior))
     gain = covariance[:, at] @ np.linalg.inv(covariance[np.ix_(at, at)])
-    times = np.flatnonzero(free % dof == TIME)
-    of_readouts[np.ix_(times, times)] = known.sigma_s**2 * gain[times] @ gain[times].T
+    of_readouts = known.sigma_s**2 * gain @ gain.T
+    of_readouts[at] = of_readouts[:, at] = 0.0
     columns, covariance = columns - columns[:, at] @ gain.T, covariance - gain @ covariance[at]
     columns[:, at] = covariance[at] = covariance[:, at] = 0.0
     return columns, covariance, of_readouts
