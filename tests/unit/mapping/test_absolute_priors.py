@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.bundle_adjustment.priors import RotationPrior, UprightPrior
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.mapping.absolute_priors import LOCAL_POSITIONS, AbsolutePriors
+from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.scene.drive import pose_from_matrix
+from schemas import RoughPose, RoughTrajectory
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    true_matches,
+    with_true_poses,
+)
+from tests.unit.mapping.test_placement import ARM_M, received
+
+UNITS, ROUGH_M, ROUGH_DEG = 24, 0.1, 0.5
+ROUGH_FROM_WORLD = se3.transform(se3.exp_so3([0.0, 0.0, 1.0]), [40.0, -20.0, 3.0])
+
+
+def rough_poses(simulated: SimulatedDrive, *, wrong: int = 0) -> np.ndarray:
+    """The true poses in a world of their own, with independent errors; some are far off."""
+    rng = np.random.default_rng(3)
+    turn = se3.exp_so3(np.radians(ROUGH_DEG) * rng.normal(size=(UNITS, 3)))
+    poses = ROUGH_FROM_WORLD @ simulated.world_from_rig
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    poses[:, :3, 3] += ROUGH_M * rng.normal(size=(UNITS, 3))
+    poses[rng.choice(UNITS, wrong, replace=False), :3, 3] += [8.0, 3.0, 0.0]
+    return poses
+
+
+def with_rough_poses(simulated: SimulatedDrive, poses: np.ndarray) -> SimulatedDrive:
+    manifest = simulated.drive.manifest
+    rough = RoughTrajectory(
+        sigma_translation_m=ROUGH_M,
+        sigma_rotation_deg=ROUGH_DEG,
+        poses=[
+            RoughPose(timestamp_us=frame.timestamp_us, world_from_rig=pose_from_matrix(pose))
+            for frame, pose in zip(manifest.frames, poses, strict=True)
+        ],
+    )
+    return replace(
+        simulated, drive=replace(simulated.drive, manifest=manifest.model_copy(update={"rough_poses": rough}))
+    )
+
+
+def long_baseline(rig_from_cam: np.ndarray) -> np.ndarray:
+    rig_from_cam[:, :3, 3] = rig_from_cam[:, :3, 3].mean(0) + 1.06 * (
+        rig_from_cam[:, :3, 3] - rig_from_cam[:, :3, 3].mean(0)
+    )
+    return rig_from_cam
+
+
+def mapped(simulated: SimulatedDrive, absolute: AbsolutePriors) -> Mapper:
+    pairs = true_matches(simulated)
+    mapper = make_model(simulated, pairs, EngineConfig(threads=1))
+    run_incremental_mapping(mapper, pairs, None, absolute=absolute)
+    return mapper
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_rough_poses_say_how_large_the_scene_is_and_where_it_lies(wrong: int) -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, given=long_baseline)
+    poses = rough_poses(simulated, wrong=wrong)
+    simulated = with_rough_poses(simulated, poses)
+    mapper = mapped(simulated, AbsolutePriors(rough_world_from_rig=poses))
+    result = refine(mapper, AbsolutePriors(rough_world_from_rig=poses))
+    assert result.placed_by_rough_poses
+    assert not result.georeferenced
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 1e-6 < abs(scale - 1) < 0.015  # 0.06 by the baselines as given
+    true_m = (ROUGH_FROM_WORLD @ simulated.world_from_rig)[:, :3, 3]
+    off_m = np.linalg.norm(mapper.state.unit_position_m - true_m, axis=1)
+    assert 1e-3 < np.sqrt((off_m**2).mean()) < 0.8 * ROUGH_M
+    assert result.certainty is not None
+    assert result.certainty.sigma_scale < 0.02
+
+
+def test_receiver_and_rough_poses_stand_side_by_side_in_worlds_of_their_own() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500)
+    poses = rough_poses(simulated)
+    simulated = with_rough_poses(simulated, poses)
+    known = AbsolutePriors(gnss=received(simulated, 0.3), antenna_in_rig_m=ARM_M, rough_world_from_rig=poses)
+    mapper = mapped(simulated, known)
+    kinds = [type(term) for term in known.terms(mapper)]
+    assert sorted(kind.__name__ for kind in kinds) == sorted(
+        kind.__name__ for kind in (ReceiverPositions, UprightPrior, ReceiverPositions, RotationPrior)
+    )
+    errors_m = np.linalg.norm(mapper.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
+    assert 1e-3 < np.sqrt((errors_m**2).mean()) < 0.3  # where the receiver says
+
+
+def test_local_adjustment_has_the_positions_around_its_units() -> None:
+    units = 120
+    simulated = make_simulated_drive(units=units, cameras=2, points=300)
+    mapper = with_true_poses(make_model(simulated), simulated, range(units))
+    known = AbsolutePriors(gnss=received(simulated, 0.3), antenna_in_rig_m=ARM_M)
+    known.place(mapper)
+    free = np.zeros(units, dtype=np.bool_)
+    free[[60, 61]] = True
+    positions, upright = known.local_terms(mapper, free)
+    assert isinstance(positions, ReceiverPositions)
+    assert isinstance(upright, UprightPrior)
+    assert len(positions.unit) == LOCAL_POSITIONS + 2
+    assert np.abs(positions.unit - 60.5).max() < 0.6 * LOCAL_POSITIONS
+    assert upright.unit.tolist() == [60, 61]
+    # Together the units of a drive weigh as one measurement, and these two their share of it.
+    (whole,) = [term for term in known.terms(mapper) if isinstance(term, UprightPrior)]
+    assert upright.sigma_roll_rad / whole.sigma_roll_rad == pytest.approx(np.sqrt(units / 2))
+
+
+def test_without_priors_or_with_gates_nothing_takes_part_while_the_scene_grows() -> None:
+    simulated = make_simulated_drive(units=12, cameras=2, points=600)
+    for setting in ("priors", "reassessment"):
+        mapper = with_true_poses(make_model(simulated), simulated, range(12))
+        settings = mapper.config.bundle_adjustment.model_copy(update={setting: False})
+        mapper.config = mapper.config.model_copy(update={"bundle_adjustment": settings})
+        known = AbsolutePriors(gnss=received(simulated, 0.3), antenna_in_rig_m=ARM_M)
+        known.renew(mapper)
+        assert known.terms(mapper) == []
+        assert not known.hold_the_frame
