@@ -61,10 +61,11 @@ class ReceiverPositions:
         wander_time_s: float,
         least_spacing_s: float,
     ) -> ReceiverPositions:
-        """The term of samples (n,) with independent and wandering errors (n, 3), with knots where they are needed.
+        """The term of samples (n,), in the order of time, with knots where they are needed.
 
-        Knots are `least_spacing_s` apart, farther on drives that would need more than `MAX_KNOTS`. What the process
-        does between two of them counts as an error that the samples between them share.
+        Their errors (n, 3) have an independent and a wandering part. Knots are `least_spacing_s` apart, farther on
+        drives that would need more than `MAX_KNOTS`. What the process does between two of them counts as an error that the
+        samples between them share.
         """
         span_s = float(np.ptp(time_s)) if len(time_s) else 0.0
         spacing_s = max(least_spacing_s, span_s / (MAX_KNOTS - 1))
@@ -74,7 +75,7 @@ class ReceiverPositions:
         # Variance half way between knots of unit variance, given both; samples share it while they are alike.
         half = np.exp(-0.5 * spacing_s / wander_time_s)
         between = max(0.0, 1.0 + 0.5 * (1.0 + half**2) - 2.0 * half) if count > 1 else 0.0
-        step_s = span_s / max(len(time_s) - 1, 1)
+        step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
         sharing = max(1.0, min(spacing_s, 2.0 * wander_time_s) / step_s) if step_s > 0 else 1.0
         return ReceiverPositions(
             unit=unit,

@@ -6,7 +6,7 @@ again by the scene after every global adjustment: each position against those th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from mrasfm_engine.mapping.georeferencing import MOST, SIGMA_PITCH_RAD, SIGMA_RO
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import (
     Placement,
+    ReceiverErrors,
     compare_rough_poses,
     place_by_gnss,
     place_by_rough_poses,
@@ -63,6 +64,11 @@ class AbsolutePriors:
         return None if self.placement is None else self.placement.prior
 
     @property
+    def errors(self) -> list[ReceiverErrors]:
+        """Sizes of the errors of positions and of rough poses that take part."""
+        return [fit.errors for fit in (self.placement, self.rough) if fit is not None and fit.prior is not None]
+
+    @property
     def hold_the_frame(self) -> bool:
         """True where they say how the scene lies, so that no unit has to be held."""
         return self.positions is not None or self.rough is not None
@@ -100,13 +106,17 @@ class AbsolutePriors:
         if fit is not None and fit.prior is not None and (fit.noise_factor > BENT or fit.inlier.mean() < MOST):
             self.placement = None
         self._renew_rough(mapper)
+        if self.rough is not None and (self.rough.noise_factor > BENT or self.rough.inlier.mean() < MOST):
+            self.rough = self.rough_rotations = None
 
     def reassess(self, mapper: Mapper, *, thorough: bool = True) -> None:
-        """Judge positions by the adjusted scene, where they took part in it."""
+        """Judge positions and rough poses by the adjusted scene."""
         if self.placement is not None and self.placement.prior is not None:
             self.placement = reassess_positions(
                 mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
             )
+        if self.rough is not None:
+            self._renew_rough(mapper)
 
     def _renew_rough(self, mapper: Mapper) -> None:
         self.rough, self.rough_rotations = None, None
@@ -114,30 +124,39 @@ class AbsolutePriors:
         if self.rough_world_from_rig is None or sigma is None or not mapper.config.bundle_adjustment.priors:
             return
         found = compare_rough_poses(
-            mapper, self.rough_world_from_rig, sigma.sigma_translation_m, np.radians(sigma.sigma_rotation_deg)
+            mapper,
+            self.rough_world_from_rig,
+            sigma.sigma_translation_m,
+            np.radians(sigma.sigma_rotation_deg),
+            scene_stands_there=self.placed_by_rough_poses,
         )
         if found is not None:
             self.rough, self.rough_rotations = found
 
     def terms(self, mapper: Mapper) -> list[Term]:
         """All of them as terms of an adjustment of all units."""
-        terms: list[Term] = []
-        if self.positions is not None:
-            terms += [self.positions, upright_prior(mapper, mapper.registered)]
-        if self.rough is not None and self.rough.prior is not None and self.rough_rotations is not None:
-            terms += [self.rough.prior, self.rough_rotations]
-        return terms
+        return self._terms_of(mapper, np.flatnonzero(mapper.registered), mapper.registered)
 
     def local_terms(self, mapper: Mapper, free_units: Bools) -> list[Term]:
         """Terms of an adjustment of some units (u,): their own, and positions near them that show the errors there."""
         free = np.flatnonzero(free_units & mapper.registered)
-        near = _nearest(np.flatnonzero(mapper.registered), free)
-        terms: list[Term] = []
-        for placement in (self.placement, self.rough):
-            if placement is not None and placement.prior is not None:
-                terms.append(positions_of_units(mapper, placement, near))
+        return self._terms_of(mapper, _nearest(np.flatnonzero(mapper.registered), free), free_units)
+
+    def _terms_of(self, mapper: Mapper, units: Ints, free_units: Bools) -> list[Term]:
+        """Terms of the positions of some registered units (n,), and of the attitude of free ones (u,)."""
+        terms: list[Term] = [
+            positions_of_units(mapper, placement, units)
+            for placement in (self.placement, self.rough)
+            if placement is not None and placement.prior is not None
+        ]
         if self.positions is not None:
             terms.append(upright_prior(mapper, free_units))
+        turns = self.rough_rotations
+        if turns is not None:
+            rows = np.flatnonzero((free_units & mapper.registered)[turns.unit])
+            terms.append(
+                replace(turns, unit=turns.unit[rows], rotation=turns.rotation[rows], sigma_rad=turns.sigma_rad[rows])
+            )
         return terms
 
 

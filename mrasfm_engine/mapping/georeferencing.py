@@ -107,7 +107,7 @@ def align_with_gnss(
         if bent is not None:
             start, inlier = bent
     if inlier.sum() < 3 or inlier.mean() < MIN_CONSENSUS:
-        return _why_not(a, measured_m, sigma_m, inlier, outlier_sigmas, rng)
+        return _why_not(a, measured_m, sigma_m, inlier, outlier_sigmas, rng, scale_range)
     similarity, factor = start @ level, 1.0
     for _ in range(4):
         similarity = _refine(similarity, antenna_m, up, forward, measured_m, sigma_m * factor, inlier)
@@ -203,12 +203,19 @@ def _scale_is_off(scale: float) -> str:
 
 
 def _why_not(
-    a: Floats, measured: Floats, sigma: Floats, inlier: Bools, outlier_sigmas: float, rng: np.random.Generator
+    a: Floats,
+    measured: Floats,
+    sigma: Floats,
+    inlier: Bools,
+    outlier_sigmas: float,
+    rng: np.random.Generator,
+    scale_range: tuple[float, float],
 ) -> str:
     """Reason for which positions do not fit: perhaps only the rig's units."""
     wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, ANY_SCALE)
-    if fitting.mean() >= 2 * MIN_CONSENSUS:
-        return _scale_is_off(float(np.cbrt(np.linalg.det(wide[:3, :3]))))
+    scale = float(np.cbrt(np.linalg.det(wide[:3, :3])))
+    if fitting.mean() >= 2 * MIN_CONSENSUS and not scale_range[0] <= scale <= scale_range[1]:
+        return _scale_is_off(scale)
     return (
         f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the trajectory (are latitude and "
         "longitude swapped, or the receiver's clock off?)"

@@ -127,7 +127,11 @@ def _lens_sigmas(mapper: Mapper) -> Floats:
     """Standard deviations (c, INTRINSICS) at which parameters move a camera's keypoints by `LENS_SIGMA_PX`, RMS."""
     result = np.empty((len(mapper.camera_kind), INTRINSICS))
     for c, params in enumerate(mapper.state.camera_params):
-        x, y = ((mapper.keypoints.xy_px[mapper.keypoints.camera == c] - params[2:4]) / params[:2]).T
+        own = mapper.keypoints.camera == c
+        if not own.any():
+            result[c] = RIDGE  # no image of it shows anything: its lens takes no part
+            continue
+        x, y = ((mapper.keypoints.xy_px[own] - params[2:4]) / params[:2]).T
         r2, one = x**2 + y**2, np.ones_like(x)
         moved = [
             r2**0.5,

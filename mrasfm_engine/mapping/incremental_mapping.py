@@ -152,7 +152,7 @@ def map_units(
     log = run_incremental_mapping(
         mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
     )
-    again = _verified_again(mapper, near)
+    again = _verified_again(mapper, near, cancel)
     if again is not near:
         near, log.verified_again = again, True
         sound = without_keypoints(near, keypoints.first, still) if still.any() else near
@@ -177,7 +177,7 @@ def map_units(
     return closed, log
 
 
-def _verified_again(mapper: Mapper, pairs: list[PairMatches]) -> list[PairMatches]:
+def _verified_again(mapper: Mapper, pairs: list[PairMatches], cancel: Cancel | None) -> list[PairMatches]:
     """The pairs with matches of simultaneous images judged by the calibration as it is now; as they are, if it stayed.
 
     It stayed where no camera has turned against another by more than an inlier may be off.
@@ -195,7 +195,9 @@ def _verified_again(mapper: Mapper, pairs: list[PairMatches]) -> list[PairMatche
         a, b = first[pair.image_a] + pair.matches[:, 0], first[pair.image_b] + pair.matches[:, 1]
         return mapper.keypoints.rays[a], mapper.keypoints.rays[b]
 
-    return verified_again(mapper.drive, pairs, rays_of, rig, focal_px=focal_px, config=mapper.config.matching)
+    return verified_again(
+        mapper.drive, pairs, rays_of, rig, focal_px=focal_px, config=mapper.config.matching, cancel=cancel
+    )
 
 
 def _registered_anew(

@@ -222,12 +222,17 @@ def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_tra
 
 
 def compare_rough_poses(
-    mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float, sigma_rotation_rad: float
+    mapper: Mapper,
+    rough_world_from_rig: Floats,
+    sigma_translation_m: float,
+    sigma_rotation_rad: float,
+    *,
+    scene_stands_there: bool = False,
 ) -> tuple[Placement, RotationPrior] | None:
     """Rough poses (units, 4, 4; NaN where unknown), moved to where the scene lies, as terms of the adjustment.
 
     As of a receiver's positions, what they do not scatter by from pose to pose is an error that wanders. None where
-    there are too few.
+    there are too few. A scene that stands where they say is in their world already.
     """
     units = np.flatnonzero(mapper.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
     if len(units) < MIN_POSITIONS:
@@ -236,6 +241,8 @@ def compare_rough_poses(
     turns = own[:, :3, :3] @ np.swapaxes(rough[:, :3, :3], 1, 2)
     rotation = robust_mean_rotation(turns)
     shift_m = geometric_median(own[:, :3, 3] - rough[:, :3, 3] @ rotation.T)
+    if scene_stands_there:
+        rotation, shift_m = np.eye(3), np.zeros(3)
     known = se3.transform(rotation, shift_m) @ rough_world_from_rig
     off_m = own[:, :3, 3] - known[units, :3, 3]
     sigma_m = np.full((len(known), 3), sigma_translation_m)

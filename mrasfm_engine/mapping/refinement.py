@@ -255,11 +255,12 @@ def _unbend(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
 
 def _reassess(mapper: Mapper, result: Refinement) -> bool:
     """Judge positions by the adjusted scene; whether their errors have the sizes that they had before."""
-    if result.placement is None or not (result.georeferenced and _reassesses(mapper)):
+    if not (result.absolute.hold_the_frame and _reassesses(mapper)):
         return True
-    before = result.placement.errors
+    before = result.absolute.errors
     result.absolute.reassess(mapper)
-    return result.placement.errors.is_as_large_as(before)
+    after = result.absolute.errors
+    return len(after) == len(before) and all(a.is_as_large_as(b) for a, b in zip(after, before, strict=True))
 
 
 def _reassesses(mapper: Mapper) -> bool:

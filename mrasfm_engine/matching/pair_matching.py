@@ -144,7 +144,9 @@ def match_pairs(
             raise
 
     rig = rig_of_drive(drive, found, inlier_rays_of, config, calibration)
-    by_prior = verified_by_prior(drive, found, rays_of, prior, rig, focal_px=focal, config=config, threads=threads)
+    by_prior = verified_by_prior(
+        drive, found, rays_of, prior, rig, focal_px=focal, config=config, threads=threads, cancel=cancel
+    )
     kept = []
     for pair in by_prior.pairs:
         if are_simultaneous(drive, pair.image_a, pair.image_b):

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.relative_pose import GATE_SIGMAS, RelativePose, UncertainRig
@@ -23,7 +24,7 @@ from mrasfm_engine.matching.verification import signed_parallax
 from mrasfm_engine.parallel import mapped
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
-from mrasfm_engine.types import Bools, Floats
+from mrasfm_engine.types import Bools, Cancel, Floats
 
 # Matches show five directions of a relative pose, all but the distance. As improbable as an error of `GATE_SIGMAS`.
 MAX_CORRECTION = float(chi2.ppf(chi2.cdf(GATE_SIGMAS**2, 1), 5))
@@ -65,14 +66,23 @@ def verified_by_prior(
     focal_px: Floats,
     config: MatchConfig,
     threads: int,
+    cancel: Cancel | None = None,
 ) -> PriorVerdict:
-    """Judge the inliers of pairs between units by the prior trajectory; `rays_of` gives those of all their matches."""
+    """Judge the inliers of pairs between units by the prior trajectory; `rays_of` gives those of all their matches.
+
+    Raises
+    ------
+    CancelledError
+        Where `cancel` answers True.
+    """
     predictions = _Predictions.from_prior(drive, prior, rig)
     if predictions is None:
         return PriorVerdict(pairs=list(pairs))
 
     def judged(pair: PairMatches) -> Bools | bool | None:
         """Inliers that agree with the prior, False where they contradict it, None where it predicts nothing."""
+        if cancel is not None and cancel():
+            raise CancelledError
         predicted = predictions.of_pair(pair)
         if predicted is None:
             return None

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.matching.relative_pose import (
@@ -34,7 +35,7 @@ from mrasfm_engine.matching.relative_pose import (
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
-from mrasfm_engine.types import Floats
+from mrasfm_engine.types import Cancel, Floats
 from schemas.findings import Finding, warning
 
 SIMULTANEOUS_US = 2_000  # cameras less apart than this are one rig: a fast car goes 6 cm
@@ -132,6 +133,7 @@ def verified_again(
     *,
     focal_px: Floats,
     config: MatchConfig,
+    cancel: Cancel | None = None,
 ) -> list[PairMatches]:
     """The pairs, those of simultaneous images with the inliers that follow from another rig than the one so far.
 
@@ -149,6 +151,8 @@ def verified_again(
     """
     result = []
     for pair in pairs:
+        if cancel is not None and cancel():
+            raise CancelledError
         if are_simultaneous(drive, pair.image_a, pair.image_b):
             rays = rays_of(pair)
             max_error = max_error_rad(drive, pair, focal_px, config)

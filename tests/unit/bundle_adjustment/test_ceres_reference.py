@@ -183,7 +183,7 @@ def receiver_positions(truth: State, rng: Rng) -> ReceiverPositions:
         time_s=np.sort(rng.uniform(0.0, 10.0, UNITS)),
         position_m=prior.position_m + rng.normal(size=3) * 0.05,
         white_m=prior.sigma_m,
-        wander_m=rng.uniform(0.02, 0.05, (UNITS, 3)),
+        wander_m=rng.uniform(0.005, 0.015, (UNITS, 3)),
         lever_arm_m=prior.lever_arm_m,
         wander_time_s=20.0,
         least_spacing_s=4.0,

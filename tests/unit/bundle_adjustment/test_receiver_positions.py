@@ -161,3 +161,19 @@ def test_single_sample_is_a_position_with_both_errors() -> None:
     )  # fmt: skip
     term = replace(term, loss_scale=1e6)
     assert term.cost(state) == pytest.approx(0.5, rel=1e-6)  # half a metre of a sigma of half a metre
+
+
+def test_clusters_of_samples_share_what_knots_leave_out() -> None:
+    """Two short visits, long apart: knots are as far apart as on a long drive, samples as near as on a short one."""
+    time_s = np.concatenate([0.1 * np.arange(25), 1000.0 + 0.1 * np.arange(25)])
+    term = ReceiverPositions.from_samples(
+        unit=np.arange(50), time_s=time_s, position_m=np.zeros((50, 3)), white_m=np.full((50, 3), 0.01),
+        wander_m=np.ones((50, 3)), lever_arm_m=np.zeros(3), wander_time_s=60.0, least_spacing_s=1.0,
+    )  # fmt: skip
+    alike = np.exp(-np.abs(time_s[:, None] - time_s) / 60.0)
+    covariance = 1e-4 * np.eye(50) + alike
+    between = np.where(np.arange(50) < 25, -1.0, 1.0)  # from one visit to the other
+    columns = np.zeros((50, 3, 1))
+    columns[:, 0, 0] = between
+    exact = 1.0 / (between @ np.linalg.solve(covariance, between))
+    assert 0.97 < (1.0 / float(term.information(columns)[0, 0])) / exact < 30.0

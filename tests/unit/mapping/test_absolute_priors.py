@@ -130,3 +130,27 @@ def test_without_priors_or_with_gates_nothing_takes_part_while_the_scene_grows()
         known.renew(mapper)
         assert known.terms(mapper) == []
         assert not known.hold_the_frame
+
+
+def test_units_that_were_dropped_tell_nothing_of_the_receivers_error() -> None:
+    """A unit that is not registered stands where it stood last, which measures no error."""
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    known = AbsolutePriors(gnss=received(simulated, 0.3), antenna_in_rig_m=ARM_M)
+    known.place(mapper)
+    mapper.forget(np.array([10]))
+    (positions,) = [term for term in known.terms(mapper) if isinstance(term, ReceiverPositions)]
+    assert len(positions.unit) >= UNITS - 3
+    assert 10 not in positions.unit
+
+
+def test_rough_poses_that_contradict_a_growing_scene_take_no_part_in_it() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    poses = rough_poses(simulated)
+    poses[:, :3, 3] *= 2.0
+    simulated = with_rough_poses(simulated, poses)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    known = AbsolutePriors(rough_world_from_rig=poses)
+    known.renew(mapper)
+    assert known.rough is None
+    assert not known.hold_the_frame
