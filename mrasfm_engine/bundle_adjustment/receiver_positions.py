@@ -64,8 +64,8 @@ class ReceiverPositions:
         """The term of samples (n,), in the order of time, with knots where they are needed.
 
         Their errors (n, 3) have an independent and a wandering part. Knots are `least_spacing_s` apart, farther on
-        drives that would need more than `MAX_KNOTS`. What the process does between two of them counts as an error that the
-        samples between them share.
+        drives that would need more than `MAX_KNOTS`. What the process does between two of them counts as an error that
+        the samples between them share.
         """
         span_s = float(np.ptp(time_s)) if len(time_s) else 0.0
         spacing_s = max(least_spacing_s, span_s / (MAX_KNOTS - 1))
