@@ -327,26 +327,60 @@ class PositionPrior:
     loss_scale: float = 3.0
 
     def _residuals(self, state: State) -> tuple[Floats, Floats]:
-        arm = state.unit_rotation[self.unit] @ self.lever_arm_m
-        return arm, (state.unit_position_m[self.unit] + arm - self.position_m) / self.sigma_m
+        return antenna_residuals(state, self.unit, self.lever_arm_m, self.position_m, self.sigma_m)
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        _, r = self._residuals(state)
-        s2 = self.loss_scale**2
-        return float(0.5 * s2 * np.log1p((r**2).sum(1) / s2).sum())
+        return cauchy_cost(self._residuals(state)[1], self.loss_scale)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         arm, r = self._residuals(state)
-        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
-        # d (R arm) / d omega = -[R arm]x in world axes
-        j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-        j = j / self.sigma_m[:, :, None]
-        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
-        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
-        np.add.at(extra.units, slots, j_w @ j[free])
-        np.add.at(extra.unit_gradient, slots, (j_w @ r[free, :, None])[:, :, 0])
+        add_to_units(
+            layout, extra, self.unit, antenna_jacobian(arm, self.sigma_m), r, cauchy_weights(r, self.loss_scale)
+        )
+
+
+def antenna_residuals(
+    state: State, unit: Ints, lever_arm_m: Floats, position_m: Floats, sigma_m: Floats
+) -> tuple[Floats, Floats]:
+    """Lever arms (n, 3) of an antenna in world axes, and its distances (n, 3) from positions over sigma."""
+    arm = state.unit_rotation[unit] @ lever_arm_m
+    return arm, (state.unit_position_m[unit] + arm - position_m) / sigma_m
+
+
+def antenna_jacobian(arm: Floats, sigma_m: Floats) -> Floats:
+    """Derivatives (n, 3, 6) of `antenna_residuals` by steps of the units: d (R arm) / d omega = -[R arm]x."""
+    j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+    result: Floats = j / sigma_m[:, :, None]
+    return result
+
+
+def cauchy_weights(residuals: Floats, loss_scale: float) -> Floats:
+    """Weights (n,) under a Cauchy loss of residuals (n, k) over sigma, each taken as a whole."""
+    result: Floats = 1.0 / (1.0 + (residuals**2).sum(1) / loss_scale**2)
+    return result
+
+
+def cauchy_cost(residuals: Floats, loss_scale: float) -> float:
+    """Half the sum of the Cauchy loss of residuals (n, k) over sigma."""
+    s2 = loss_scale**2
+    return float(0.5 * s2 * np.log1p((residuals**2).sum(1) / s2).sum())
+
+
+def add_to_units(
+    layout: Layout, extra: Extra, unit: Ints, jacobian: Floats, residuals: Floats, weights: Floats | None = None
+) -> tuple[Ints, Floats, Ints]:
+    """Add J'WJ and J'Wr of residuals (n, k) on units (n,), by the first (n, k, d) places of these units' steps.
+
+    Returns the rows (f,) whose unit is free, their J'W (f, d, k), and the units' slots (f,).
+    """
+    free = np.flatnonzero(layout.unit_slot[unit] >= 0)
+    weighted = jacobian[free] if weights is None else weights[free, None, None] * jacobian[free]
+    slots, j_w, d = layout.unit_slot[unit[free]], np.swapaxes(weighted, 1, 2), jacobian.shape[2]
+    np.add.at(extra.units[:, :d, :d], slots, j_w @ jacobian[free])
+    np.add.at(extra.unit_gradient[:, :d], slots, (j_w @ residuals[free, :, None])[:, :, 0])
+    return free, j_w, slots
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,18 +398,13 @@ class RotationPrior:
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        s2 = self.loss_scale**2
-        return float(0.5 * s2 * np.log1p((self._residuals(state) ** 2).sum(1) / s2).sum())
+        return cauchy_cost(self._residuals(state), self.loss_scale)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         r = self._residuals(state)
-        w = 1.0 / (1.0 + (r**2).sum(1) / self.loss_scale**2)
         j = se3.inverse_left_jacobian(r * self.sigma_rad[:, None]) / self.sigma_rad[:, None, None]
-        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
-        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
-        np.add.at(extra.units[:, :3, :3], slots, j_w @ j[free])
-        np.add.at(extra.unit_gradient[:, :3], slots, (j_w @ r[free, :, None])[:, :, 0])
+        add_to_units(layout, extra, self.unit, j, r, cauchy_weights(r, self.loss_scale))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -405,7 +434,4 @@ class UprightPrior:
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         r, j = self._position_rows(state)
-        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
-        slots, j_t = layout.unit_slot[self.unit[free]], np.swapaxes(j[free], 1, 2)
-        np.add.at(extra.units[:, :3, :3], slots, j_t @ j[free])
-        np.add.at(extra.unit_gradient[:, :3], slots, (j_t @ r[free, :, None])[:, :, 0])
+        add_to_units(layout, extra, self.unit, j, r)

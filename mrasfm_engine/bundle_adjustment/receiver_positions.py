@@ -20,9 +20,15 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 
+from mrasfm_engine.bundle_adjustment.priors import (
+    add_to_units,
+    antenna_jacobian,
+    antenna_residuals,
+    cauchy_cost,
+    cauchy_weights,
+)
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
-from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats, Ints
 
@@ -149,8 +155,7 @@ class ReceiverPositions:
         return result
 
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
-        arm = state.unit_rotation[self.unit] @ self.lever_arm_m
-        return arm, (state.unit_position_m[self.unit] + arm - self.position_m) / self.sigma_m
+        return antenna_residuals(state, self.unit, self.lever_arm_m, self.position_m, self.sigma_m)
 
     def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats]:
         """The states (k, 3) that cost least, residuals (n, 3) and robust weights (n,) with them."""
@@ -160,7 +165,7 @@ class ReceiverPositions:
                 right = self._at_knots((weights * whitened[:, axis])[:, None], axis)
                 states[:, axis] = _solved(self._by_knots(weights, axis), right)[:, 0]
             residuals = whitened - self._at_samples(states)
-            renewed = 1.0 / (1.0 + (residuals**2).sum(1) / self.loss_scale**2)
+            renewed = cauchy_weights(residuals, self.loss_scale)
             same = bool((np.abs(renewed - weights) < SAME_WEIGHTS).all())
             weights = renewed
             if same:
@@ -176,25 +181,16 @@ class ReceiverPositions:
     def cost(self, state: State) -> float:
         """See `Term`."""
         states, residuals, _ = self._best(self._whitened(state)[1])
-        s2, (off, diagonal) = self.loss_scale**2, self._precision
-        robust = s2 * np.log1p((residuals**2).sum(1) / s2).sum()
+        off, diagonal = self._precision
         prior = (diagonal[:, None] * states**2).sum() + 2.0 * (off[1:, None] * states[1:] * states[:-1]).sum()
-        return float(0.5 * (robust + prior))
+        return cauchy_cost(residuals, self.loss_scale) + 0.5 * float(prior)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         arm, whitened = self._whitened(state)
         _, r, w = self._best(whitened)
-        # d (R arm) / d omega = -[R arm]x in world axes
-        j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-        j = j / self.sigma_m[:, :, None]
-        free = np.flatnonzero(layout.unit_slot[self.unit] >= 0)
-        if not len(free):
-            return
-        slots, j_w = layout.unit_slot[self.unit[free]], np.swapaxes(w[free, None, None] * j[free], 1, 2)
-        np.add.at(extra.units, slots, j_w @ j[free])
-        np.add.at(extra.unit_gradient, slots, (j_w @ r[free, :, None])[:, :, 0])
-        if not self.wander_m.any():
+        free, j_w, slots = add_to_units(layout, extra, self.unit, antenna_jacobian(arm, self.sigma_m), r, w)
+        if not (len(free) and self.wander_m.any()):
             return
         count, (before, after, share) = len(self.knots_s), self._places
         with_units = np.zeros((layout.num_units, count, UNIT_DOF, AXES))

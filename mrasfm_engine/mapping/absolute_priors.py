@@ -14,7 +14,7 @@ from mrasfm_engine.bundle_adjustment.priors import RotationPrior, Term, UprightP
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
-from mrasfm_engine.mapping.georeferencing import MOST, SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
+from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import (
     Placement,
@@ -27,7 +27,6 @@ from mrasfm_engine.mapping.placement import (
 )
 from mrasfm_engine.types import Bools, Floats, Ints
 
-BENT = 1.5  # factor by which residuals exceed their sigmas where a scene does not have the shape of its positions
 LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adjustment, that take part in it
 
 
@@ -102,11 +101,10 @@ class AbsolutePriors:
             self.reassess(mapper, thorough=False)
         elif self.gnss is not None and self.antenna_in_rig_m is not None:
             self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m)
-        fit = self.placement
-        if fit is not None and fit.prior is not None and (fit.noise_factor > BENT or fit.inlier.mean() < MOST):
+        if self.placement is not None and self.placement.is_contradicted:
             self.placement = None
         self._renew_rough(mapper)
-        if self.rough is not None and (self.rough.noise_factor > BENT or self.rough.inlier.mean() < MOST):
+        if self.rough is not None and self.rough.is_contradicted:
             self.rough = self.rough_rotations = None
 
     def reassess(self, mapper: Mapper, *, thorough: bool = True) -> None:

@@ -27,7 +27,7 @@ MIN_CONSENSUS = 0.3  # of the positions
 BENDS = (0.01, 0.03, 0.1)
 MOST = 0.7
 MIRRORED = (1, 0, 2)  # axes of measured positions whose latitude and longitude are swapped
-CONTRADICTED = 1.5  # factor by which residuals exceed their sigmas, beyond which mirror images are looked at
+BENT = 1.5  # factor by which residuals exceed their sigmas where a scene does not have the shape of its positions
 # Degrees of longitude are shorter than those of latitude, and not by as much at the place that swapped ones name.
 STRETCHES = (0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0)
 ANY_SCALE = (1e-4, 1e4)
@@ -116,7 +116,7 @@ def align_with_gnss(
         if inlier.sum() < 3:
             return "no consistent set of positions was found"
     off_median_m = float(np.median(np.linalg.norm(off_m[:, :2], axis=1)))
-    if factor > CONTRADICTED and _mirrored(a, measured_m, sigma_m, outlier_sigmas, rng, off_median_m):
+    if factor > BENT and _mirrored(a, measured_m, sigma_m, outlier_sigmas, rng, off_median_m):
         return "the trajectory has the shape of the positions' mirror image: latitude and longitude are swapped"
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
     rotation, weight = similarity[:3, :3] / scale, 1.0 / (sigma_m[inlier] ** 2).mean(1)
@@ -248,6 +248,12 @@ def clock_offset(antenna_m: Floats, positions: ReceiverPositions) -> tuple[float
 def rigid_motions(place_m: Floats) -> Floats:
     """Ways (n, 3, 6) in which rigid motions move places (n, 3): along the axes, then about them."""
     return np.concatenate([np.tile(np.eye(3), (len(place_m), 1, 1)), -se3.skew(place_m)], axis=2)
+
+
+def similarity_motions(place_m: Floats) -> Floats:
+    """Ways (n, 3, 7) in which similarities move places (n, 3): rigid motions about their middle, and growth."""
+    centred_m = place_m - place_m.mean(0)
+    return np.concatenate([rigid_motions(centred_m), centred_m[:, :, None]], axis=2)
 
 
 def _unit(v: Floats) -> Floats:

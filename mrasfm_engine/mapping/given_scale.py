@@ -10,9 +10,9 @@ With x the corrections of the cameras' rotations and l the errors of the lens mo
     s = b'l   with the rotations as it finds them
 
 Both are estimates of one scale, and it is best known by their mean with the weights of their variances. How far the
-drive moves cameras in other directions says how good the given rotations are. Every other
-direction of the calibration stays free: one residual a'x on the rotations is added, whose sigma gives it the weight
-that it has against the images as these are weighed by the adjustment.
+drive moves cameras in other directions says how good the given rotations are. Every other direction of the calibration
+stays free: one residual a'x on the rotations is added, whose sigma gives it the weight that it has against the images
+as these are weighed by the adjustment.
 """
 
 from __future__ import annotations
@@ -132,18 +132,10 @@ def _lens_sigmas(mapper: Mapper) -> Floats:
             result[c] = RIDGE  # no image of it shows anything: its lens takes no part
             continue
         x, y = ((mapper.keypoints.xy_px[own] - params[2:4]) / params[:2]).T
-        r2, one = x**2 + y**2, np.ones_like(x)
-        moved = [
-            r2**0.5,
-            y,
-            one,
-            one,
-            r2**1.5,
-            r2**2.5,
-            np.hypot(2 * x * y, r2 + 2 * y**2),
-            np.hypot(2 * x * y, r2 + 2 * x**2),
-        ]
-        by_parameter = np.sqrt((np.array(moved) ** 2).mean(axis=1)) * params[:2].mean()
-        by_parameter[2:4] = 1.0
+        r2 = x**2 + y**2
+        tangential = [np.hypot(2 * x * y, r2 + 2 * z**2) for z in (y, x)]
+        moved = np.array([r2**0.5, y, r2**1.5, r2**2.5, *tangential])
+        by_parameter = np.sqrt((moved**2).mean(axis=1)) * params[:2].mean()
+        by_parameter = np.insert(by_parameter, 2, [1.0, 1.0])  # the principal point's two, in pixels
         result[c] = LENS_SIGMA_PX / np.maximum(by_parameter, 1e-6)
     return result

@@ -189,14 +189,8 @@ def _verified_again(mapper: Mapper, pairs: list[PairMatches], cancel: Cancel | N
     sigma[:, :3] = LENS_SIGMA_PX / focal_px[:, None]  # what an adjustment may still be off by
     sigma[:, 3:] = calibration_sigmas(mapper.drive, mapper.config.bundle_adjustment)[1][:, None]
     rig = UncertainRig(rig_from_cam=mapper.state.rig_from_cam, covariance=np.diag(sigma.ravel() ** 2))
-
-    def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
-        first = mapper.keypoints.first
-        a, b = first[pair.image_a] + pair.matches[:, 0], first[pair.image_b] + pair.matches[:, 1]
-        return mapper.keypoints.rays[a], mapper.keypoints.rays[b]
-
     return verified_again(
-        mapper.drive, pairs, rays_of, rig, focal_px=focal_px, config=mapper.config.matching, cancel=cancel
+        mapper.drive, pairs, mapper.rays_of, rig, focal_px=focal_px, config=mapper.config.matching, cancel=cancel
     )
 
 

@@ -23,6 +23,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import median_depth_m
 from mrasfm_engine.mapping.inlier_gates import TURN_RAD
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.per_camera_pnp import squared_lengths
 from mrasfm_engine.mapping.pose_graph import Edges, optimise_pose_graph
 from mrasfm_engine.mapping.unit_registration import (
     Correspondences2D3D,
@@ -233,8 +234,7 @@ def supported(revisits: Sequence[Revisit], model: DriftModel) -> list[Revisit]:
         # Drift as one rigid motion knows of no scale, which makes it change from unit to unit.
         sigmas[:, 1] = np.hypot(sigmas[:, 1], model.scale_sigma(*units[i]) * apart_m[near - low].max(1))
         covariance = own[near] + own[i] + _diagonal(sigmas)
-        squares = (difference * np.linalg.solve(covariance, difference[..., None])[..., 0]).sum(1)
-        if np.count_nonzero(squares <= _limit()) >= MIN_SUPPORT:
+        if np.count_nonzero(squared_lengths(difference, covariance) <= _limit()) >= MIN_SUPPORT:
             result.append(revisit)
     return result
 

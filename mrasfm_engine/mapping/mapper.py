@@ -137,16 +137,20 @@ class Mapper:
             mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
         return mapper
 
+    def rays_of(self, pair: PairMatches) -> tuple[Floats, Floats]:
+        """Viewing rays (n, 3) of all of a pair's matches in image_a and image_b, through the lenses as given."""
+        first = self.keypoints.first
+        a, b = first[pair.image_a] + pair.matches[:, 0], first[pair.image_b] + pair.matches[:, 1]
+        return self.keypoints.rays[a], self.keypoints.rays[b]
+
     def correct_calibration(self, pairs: Sequence[PairMatches]) -> None:
         """Begin with the calibration as simultaneous images correct it, see `matching.simultaneous`."""
 
-        def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
-            a, b = (
-                self.keypoints.first[i] + m for i, m in zip((pair.image_a, pair.image_b), pair.matches.T, strict=True)
-            )
-            return self.keypoints.rays[a[pair.inliers]], self.keypoints.rays[b[pair.inliers]]
+        def inlier_rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
+            a, b = self.rays_of(pair)
+            return a[pair.inliers], b[pair.inliers]
 
-        rig = rig_of_drive(self.drive, pairs, rays_of, self.config.matching, self.config.bundle_adjustment)
+        rig = rig_of_drive(self.drive, pairs, inlier_rays_of, self.config.matching, self.config.bundle_adjustment)
         self.rig_as_begun = rig.rig_from_cam
         self.begin_anew(np.ones(len(self.camera_kind), dtype=np.bool_))
 

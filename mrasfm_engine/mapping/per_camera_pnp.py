@@ -112,7 +112,7 @@ def calibration_spread(votes: list[Vote]) -> float:
     for _ in range(SPREAD_STEPS):
         middle = 0.5 * (low + high)
         covariance = _covariances(votes, middle)
-        squares = _squares(difference, covariance[a] + covariance[b])
+        squares = squared_lengths(difference, covariance[a] + covariance[b])
         low, high = (middle, high) if np.partition(squares, rank - 1)[rank - 1] > expected else (low, middle)
     return high
 
@@ -130,7 +130,7 @@ def _limit(votes: list[Vote], spread: float) -> float:
 
 def _near(votes: list[Vote], covariance: Floats, world_from_rig: Floats, spread: float) -> Bools:
     poses = np.stack([vote.world_from_rig for vote in votes])
-    result: Bools = _squares(_differences(poses, world_from_rig), covariance) <= _limit(votes, spread)
+    result: Bools = squared_lengths(_differences(poses, world_from_rig), covariance) <= _limit(votes, spread)
     return result
 
 
@@ -145,7 +145,7 @@ def _differences(poses: Floats, others: Floats) -> Floats:
     return np.concatenate([turn, poses[..., :3, 3] - others[..., :3, 3]], axis=-1)
 
 
-def _squares(differences: Floats, covariances: Floats) -> Floats:
+def squared_lengths(differences: Floats, covariances: Floats) -> Floats:
     """Squared Mahalanobis lengths (n,) of differences (n, 6)."""
     solved = np.linalg.solve(covariances, differences[..., None])[..., 0]
     result: Floats = (differences * solved).sum(-1)

@@ -16,11 +16,14 @@ from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotat
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import (
+    BENT,
+    MOST,
     GnssAlignment,
     align_with_gnss,
     assess_residuals,
     clock_offset,
     rigid_motions,
+    similarity_motions,
 )
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -82,6 +85,11 @@ class Placement:
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     errors: ReceiverErrors = field(default_factory=ReceiverErrors)
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
+
+    @property
+    def is_contradicted(self) -> bool:
+        """True where the scene does not have the shape of most positions."""
+        return self.prior is not None and bool(self.noise_factor > BENT or self.inlier.mean() < MOST)
 
 
 def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, thorough: bool = False) -> Placement:
@@ -215,10 +223,14 @@ def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_tra
         if _extent(rough[:, :3, 3]) < MIN_EXTENT_SIGMAS * sigma_translation_m:
             return False
         scale_with_baselines(mapper, _extent(rough[:, :3, 3]) / _extent(mapper.state.unit_position_m[units]))
-    own = mapper.state.world_from_rig[units]
-    rotation = robust_mean_rotation(rough[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
-    _move(mapper, se3.transform(rotation, geometric_median(rough[:, :3, 3] - own[:, :3, 3] @ rotation.T)))
+    _move(mapper, _between_poses(rough, mapper.state.world_from_rig[units]))
     return True
+
+
+def _between_poses(a_from_rig: Floats, b_from_rig: Floats) -> Floats:
+    """Transform a_from_b (4, 4) by which poses (n, 4, 4) of the same units agree: rotations determine its rotation."""
+    rotation = robust_mean_rotation(a_from_rig[:, :3, :3] @ np.swapaxes(b_from_rig[:, :3, :3], 1, 2))
+    return se3.transform(rotation, geometric_median(a_from_rig[:, :3, 3] - b_from_rig[:, :3, 3] @ rotation.T))
 
 
 def compare_rough_poses(
@@ -238,12 +250,8 @@ def compare_rough_poses(
     if len(units) < MIN_POSITIONS:
         return None
     own, rough = mapper.state.world_from_rig[units], rough_world_from_rig[units]
-    turns = own[:, :3, :3] @ np.swapaxes(rough[:, :3, :3], 1, 2)
-    rotation = robust_mean_rotation(turns)
-    shift_m = geometric_median(own[:, :3, 3] - rough[:, :3, 3] @ rotation.T)
-    if scene_stands_there:
-        rotation, shift_m = np.eye(3), np.zeros(3)
-    known = se3.transform(rotation, shift_m) @ rough_world_from_rig
+    scene_from_rough = np.eye(4) if scene_stands_there else _between_poses(own, rough)
+    known = scene_from_rough @ rough_world_from_rig
     off_m = own[:, :3, 3] - known[units, :3, 3]
     sigma_m = np.full((len(known), 3), sigma_translation_m)
     inlier, factor = assess_residuals(
@@ -254,7 +262,7 @@ def compare_rough_poses(
     placement = Placement(
         known_m=known[:, :3, 3], known_sigma_m=sigma_m, units=units, inlier=inlier, off_m=off_m, noise_factor=factor
     )
-    turn_rad = se3.log_so3(turns @ rotation.T)
+    turn_rad = se3.log_so3(own[:, :3, :3] @ np.swapaxes(rough[:, :3, :3], 1, 2) @ scene_from_rough[:3, :3].T)
     scatter = np.median(np.abs(np.diff(turn_rad, axis=0))) / (0.6745 * np.sqrt(2.0) * sigma_rotation_rad)
     white = float(np.clip(scatter**2, 0.0, 1.0))
     # What does not scatter is one error of all: together they weigh no more than one rotation.
@@ -306,9 +314,8 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
     """The sizes of both kinds of errors that residuals make most likely, and what was declared.
 
     Where the scene lies, how it is turned and how large it is takes no part in it, and, if `clock_varies`, nor does
-    when its images were taken. Receivers that err by twice or half
-    of what they declare are usual. What wanders is at most what residuals exceed their sigmas by: more, the scene
-    makes of errors of its own.
+    when its images were taken. Receivers that err by twice or half of what they declare are usual. What wanders is at
+    most what residuals exceed their sigmas by: more, the scene makes of errors of its own.
     """
     begin = receiver_errors(mapper, placement)
     good = np.flatnonzero(placement.inlier)
@@ -319,8 +326,7 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
         return begin  # what scatters by as much as is declared leaves nothing that wanders
     units, off_m = placement.units[good], placement.off_m[good]
     place_m = _antenna_m(mapper, units, placement.lever_arm_m)
-    place_m = place_m - place_m.mean(0)
-    ways = [rigid_motions(place_m), place_m[:, :, None]]
+    ways = [similarity_motions(place_m)]
     if clock_varies:
         ways.append(mapper.motion.velocity_mps(mapper.state, mapper.registered)[units][:, :, None])
     # Along a straight line they are fewer.
@@ -337,7 +343,6 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
         knots_s=time_s,
         wander_time_s=mapper.config.gnss.wander_time_s,
     )
-
     least, most = np.log([MIN_WHITE, MIN_WHITE]), np.log([np.inf, placement.noise_factor])
 
     def unlikelihood(log_sizes: Floats) -> float:

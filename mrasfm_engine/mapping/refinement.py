@@ -14,7 +14,7 @@ from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
-from mrasfm_engine.mapping.absolute_priors import BENT, AbsolutePriors
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
     FEW_UNITS,
     CalibrationDecision,
@@ -24,6 +24,7 @@ from mrasfm_engine.mapping.calibration import (
     scale_of_baselines,
     scale_with_baselines,
 )
+from mrasfm_engine.mapping.georeferencing import BENT
 from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper

@@ -22,7 +22,7 @@ from mrasfm_engine.bundle_adjustment.observability_analysis import OBSERVED_RATI
 from mrasfm_engine.bundle_adjustment.priors import TimePrior, robust_gauge_weights
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.mapping.calibration import median_depth_m
-from mrasfm_engine.mapping.georeferencing import rigid_motions
+from mrasfm_engine.mapping.georeferencing import similarity_motions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import Bools, Floats
@@ -92,9 +92,7 @@ def positions_may_tell_time(mapper: Mapper, positions: ReceiverPositions) -> boo
     Wherever the scene lies, and however large it is.
     """
     velocity_mps = mapper.motion.velocity_mps(mapper.state, mapper.registered)[positions.unit]
-    place_m = mapper.state.unit_position_m[positions.unit]
-    place_m = place_m - place_m.mean(0)
-    moves = np.concatenate([rigid_motions(place_m), place_m[:, :, None]], axis=2)
+    moves = similarity_motions(mapper.state.unit_position_m[positions.unit])
     sigma_s = _sigma_s(mapper)
     known = positions.information_given(velocity_mps, moves)
     return bool(known * (sigma_s**2).mean() / len(sigma_s) > OBSERVED_RATIO**-2)

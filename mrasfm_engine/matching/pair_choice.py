@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -52,10 +53,15 @@ class PairChoice:
         if not self.config.pairs.selection:
             return pairs_without_selection(self.drive, self.config.pairs)
         if self.prior.world_from_rig is None:
-            return next_in_time(self.drive, self._usable)
+            return self._next
         return pairs_from_poses(self.drive, self.prior.world_from_rig, self.config.pairs, self._usable)
 
-    @property
+    @cached_property
+    def _next(self) -> Ints:
+        """Pairs (n, 2) of each image with the next ones of its camera."""
+        return next_in_time(self.drive, self._usable)
+
+    @cached_property
     def _usable(self) -> Bools:
         """Images (i,) that were not left out: the others count as never recorded."""
         return np.array([found.left_out is None for found in self.features], dtype=np.bool_)
@@ -73,7 +79,7 @@ class PairChoice:
         window = pairs_from_window(self.drive, pairs, self.motion, min_matches=self.config.matching.min_matches)
         revisits = revisit_pairs(self.drive, self.features, pairs, self.motion)
         every = np.unique(np.concatenate([window, revisits]), axis=0)
-        done = set(map(tuple, next_in_time(self.drive, self._usable).tolist()))
+        done = set(map(tuple, self._next.tolist()))
         return every[[tuple(pair) not in done for pair in every.tolist()]]
 
     def with_revisits(self, pairs: Sequence[PairMatches]) -> list[PairMatches]:
@@ -85,7 +91,7 @@ class PairChoice:
         travelled_m = self.motion.travelled_m[unit[ends]]
         far = np.abs(travelled_m[:, 0] - travelled_m[:, 1]) > REVISIT_PATH_M
         far &= ~are_following(units_ahead(self.motion, self.config.pairs), *unit[ends].T)
-        at_once = set(map(tuple, next_in_time(self.drive, self._usable).tolist()))
+        at_once = set(map(tuple, self._next.tolist()))
         return [
             replace(pair, is_revisit=bool(is_far) and (pair.image_a, pair.image_b) not in at_once)
             for pair, is_far in zip(pairs, far, strict=True)

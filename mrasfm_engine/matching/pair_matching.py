@@ -107,8 +107,7 @@ def match_pairs(
         if len(matches) < config.min_matches:
             return "few matches", across
         ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
-        ca, cb = drive.images[a].camera, drive.images[b].camera
-        inliers = essential_inliers(ra, rb, max_error=config.max_error_px / min(focal[ca], focal[cb]))
+        inliers = essential_inliers(ra, rb, max_error=max_error_rad(drive, a, b, focal, config))
         if inliers.sum() < config.min_matches:
             return "few inliers", across
         return PairMatches(image_a=a, image_b=b, matches=matches, inliers=inliers), across
@@ -150,7 +149,7 @@ def match_pairs(
     kept = []
     for pair in by_prior.pairs:
         if are_simultaneous(drive, pair.image_a, pair.image_b):
-            max_error = max_error_rad(drive, pair, focal, config)
+            max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal, config)
             kept.append(verified_in_rig(drive, pair, rays_of(pair), rig, max_error=max_error, config=config))
         elif pair.inliers.sum() >= config.min_matches:
             kept.append(pair)

@@ -86,7 +86,7 @@ def verified_by_prior(
         predicted = predictions.of_pair(pair)
         if predicted is None:
             return None
-        max_error = max_error_rad(drive, pair, focal_px, config)
+        max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal_px, config)
         rays_a, rays_b = (rays[pair.inliers] for rays in rays_of(pair))
         agree = agreeing(predicted, rays_a, rays_b, max_error=max_error)
         return False if agree is None else agree

@@ -155,7 +155,7 @@ def verified_again(
             raise CancelledError
         if are_simultaneous(drive, pair.image_a, pair.image_b):
             rays = rays_of(pair)
-            max_error = max_error_rad(drive, pair, focal_px, config)
+            max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal_px, config)
             essential = replace(pair, inliers=essential_inliers(*rays, max_error=max_error))
             result.append(verified_in_rig(drive, essential, rays, rig, max_error=max_error, config=config))
         else:
@@ -179,9 +179,9 @@ def verified_in_rig(
     return replace(pair, inliers=inliers if enough else np.zeros_like(inliers))
 
 
-def max_error_rad(drive: Drive, pair: PairMatches, focal_px: Floats, config: MatchConfig) -> float:
-    """Epipolar distance (rad) that a pair's keypoints may have, by the camera with the coarser pixels."""
-    return float(config.max_error_px / focal_px[[drive.images[i].camera for i in (pair.image_a, pair.image_b)]].min())
+def max_error_rad(drive: Drive, image_a: int, image_b: int, focal_px: Floats, config: MatchConfig) -> float:
+    """Epipolar distance (rad) that matches of two images may have, by the camera with the coarser pixels."""
+    return float(config.max_error_px / focal_px[[drive.images[i].camera for i in (image_a, image_b)]].min())
 
 
 def calibration_sigmas(drive: Drive, settings: BundleAdjustmentConfig) -> tuple[Floats, Floats]:
