@@ -1,15 +1,18 @@
-"""Covariance that errors add which the observations of an image share.
+"""Covariance that errors add which the observations of an image share, or those of a point.
 
 The inverse of the normal equations H is the covariance of an adjustment whose observations err independently. Those of
 an image do not where its pose is not what the model makes of it: the vehicle does not move between units as
-interpolated, the shutter rolls, a lorry fills the view. It shows in the images' scores s = sum J' w r. Of independent
-errors their squares M = sum s s' have the expectation F, the observations' part of H, so that
+interpolated, the shutter rolls, a lorry fills the view. Those of a point do not where its neighbourhood draws keypoints
+to one side in image after image. It shows in the scores s = sum J' w r of images and of points. Of independent errors
+their squares M = sum s s' have the expectation F, the observations' part of H, so that
 
     H^-1 (M - F) H^-1
 
 is what shared errors add [the sandwich of Huber and White, by clusters: Liang and Zeger, Longitudinal Data Analysis
-Using Generalized Linear Models, Biometrika 1986], in those directions in which they add something. The scores are of
-whole units: a unit's pose has absorbed what its images share.
+Using Generalized Linear Models, Biometrika 1986]: those of images and those of points one to another, in those
+directions in which they add something [two ways of clustering: Cameron, Gelbach and Miller, Robust Inference With
+Multiway Clustering, Journal of Business and Economic Statistics 2011]. The scores of images are of whole units: a
+unit's pose has absorbed what its images share.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats
 
 MIN_UNITS = 10  # beyond those that units and cameras absorb: fewer tell no covariance
+POINT_GROUPS = 4096  # points that share nothing add up to as much as one by one; so many tell a variance to 2 %
 
 
 def shared_error_covariance(
@@ -43,8 +47,10 @@ def shared_error_covariance(
     units = int(unit.max(initial=-1)) + 1
     if units < MIN_UNITS or not covariance.any():
         return np.zeros_like(covariance)
-    scores = problem.scores(state, system, columns, unit)
-    added = units / (units - 1) * scores.T @ scores - (covariance - _of_terms(problem, state, columns))
+    of_units = problem.scores(state, system, columns, unit)
+    of_points = problem.scores(state, system, columns, problem.observations.point % POINT_GROUPS)
+    independent = covariance - _of_terms(problem, state, columns)
+    added = units / (units - 1) * of_units.T @ of_units - independent + (of_points.T @ of_points - independent)
     sigma = np.sqrt(np.diagonal(covariance))
     by_sigma = np.where(sigma > 0.0, 1.0 / np.where(sigma > 0.0, sigma, 1.0), 0.0)
     values, vectors = np.linalg.eigh(added * by_sigma * by_sigma[:, None])

@@ -22,6 +22,7 @@ from mrasfm_engine.matching.verification import signed_parallax
 from mrasfm_engine.types import Bools, Floats, Ints
 
 GATE_SIGMAS = 3.0
+MIN_BASELINE_M = 1e-6  # far below what any pose is known to, and far above what rounding leaves of its square
 ITERATIONS = 40
 INITIAL_DAMPING = 1e-3
 CONVERGED = 0.1  # of what matches and prior leave uncertain
@@ -274,10 +275,14 @@ def epipolar_derivatives(
     """Sampson distances (n,) in rad of rays (n, 3) of two cameras, and their derivatives.
 
     These are (n, 3) each, in the rotations of a and b and in the place of a against b, all in rig axes; the last are
-    the unit normals (n, 3) of the epipolar planes.
+    the unit normals (n, 3) of the epipolar planes. Cameras nearer to one another than `MIN_BASELINE_M` are taken as so
+    far apart: the distances are the same at any length of a baseline, and would all vanish with it.
     """
     a, b = rays_a @ rig_from_a[:3, :3].T, rays_b @ rig_from_b[:3, :3].T
     t = rig_from_a[:3, 3] - rig_from_b[:3, 3]
+    baseline_m = float(np.linalg.norm(t))
+    if baseline_m < MIN_BASELINE_M:
+        t = MIN_BASELINE_M * (t / baseline_m if baseline_m > 0.0 else np.array([1.0, 0.0, 0.0]))
     # A product with a matrix takes a quarter of the time of np.cross.
     along_t = se3.skew(t).T
     across, ta, tb = _cross(a, b), a @ along_t, b @ along_t

@@ -15,8 +15,13 @@ from tests.helpers.small_problems import make_case
 UNITS, CAMERAS, NOISE_PX, SHARED_PX = 24, 3, 0.5, 1.5
 
 
-def adjusted(seed: int, *, shared_px: float, units: int = UNITS) -> tuple[State, Problem, State]:
-    """Truth, problem and solution of a drive whose images are shifted, each by an error of its own."""
+def adjusted(
+    seed: int, *, shared_px: float, units: int = UNITS, of_points: bool = False
+) -> tuple[State, Problem, State]:
+    """Truth, problem and solution of a drive whose images are shifted, each by an error of its own.
+
+    With `of_points` keypoints are, by an error that those of a point share.
+    """
     case = make_case(
         units=units,
         cameras=CAMERAS,
@@ -29,14 +34,15 @@ def adjusted(seed: int, *, shared_px: float, units: int = UNITS) -> tuple[State,
         options=SolverOptions(sigma_px=NOISE_PX, loss_scale=1e3),
     )
     truth, o = case.truth, case.problem.observations
-    shift_px = np.random.default_rng(seed).normal(scale=shared_px, size=(units, CAMERAS, 2))
+    rows, columns = (o.point, np.zeros_like(o.point)) if of_points else (o.unit, o.camera)
+    shift_px = np.random.default_rng(seed).normal(scale=shared_px, size=(rows.max() + 1, columns.max() + 1, 2))
     prior = CalibrationPrior(
         rotation=truth.camera_rotation,
         position_m=truth.camera_position_m,
         sigma_rotation_rad=np.full(CAMERAS, np.radians(2.0)),
         sigma_translation_m=np.full(CAMERAS, 0.05),
     )
-    shifted = replace(o, xy_px=o.xy_px + shift_px[o.unit, o.camera])
+    shifted = replace(o, xy_px=o.xy_px + shift_px[rows, columns])
     problem = replace(case.problem, observations=shifted, terms=[prior])
     return truth, problem, solve(problem)[0]
 
@@ -50,16 +56,17 @@ def rotation_in_sigmas(truth: State, problem: Problem, solution: State, found: C
     return result
 
 
-def test_errors_that_images_share_are_covered(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("of_points", [False, True])
+def test_errors_that_observations_share_are_covered(of_points: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     covered, without = [], []
     for seed in range(8):
-        case = adjusted(seed, shared_px=SHARED_PX)
+        case = adjusted(seed, shared_px=SHARED_PX, of_points=of_points)
         covered.append(rotation_in_sigmas(*case, covariances(*case[1:])))
         with monkeypatch.context() as patch:
             patch.setattr(shared_errors, "MIN_UNITS", 1_000)
             without.append(rotation_in_sigmas(*case, covariances(*case[1:])))
     assert 0.5 < np.sqrt(np.mean(np.square(covered))) < 1.5
-    assert np.sqrt(np.mean(np.square(without))) > 3.0
+    assert np.sqrt(np.mean(np.square(without))) > 2.0
 
 
 def test_independent_errors_add_little(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -104,3 +106,29 @@ def test_derivatives_are_those_of_the_error() -> None:
         moved[0, :3, 3] += delta
         change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
         np.testing.assert_allclose(by_shift[:, axis], change, atol=1e-5)
+
+
+@pytest.mark.parametrize("apart_m", [0.0, 1e-16, 1e-9])
+def test_cameras_in_one_place_have_a_relative_pose(apart_m: float) -> None:
+    """A standing vehicle's: their epipolar lines have no direction."""
+    true, rays_a, rays_b = views(np.random.default_rng(3), 200, 0.4)
+    at_a = true.base_from_a.copy()
+    at_a[:3, 3] = true.base_from_b[:3, 3] + [apart_m, 0.0, 0.0]
+    start = replace(true, base_from_a=at_a, covariance=np.diag(np.array([4.0 * DEG] * 6 + [0.9] * 3) ** 2))
+    refined, correction = start.refined(rays_a, rays_b, sigma_rad=0.7 * PIXEL_RAD)
+    assert np.isfinite(correction)
+    assert np.isfinite(refined.b_from_a).all()
+    assert (np.diag(refined.covariance) <= np.diag(start.covariance) * (1 + 1e-9)).all()
+
+
+def test_matches_that_no_motion_explains_do_not_draw_cameras_together() -> None:
+    """With no baseline at all any two rays would be on one epipolar line."""
+    rng = np.random.default_rng(4)
+    rays_a, rays_b = (np.c_[rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)] for _ in range(2))
+    rays_b[:140] = rays_a[:140] + rng.normal(0, 0.01, (140, 3)) * [1, 1, 0]
+    rays_a, rays_b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (rays_a, rays_b))
+    sigma = np.array([4.0 * DEG, 4.0 * DEG, 9.0 * DEG] * 2 + [0.9, 0.9, 1.2])
+    at_a = se3.transform(np.eye(3), [-0.96, -1.15, 0.0])
+    start = RelativePose(base_from_a=at_a, base_from_b=np.eye(4), covariance=np.diag(sigma**2))
+    refined, _ = start.refined(rays_a, rays_b, sigma_rad=PIXEL_RAD)
+    assert refined.fits(rays_a, rays_b, max_error=3 * PIXEL_RAD)[140:].mean() < 0.5
