@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 
 from mrasfm_engine.aggregation.association import component_labels
+from mrasfm_engine.aggregation.loops import Loop, LoopJudge, Ways, seam_covariance
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.pose_graph import Edges, optimise_pose_graph
 from mrasfm_engine.types import Floats
-
-MAX_CLOSING_M, MAX_CLOSING_DEG = 0.6, 1.5  # of a loop of seams, for each of them
-LEAST_SIGMA_DEG, LEAST_SIGMA_M = 0.02, 0.01  # of a seam: scenes are bent by more than their images' noise says
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,11 +25,6 @@ class Closing:
     shift_m: float
     turn_deg: float
     length: int  # seams of the loop
-
-    @property
-    def plausible(self) -> bool:
-        """Return whether the errors of good seams can add up to this misclosure."""
-        return self.shift_m <= MAX_CLOSING_M * self.length and self.turn_deg <= MAX_CLOSING_DEG * self.length
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,18 +38,35 @@ class Chain:
 
 
 class SeamGraph:
-    """Seams between scenes, these by index."""
+    """Seams between scenes, these by index.
 
-    def __init__(self, names: Sequence[str], seams: Sequence[Seam]) -> None:
+    Parameters
+    ----------
+    ways
+        Through every scene, for what loops say; without, scenes have the errors of their images alone.
+    off_positions
+        How many sigmas a seam is off positions; without, these say nothing.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        seams: Sequence[Seam],
+        *,
+        ways: Sequence[Ways] | None = None,
+        off_positions: Callable[[int], float] = lambda _: 0.0,
+    ) -> None:
         self.seams = list(seams)
         number = {name: k for k, name in enumerate(names)}
         self._ends = [(number[s.a], number[s.b]) for s in seams]
-        self._count = len(names)
+        self._ways = [Ways()] * len(names) if ways is None else ways
+        self._off_positions = off_positions
+        self._of_scene = self._seams_of_scenes()
 
     def components(self) -> list[tuple[int, ...]]:
         """Scenes that accepted seams connect, the largest first, each with its members ascending."""
         groups: dict[int, list[int]] = {}
-        for scene, value in enumerate(component_labels(self._count, (self._ends[k] for k in self._accepted()))):
+        for scene, value in enumerate(component_labels(len(self._ways), (self._ends[k] for k in self._accepted()))):
             groups.setdefault(value, []).append(scene)
         return sorted((tuple(g) for g in groups.values()), key=lambda g: (-len(g), g))
 
@@ -63,43 +75,35 @@ class SeamGraph:
         poses = {start: np.eye(4)}
         order, used = [start], []
         parent: dict[int, int] = {}
-        while True:
-            open_seams = [k for k in self._accepted() if sum(end in poses for end in self._ends[k]) == 1]
-            if not open_seams:
-                break
-            k = max(open_seams, key=self._strength)
+        reached = [(self._weakness(k), k) for k in self._of_scene[start]]
+        heapify(reached)
+        while reached:
+            _, k = heappop(reached)
             a, b = self._ends[k]
+            if a in poses and b in poses:
+                continue
             known, new = (a, b) if a in poses else (b, a)
             step = self.seams[k].a_from_b if known == a else se3.inverse(self.seams[k].a_from_b)
             poses[new], parent[new] = poses[known] @ step, known
             order.append(new)
             used.append(k)
-        closings = tuple(
-            self._closing(k, poses, parent) for k in self._accepted() if k not in used and self._ends[k][0] in poses
-        )
+            for other in self._of_scene[new]:
+                heappush(reached, (self._weakness(other), other))
+        in_chain = set(used)
+        others = sorted({k for scene in order for k in self._of_scene[scene]} - in_chain)
+        closings = tuple(self._closing(k, poses, parent) for k in others)
         return Chain(scenes=tuple(order), seams=tuple(used), first_from_scene=poses, closings=closings)
 
-    def without_contradictions(self, start: int) -> tuple[SeamGraph, Chain]:
-        """The graph without seams that contradict the others round a loop, and its chain.
-
-        Which seam of a loop is wrong, the loop does not say: the one goes without which least contradicts, of several
-        the weakest.
-        """
-        graph, chain = self, self.chain(start)
-        while bad := [c for c in chain.closings if not c.plausible]:
-            worst = max(bad, key=lambda c: c.shift_m)
-            suspects = [worst.seam, *chain.seams]
-
-            def left(k: int, graph: SeamGraph = graph) -> tuple[int, int, tuple[int, int]]:
-                rest = graph._without(k, "")
-                found = rest.chain(start)
-                contradicting = sum(not c.plausible for c in found.closings)
-                return contradicting, -len(found.scenes), graph._strength(k)
-
-            k = min(suspects, key=left)
-            graph = graph._without(k, f"it contradicts the other seams: a loop does not close by {worst.shift_m:.2f} m")
-            chain = graph.chain(start)
-        return graph, chain
+    def without_contradictions(self) -> tuple[SeamGraph, tuple[Loop, ...]]:
+        """The graph without seams that loops contradict or leave open, and the loops that do not close."""
+        judgement = LoopJudge(self.seams, self._ends, self._of_scene, self._ways, self._off_positions).judge()
+        result = copy(self)
+        result.seams = [
+            replace(seam, accepted=False, reason=judgement.refused[k]) if k in judgement.refused else seam
+            for k, seam in enumerate(self.seams)
+        ]
+        result._of_scene = result._seams_of_scenes()
+        return result, judgement.loops
 
     def balanced(self, chain: Chain) -> dict[int, Floats]:
         """Poses (by scene) with the errors of loops spread over their seams; the chain's first scene stays."""
@@ -128,19 +132,24 @@ class SeamGraph:
         )
         return {scene: poses[k] for scene, k in row.items()}
 
+    def _seams_of_scenes(self) -> list[list[int]]:
+        result: list[list[int]] = [[] for _ in self._ways]
+        for k in self._accepted():
+            for end in self._ends[k]:
+                result[end].append(k)
+        return result
+
     def _accepted(self) -> list[int]:
         return [k for k, seam in enumerate(self.seams) if seam.accepted]
 
-    def _strength(self, k: int) -> tuple[int, int]:
+    def _weakness(self, k: int) -> tuple[int, int]:
         quality = self.seams[k].quality
-        return min(quality["units_a"], quality["units_b"]), quality["inliers"]
+        return -min(quality["units_a"], quality["units_b"]), -quality["inliers"]
 
     def _sigmas(self, seam: Seam) -> tuple[float, float]:
-        rotation, translation = (np.sqrt(np.trace(seam.covariance[i : i + 3, i : i + 3]) / 3) for i in (0, 3))
-        return (
-            float(np.hypot(rotation, np.radians(LEAST_SIGMA_DEG))),
-            float(np.hypot(translation, LEAST_SIGMA_M)),
-        )
+        covariance = seam_covariance(seam)
+        rotation, translation = (float(np.sqrt(np.trace(covariance[i : i + 3, i : i + 3]) / 3)) for i in (0, 3))
+        return rotation, translation
 
     def _closing(self, k: int, poses: dict[int, Floats], parent: dict[int, int]) -> Closing:
         a, b = self._ends[k]
@@ -150,12 +159,6 @@ class SeamGraph:
         shift = np.linalg.norm(se3.apply(by_others, at) - se3.apply(seam.a_from_b, at))
         turn = se3.rotation_angle_deg(by_others[:3, :3] @ seam.a_from_b[:3, :3].T)
         return Closing(seam=k, shift_m=float(shift), turn_deg=float(turn), length=1 + _path_length(a, b, parent))
-
-    def _without(self, k: int, reason: str) -> SeamGraph:
-        result = SeamGraph.__new__(SeamGraph)
-        result.seams = [replace(s, accepted=False, reason=reason) if i == k else s for i, s in enumerate(self.seams)]
-        result._ends, result._count = self._ends, self._count
-        return result
 
 
 def _path_length(a: int, b: int, parent: dict[int, int]) -> int:
@@ -168,6 +171,5 @@ def _path_length(a: int, b: int, parent: dict[int, int]) -> int:
             path.append(scene)
         return path
 
-    above_a, above_b = up(a), up(b)
-    common = next(s for s in above_a if s in set(above_b))
-    return above_a.index(common) + above_b.index(common)
+    steps_to_b = {scene: steps for steps, scene in enumerate(up(b))}
+    return next(steps + steps_to_b[scene] for steps, scene in enumerate(up(a)) if scene in steps_to_b)

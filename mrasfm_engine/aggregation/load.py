@@ -228,7 +228,7 @@ def _arrays(
         name=name,
         manifest=manifest,
         calibration=calibration,
-        report={key: report[key] for key in ("engine_version", "drive", "summary") if key in report},
+        report={key: report[key] for key in ("engine_version", "drive", "summary") if key in report} | _scale(report),
         features_kind=kind,
         height_datum=str(frame.get("height_datum", "")),
         common_world=place[1],
@@ -252,6 +252,12 @@ def _arrays(
         keypoint_point=point,
         descriptors=descriptors if kind.startswith("sift") else descriptors.view(np.float32),
     )
+
+
+def _scale(report: dict[str, Any]) -> dict[str, Any]:
+    """What the refinement says of the scene's scale."""
+    found = [stage["scale"] for stage in report.get("stages", ()) if "scale" in stage]
+    return {"scale": found[-1]} if found else {}
 
 
 def features_kind(report: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain
+from mrasfm_engine.aggregation.loops import Loop
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap
 from mrasfm_engine.aggregation.map_scene import map_scene
 from mrasfm_engine.aggregation.seam import Seam
@@ -26,7 +27,7 @@ from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
-from schemas.findings import warning
+from schemas.findings import Finding, warning
 
 CONNECTED, BY_POSITIONS = "connected", "placed by positions"
 BEFORE, AFTER = "before", "after"
@@ -40,6 +41,7 @@ class MapResult:
     association: Association
     found_seams: Sequence[Seam]  # as every pair of scenes by itself says
     seams: Sequence[Seam]  # without those that contradict others
+    loops: Sequence[Loop]  # of seams that do not close
     chains: Sequence[Chain]  # of components; the first is the map's
     map_from_scene: Floats  # (scenes, 4, 4) before units varied on their own
     chained: Floats  # the same, one scene after the other
@@ -68,6 +70,8 @@ class MapResult:
 
 def say_findings(run: stages.Run, result: MapResult) -> None:
     """Note scenes that are not connected, and seams that were refused for what they contradict."""
+    for loop in result.loops:
+        run.found(_finding(result, loop))
     names = result.unconnected
     if len(names) == len(result.scenes):
         run.found(
@@ -85,6 +89,29 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Give drives whose trajectories meet theirs.",
             )
         )
+
+
+def _finding(result: MapResult, loop: Loop) -> Finding:
+    """What a loop that does not close means for its seams."""
+    around = " - ".join(result.scenes[k].name for k in (*loop.scenes, loop.scenes[0]))
+    off = f"{loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg, {loop.sigmas:.1f} sigmas"
+    what = f"the seams {around} do not close, by {off}"
+    if not loop.refused:
+        return warning(
+            "loop-does-not-close",
+            f"{what}; other loops confirm each of them, and all are used",
+            "Compare what the scenes' calibrations and positions say of their lengths.",
+        )
+    names = ", ".join(f"{result.seams[k].a} - {result.seams[k].b}" for k in loop.refused)
+    if loop.wrong is not None:
+        return warning(
+            "seam-contradicted", f"{what}: the seam {names} is wrong and not used", "Look at the pictures of that seam."
+        )
+    return warning(
+        "loop-leaves-open",
+        f"{what}, and nothing says which of them is wrong: not used are {names}",
+        "Give a drive that shares places with several of these scenes, or better positions.",
+    )
 
 
 def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
@@ -125,6 +152,7 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
         "order": [scenes[k].name for chain in result.chains[:1] for k in chain.scenes],
         "scenes": [_scene(result, k) for k in range(len(scenes))],
         "seams": [_seam(result, number, pictures) for number in range(len(result.seams))],
+        "loops": [_loop(result, loop) for loop in result.loops],
         "unconnected": result.unconnected,
         "joint": [
             {"iterations": r.iterations, "observations": r.observations, "termination": str(r.termination)}
@@ -181,6 +209,17 @@ def _seam(result: MapResult, number: int, pictures: Collection[str]) -> dict[str
     if closing is not None:
         document["closes_loop"] = {"shift_m": closing.shift_m, "turn_deg": closing.turn_deg, "seams": closing.length}
     return document
+
+
+def _loop(result: MapResult, loop: Loop) -> dict[str, Any]:
+    return {
+        "scenes": [result.scenes[k].name for k in loop.scenes],
+        "shift_m": loop.shift_m,
+        "turn_deg": loop.turn_deg,
+        "sigmas": loop.sigmas,
+        "refused": [[result.seams[k].a, result.seams[k].b] for k in loop.refused],
+        "wrong_seam_known": loop.wrong is not None,
+    }
 
 
 def _moved(result: MapResult, seam: Seam) -> float:

@@ -14,6 +14,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain, SeamGraph
 from mrasfm_engine.aggregation.load import name_scenes
+from mrasfm_engine.aggregation.loops import Loop, Ways, off_positions
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, adjust_map
 from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
 from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner, placed
@@ -89,8 +90,8 @@ def aggregate(
     found = stages.scenes(run, named, remove, leave_out=leave_out)
     known = stages.association(run, found)
     seams = stages.seams(run, found, known)
-    graph, chains = _graph(found, known, seams)
-    result = _join_scenes(run, found, known, seams, graph, chains)
+    graph, loops, chains = _graph(found, known, seams, config)
+    result = _join_scenes(run, found, known, seams, graph, loops, chains)
     say_findings(run, result)
     pictures = map_pictures(run, result) if config.output.pictures else {}
     if cancel():
@@ -102,12 +103,25 @@ def aggregate(
     return report
 
 
-def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Seam]) -> tuple[SeamGraph, list[Chain]]:
-    """Seams without contradictions, and the chain of every component; the map's, which is the largest, comes first.
+def _graph(
+    found: Sequence[SourceScene], known: Association, seams: Sequence[Seam], config: EngineConfig
+) -> tuple[SeamGraph, Sequence[Loop], list[Chain]]:
+    """Seams without contradictions, the loops that do not close, and the chain of every component.
 
-    It begins with the reference, or where that is not in the largest component with this one's first scene.
+    The map's, which is the largest, comes first. It begins with the reference, or where that is not in the largest
+    component with this one's first scene.
     """
-    graph = SeamGraph([scene.name for scene in found], seams)
+    by_name = {scene.name: scene for scene in found}
+    graph, loops = SeamGraph(
+        list(by_name),
+        seams,
+        ways=[Ways.of_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
+        off_positions=lambda k: off_positions(
+            seams[k],
+            by_name[seams[k].a].sigma_position_m[seams[k].units_a],
+            by_name[seams[k].b].sigma_position_m[seams[k].units_b],
+        ),
+    ).without_contradictions()
     done: set[int] = set()
     chains: list[Chain] = []
     components = graph.components()
@@ -117,10 +131,10 @@ def _graph(found: Sequence[SourceScene], known: Association, seams: Sequence[Sea
     for start in [*starts, *range(len(found))]:
         if start in done:
             continue
-        graph, chain = graph.without_contradictions(start)
+        chain = graph.chain(start)
         chains.append(chain)
         done.update(chain.scenes)
-    return graph, chains
+    return graph, loops, chains
 
 
 def _join_scenes(
@@ -129,6 +143,7 @@ def _join_scenes(
     known: Association,
     seams: Sequence[Seam],
     graph: SeamGraph,
+    loops: Sequence[Loop],
     chains: Sequence[Chain],
 ) -> MapResult:
     started = time.perf_counter()
@@ -162,6 +177,7 @@ def _join_scenes(
         association=known,
         found_seams=seams,
         seams=graph.seams,
+        loops=loops,
         chains=chains,
         map_from_scene=poses,
         chained=chained,

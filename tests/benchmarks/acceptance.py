@@ -25,6 +25,7 @@
 | 21 | real drives with poorer receivers than theirs, and with cameras left out |
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
+| 24 | which of many seams is wrong, by loops of simulated scenes |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -62,6 +63,7 @@ from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
+from tests.benchmarks.seam_graphs import seam_graphs
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.sigmas import halves, simulated
@@ -109,6 +111,7 @@ LINES = {
     "21": Line(untimed=(receivers,)),
     "22": Line(timed=(surround_peers,)),
     "23": Line(untimed=(simulated_routes,)),
+    "24": Line(timed=(seam_graphs,)),
 }
 
 

@@ -95,18 +95,29 @@ def test_components_and_scenes_alone(rng: np.random.Generator) -> None:
     assert graph.chain(4).scenes == (4,)
 
 
-@pytest.mark.parametrize("wrong", [1, 4])
-def test_the_seam_that_contradicts_the_others_goes(rng: np.random.Generator, wrong: int) -> None:
-    """Seams 0 and 1 are the only ones of scene 1, so that the loops say "one of these": the weaker one goes."""
+@pytest.mark.parametrize("wrong", [2, 4])
+def test_a_seam_that_others_contradict_goes(rng: np.random.Generator, wrong: int) -> None:
+    """A ring of four, and both of its diagonals: every seam is on loops without any other."""
     world = poses(rng)
     seams = ring(world, rng)
-    seams.append(seam(0, 2, noisy(se3.inverse(world[0]) @ world[2], rng), inliers=300))
+    for a, b in ((0, 2), (1, 3)):
+        seams.append(seam(a, b, noisy(se3.inverse(world[a]) @ world[b], rng), inliers=300))
     bad = seams[wrong]
     off = bad.a_from_b @ se3.transform(np.eye(3), [12.0, 0.0, 0.0])
     seams[wrong] = seam(int(bad.a), int(bad.b), off, inliers=bad.quality["inliers"])
-    graph, chain = SeamGraph(["0", "1", "2", "3"], seams).without_contradictions(0)
-    refused = [k for k, s in enumerate(graph.seams) if not s.accepted]
-    assert refused == [wrong]
+    graph, loops = SeamGraph(["0", "1", "2", "3"], seams).without_contradictions()
+    assert [k for k, s in enumerate(graph.seams) if not s.accepted] == [wrong]
     assert "contradicts" in graph.seams[wrong].reason
+    assert {loop.wrong for loop in loops} == {wrong}
+    chain = graph.chain(0)
     assert len(chain.scenes) == 4
     assert 0 < largest_seam_error_m(graph.balanced(chain), world, [s for s in graph.seams if s.accepted]) < 0.2
+
+
+def test_a_diagonal_that_the_ring_contradicts_goes(rng: np.random.Generator) -> None:
+    """Both triangles of a diagonal fail; only the ring round both says that it is the diagonal."""
+    world = poses(rng)
+    seams = ring(world, rng)
+    off = se3.inverse(world[0]) @ world[2] @ se3.transform(np.eye(3), [5.0, 0.0, 0.0])
+    graph, _ = SeamGraph(["0", "1", "2", "3"], [*seams, seam(0, 2, off)]).without_contradictions()
+    assert [k for k, s in enumerate(graph.seams) if not s.accepted] == [4]

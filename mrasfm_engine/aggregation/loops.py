@@ -1,0 +1,338 @@
+"""Loops of seams: which seams other seams confirm, which they contradict, and what a loop leaves open.
+
+Round a loop of right seams one comes back to where one began, but for what the seams and the scenes between them err
+by. Both have covariances: a seam its own, a scene that of a way through it, which bends and has a scale that is known
+no better than the scene says. The misclosure is tested against their sum.
+
+A loop that closes well confirms all of its seams: a wrong one would have to be wrong by what its loop cannot tell. A
+seam that does not close a loop of confirmed ones is wrong. Where a loop does not close and several of its seams are on no
+loop that does, nothing in the graph says which of them is wrong; positions may, and else none of them is used
+[consistency by cycles: Olson, Recognizing places using spectrally clustered local matches, 2009; Latif et al., Robust
+loop closing over time, 2013]. Each seam is asked for its shortest loop, so that the cost grows with the seams.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+
+from mrasfm_engine.aggregation.seam import Seam
+from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.types import Bools, Floats
+
+GATE_SIGMAS = 4.0  # of a loop and of positions: of a thousand right loops it refuses none
+MAX_MISCLOSURE = float(chi2.isf(chi2.sf(GATE_SIGMAS**2, 1), 6))  # squared: as likely as one value beyond the gate
+# A loop that closes no worse than most right ones do confirms its seams; between the two it says nothing.
+CONFIRMING = float(chi2.isf(chi2.sf(2.0**2, 1), 6))
+# What images leave of a way: heading and tilt drift like a random walk. The similarity errors of reconstructed drives
+# (0.01 to 0.07 m after 50 to 100 m, see docs/benchmarks/accuracy.md) are of this size.
+DRIFT_RAD_PER_SQRT_M = np.radians(0.02) / np.sqrt(10.0)
+STRAIGHT_PARTS = 32  # of a way of which only the ends are known
+LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # of a seam: it averages over the bends of both scenes there
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ways:
+    """Ways through a scene, from one seam to another.
+
+    Attributes
+    ----------
+    trajectory_m
+        (n, 3) of the scene's units, in its frame; where there is none, ways are straight.
+    sigma_scale
+        Relative standard deviation of the scene's lengths.
+    """
+
+    trajectory_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    sigma_scale: float = 0.0
+
+    @staticmethod
+    def of_scene(scene: SourceScene, *, most_scale: float) -> Ways:
+        """The ways of a reconstructed scene. Its lengths are no worse than `most_scale`, as seams compare them."""
+        known = scene.report.get("scale", {}).get("sigma_relative")
+        sigma = float(known) if isinstance(known, int | float) and known >= 0 else most_scale
+        return Ways(trajectory_m=scene.trajectory_m, sigma_scale=min(sigma, most_scale))
+
+    @cached_property
+    def _turns(self) -> tuple[Floats, Floats]:
+        """Places (n - 1, 3) half way between the trajectory's units, and how far these are apart."""
+        return 0.5 * (self.trajectory_m[1:] + self.trajectory_m[:-1]), np.linalg.norm(
+            np.diff(self.trajectory_m, axis=0), axis=1
+        )
+
+    def _way(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
+        """Places (n, 3) on the way between two others, and the lengths (n,) of the way that they stand for."""
+        chord_m = end_m - start_m
+        share = (np.arange(STRAIGHT_PARTS) + 0.5) / STRAIGHT_PARTS
+        straight = start_m + share[:, None] * chord_m, np.full(len(share), np.linalg.norm(chord_m) / len(share))
+        if len(self.trajectory_m) < 2:
+            return straight
+        first, last = sorted(int(np.argmin(((self.trajectory_m - at) ** 2).sum(1))) for at in (start_m, end_m))
+        places_m, lengths_m = self._turns
+        on_it = places_m[first:last], lengths_m[first:last]
+        return on_it if on_it[1].sum() > straight[1].sum() else straight
+
+    def covariance(self, start_m: Floats, end_m: Floats) -> Floats:
+        """Covariance (6, 6) of rotation and shift at the end of a way against its start, about its end, in the scene's
+        axes.
+        """
+        places_m, lengths_m = self._way(start_m, end_m)
+        by_turn = np.zeros((len(places_m), 6, 3))  # of the way's end, by a turn on it
+        by_turn[:, :3], by_turn[:, 3:] = np.eye(3), -se3.skew(end_m - places_m)
+        result: Floats = np.einsum("n,nik,njk->ij", DRIFT_RAD_PER_SQRT_M**2 * lengths_m, by_turn, by_turn)
+        longer_m = self.sigma_scale * (end_m - start_m)
+        result[3:, 3:] += np.outer(longer_m, longer_m)
+        return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loop:
+    """Seams round a loop that does not close.
+
+    Attributes
+    ----------
+    seams, scenes
+        One after the other; the first scene is where the first seam begins.
+    shift_m, turn_deg
+        The misclosure, at the place of the first seam.
+    sigmas
+        How large it is: of a normal variable as unlikely.
+    wrong
+        The seam that is; None where nothing says which, or where all are confirmed by other loops.
+    refused
+        Seams that are not used because of this loop.
+    """
+
+    seams: tuple[int, ...]
+    scenes: tuple[int, ...]
+    shift_m: float
+    turn_deg: float
+    sigmas: float
+    wrong: int | None = None
+    refused: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """What loops say of the seams."""
+
+    confirmed: Bools  # (seams,)
+    refused: Mapping[int, str]  # seams that are not to be used, and why
+    loops: tuple[Loop, ...]  # that do not close
+
+
+class LoopJudge:
+    """Judges the accepted seams of a graph by its loops.
+
+    Parameters
+    ----------
+    ends
+        Numbers of each seam's scenes.
+    of_scene
+        Accepted seams of every scene.
+    ways
+        Of every scene.
+    off_positions
+        How many sigmas a seam is off what positions say; 0 where they say nothing.
+    """
+
+    def __init__(
+        self,
+        seams: Sequence[Seam],
+        ends: Sequence[tuple[int, int]],
+        of_scene: Sequence[Sequence[int]],
+        ways: Sequence[Ways],
+        off_positions: Callable[[int], float],
+    ) -> None:
+        self._seams, self._ends, self._ways, self._off_positions = seams, ends, ways, off_positions
+        self._of_scene = of_scene
+        self._confirmed = np.zeros(len(seams), dtype=np.bool_)
+        self._wrong: dict[int, str] = {}  # why
+        self._open: dict[frozenset[int], Loop] = {}  # loops that do not close
+        self._tested: set[frozenset[int]] = set()
+
+    def judge(self) -> Judgement:
+        """Confirm what closes, find what does not."""
+        for k in sorted({k for seams in self._of_scene for k in seams}):
+            if not self._confirmed[k]:
+                self._test(self._path(k, lambda _: True))
+        while self._narrowed():
+            pass
+        return self._explained()
+
+    def _narrowed(self) -> bool:
+        """Test suspects against confirmed seams alone, and on loops without one another; whether that told something.
+
+        A suspect on no loop without its neighbours on this one is on none that could tell it from them.
+        """
+        told = False
+        for loop in list(self._open.values()):
+            if any(k in self._wrong for k in loop.seams):
+                continue
+            for k in self._suspects(loop):
+                told |= self._test(self._path(k, lambda step: bool(self._confirmed[step])))
+            suspects = self._suspects(loop)
+            if len(suspects) == 1:
+                self._wrong[suspects[0]] = f"it contradicts {_words(loop)}, whose other seams other loops confirm"
+                told = True
+                continue
+            for number, other in enumerate(suspects):
+                for k in {suspects[number - 1], suspects[(number + 1) % len(suspects)]} - {other}:
+                    told |= self._test(self._path(k, lambda step, but=other: step != but))  # type: ignore[misc]
+        return told
+
+    def _singled_out(self, loop: Loop) -> None:
+        """Take the seam for wrong that positions are far off, if there is one such among the loop's suspects."""
+        known = any(k in self._wrong for k in loop.seams)
+        off = {} if known else {k: self._off_positions(k) for k in self._suspects(loop)}
+        far = [k for k, sigmas in off.items() if sigmas > GATE_SIGMAS]
+        if len(far) == 1:
+            self._wrong[far[0]] = f"{_words(loop)} does not close, and positions are {off[far[0]]:.0f} sigmas off it"
+
+    def _explained(self) -> Judgement:
+        """What is wrong on the loops that do not close; suspects of which nothing tells more are refused."""
+        # A loop of fewer suspects says more; of several that tell the same, the shortest is shown.
+        loops = sorted(self._open.values(), key=lambda one: (len(self._suspects(one)), len(one.seams), one.seams))
+        for loop in loops:
+            self._singled_out(loop)
+        refused, shown = dict(self._wrong), dict[tuple[int, ...], Loop]()
+        for loop in loops:
+            wrong = tuple(k for k in loop.seams if k in self._wrong)
+            own = wrong or tuple(self._suspects(loop))
+            for k in own:
+                refused.setdefault(k, f"{_words(loop)} does not close, and nothing says which of its seams is wrong")
+            explained = replace(loop, wrong=wrong[0] if len(wrong) == 1 else None, refused=own)
+            shown.setdefault(own or loop.seams, explained)
+        return Judgement(confirmed=self._confirmed, refused=refused, loops=tuple(shown.values()))
+
+    def _suspects(self, loop: Loop) -> list[int]:
+        return [k for k in loop.seams if not self._confirmed[k]]
+
+    def _test(self, path: list[int] | None) -> bool:
+        """Test the loop of a path of seams, unless it has been: one that closes well confirms them. Whether it does."""
+        if path is None or frozenset(path) in self._tested:
+            return False
+        key = frozenset(path)
+        self._tested.add(key)
+        scenes, misclosure, covariance = self._closing(path)
+        squared = float(misclosure @ np.linalg.solve(covariance, misclosure))
+        if squared <= CONFIRMING:
+            self._confirmed[path] = True
+            return True
+        if squared <= MAX_MISCLOSURE:
+            return False
+        self._open[key] = Loop(
+            seams=tuple(path),
+            scenes=scenes,
+            shift_m=float(np.linalg.norm(misclosure[3:])),
+            turn_deg=float(np.degrees(np.linalg.norm(misclosure[:3]))),
+            sigmas=float(np.sqrt(chi2.isf(max(chi2.sf(squared, 6), 1e-300), 1))),
+        )
+        return False
+
+    def _path(self, seam: int, may: Callable[[int], bool]) -> list[int] | None:
+        """The shortest loop through a seam, it first, over other seams that `may` be used; None where there is none."""
+        start, goal = self._ends[seam][1], self._ends[seam][0]
+        came: dict[int, tuple[int, int]] = {start: (-1, -1)}
+        queue = deque([start])
+        while queue:
+            scene = queue.popleft()
+            for k, other in self._steps(scene):
+                if k == seam or other in came or k in self._wrong or not may(k):
+                    continue
+                came[other] = (scene, k)
+                if other == goal:
+                    return [seam, *self._back(came, goal)]
+                queue.append(other)
+        return None
+
+    @staticmethod
+    def _back(came: dict[int, tuple[int, int]], scene: int) -> list[int]:
+        path = []
+        while came[scene][1] >= 0:
+            scene, k = came[scene]
+            path.append(k)
+        return path[::-1]
+
+    def _steps(self, scene: int) -> Iterator[tuple[int, int]]:
+        for k in self._of_scene[scene]:
+            a, b = self._ends[k]
+            yield k, b if a == scene else a
+
+    def _closing(self, path: Sequence[int]) -> tuple[tuple[int, ...], Floats, Floats]:
+        """Scenes of a loop, its misclosure (6,) at the first seam's place, and the covariance (6, 6) of that."""
+        scenes = [self._ends[path[0]][0]]
+        pose = np.eye(4)  # of the present scene, in the first one's frame
+        here: list[tuple[Floats, Floats]] = []  # places there, and covariances of errors about them
+        first_m, arrived_m = self._place(path[0], scenes[0]), np.zeros(3)
+        for number, k in enumerate(path):
+            scene = scenes[-1]
+            leave_m = self._place(k, scene)
+            if number:
+                here.append(_error_at(pose, leave_m, self._ways[scene].covariance(arrived_m, leave_m)))
+            a, b = self._ends[k]
+            here.append(_error_at(pose if scene == a else pose @ se3.inverse(self._seams[k].a_from_b),
+                                  self._place(k, a), seam_covariance(self._seams[k])))  # fmt: skip
+            pose = pose @ (self._seams[k].a_from_b if scene == a else se3.inverse(self._seams[k].a_from_b))
+            scenes.append(b if scene == a else a)
+            arrived_m = self._place(k, scenes[-1])
+        here.append(_error_at(pose, first_m, self._ways[scenes[0]].covariance(arrived_m, first_m)))
+        end_m = se3.apply(pose, first_m[None])[0]
+        covariance = np.zeros((6, 6))
+        for at_m, own in here:
+            carried = np.eye(6)
+            carried[3:, :3] = -se3.skew(end_m - at_m)
+            covariance += carried @ own @ carried.T
+        return tuple(scenes[:-1]), np.concatenate([se3.log_so3(pose[:3, :3]), end_m - first_m]), covariance
+
+    def _place(self, k: int, scene: int) -> Floats:
+        """The place (3,) of a seam in the frame of one of its scenes."""
+        seam = self._seams[k]
+        at = seam.place_b_m[None]
+        result: Floats = (se3.apply(seam.a_from_b, at) if scene == self._ends[k][0] else at)[0]
+        return result
+
+
+def seam_covariance(seam: Seam) -> Floats:
+    """The covariance (6, 6) of a seam about its place, in a's axes."""
+    result: Floats = seam.covariance + np.diag([LEAST_SIGMA_RAD**2] * 3 + [LEAST_SIGMA_M**2] * 3)
+    return result
+
+
+def _error_at(first_from_scene: Floats, at_m: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """A place (3,) and the covariance of an error about it, from a scene's axes to those of the loop's first one."""
+    turned = np.kron(np.eye(2), first_from_scene[:3, :3])
+    return se3.apply(first_from_scene, at_m[None])[0], turned @ covariance @ turned.T
+
+
+def _words(loop: Loop) -> str:
+    return f"a loop of {len(loop.seams)} seams that is {loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg off"
+
+
+def off_positions(seam: Seam, sigma_a_m: Floats, sigma_b_m: Floats) -> float:
+    """How many sigmas a seam lies from where the positions of both scenes put them; 0 where they are not known.
+
+    As a normal variable as unlikely as the shift (3,) at the seam's place.
+
+    Parameters
+    ----------
+    sigma_a_m, sigma_b_m
+        (n, 3) of both scenes' units at the seam, along their frames' axes; NaN where not known.
+    """
+    known = [sigma_m[np.isfinite(sigma_m).all(1)] for sigma_m in (sigma_a_m, sigma_b_m)]
+    if not all(len(rows) for rows in known):
+        return 0.0
+    at = seam.place_b_m[None]
+    shift_m = (se3.apply(seam.a_from_b, at) - se3.apply(seam.coarse_a_from_b, at))[0]
+    # What units of a scene err by they share, as receivers do: its mean square, not its mean's.
+    of_a, of_b = (np.diag((rows**2).mean(0)) for rows in known)
+    a_from_b = seam.a_from_b[:3, :3]
+    covariance = of_a + a_from_b @ of_b @ a_from_b.T + seam_covariance(seam)[3:, 3:]
+    squared = float(shift_m @ np.linalg.solve(covariance, shift_m))
+    return float(np.sqrt(chi2.isf(max(chi2.sf(squared, 3), 1e-300), 1)))

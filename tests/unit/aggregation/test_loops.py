@@ -1,0 +1,123 @@
+"""What loops of seams say: which of them is wrong, and where they leave it open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from mrasfm_engine.aggregation import loops
+from mrasfm_engine.aggregation.loops import Ways, off_positions
+from tests.helpers.simulated_seams import SimulatedSeams, ring, simulate, torus, town
+
+SIDE_M = 30.0  # of scenes: so far they know how they lie to decimetres round a ring of 20
+SEEDS = range(12)
+
+
+def refused(case: SimulatedSeams) -> set[int]:
+    graph, _ = case.graph().without_contradictions()
+    return {k for k, seam in enumerate(graph.seams) if not seam.accepted}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_right_seams_are_kept(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    assert refused(simulate(*ring(20, SIDE_M), rng)) == set()
+    assert refused(simulate(*torus(), rng)) == set()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_ring_does_not_say_which_seam_is_wrong(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    case = simulate(*ring(20, SIDE_M), rng, sigma_position_m=20.0).with_wrong({seed: rng.uniform(2, 11)}, rng)
+    graph, found = case.graph().without_contradictions()
+    assert not any(seam.accepted for seam in graph.seams)
+    assert "nothing says which" in graph.seams[3].reason
+    (loop,) = found
+    assert sorted(loop.scenes) == list(range(20))
+    assert loop.wrong is None
+    assert loop.sigmas > loops.GATE_SIGMAS
+    assert len(graph.components()) == 20
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_positions_single_out_the_wrong_seam_of_a_ring(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    case = simulate(*ring(20, SIDE_M), rng, sigma_position_m=0.1).with_wrong({seed: rng.uniform(2, 11)}, rng)
+    graph, found = case.graph().without_contradictions()
+    assert [k for k, seam in enumerate(graph.seams) if not seam.accepted] == [seed]
+    assert "positions" in graph.seams[seed].reason
+    assert [loop.wrong for loop in found] == [seed]
+    assert len(graph.components()) == 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_two_loops_single_out_the_wrong_seam(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    case = simulate(*torus(), rng, sigma_position_m=20.0)
+    wrong = int(rng.integers(len(case.seams)))
+    assert refused(case.with_wrong({wrong: rng.uniform(2, 11)}, rng)) == {wrong}
+
+
+def test_the_cost_grows_with_the_seams() -> None:
+    """Loops that are tested, whose closing is what takes time: at most 2.3 times as many for twice the seams."""
+    counts = []
+    for rows in (12, 24):
+        rng = np.random.default_rng(rows)
+        case = simulate(*town(rows, 24, 3 * rows * 24), rng, sigma_position_m=20.0)
+        wrong = {int(k): 5.0 for k in rng.choice(len(case.seams), rows // 2, replace=False)}
+        case, tested = case.with_wrong(wrong, rng), [0]
+        closing = loops.LoopJudge._closing
+
+        def counted(
+            self: loops.LoopJudge, path: list[int], closing: object = closing, tested: list[int] = tested
+        ) -> object:
+            tested[0] += 1
+            return closing(self, path)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(loops.LoopJudge, "_closing", counted)
+            assert set(wrong) <= refused(case)
+        counts.append(tested[0])
+    assert counts[1] <= 2.3 * counts[0]
+
+
+def test_misclosures_are_as_large_as_their_covariance_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of right loops: chi-squared, with six degrees of freedom."""
+    monkeypatch.setattr(loops, "LEAST_SIGMA_RAD", 0.0)
+    monkeypatch.setattr(loops, "LEAST_SIGMA_M", 0.0)
+    squared = []
+    for seed in range(150):
+        case = simulate(*ring(8, SIDE_M), np.random.default_rng(seed))
+        _, off, covariance = case.judge()._closing(list(range(8)))
+        squared.append(off @ np.linalg.solve(covariance, off))
+    assert kstest(squared, "chi2", args=(6,)).pvalue > 1e-3
+    # Seams without their scenes' bends would not be.
+    straight = replace(case, ways=[Ways()] * 8)
+    monkeypatch.setattr(loops, "DRIFT_RAD_PER_SQRT_M", 0.0)
+    assert np.trace(straight.judge()._closing(list(range(8)))[2]) < 0.7 * np.trace(covariance)
+
+
+def test_a_way_turns_what_comes_after_it() -> None:
+    """The covariance of a straight way is that of a random walk of its heading."""
+    way = Ways(trajectory_m=np.linspace([0, 0, 0], [100.0, 0, 0], 51), sigma_scale=1e-3)
+    found = way.covariance(np.zeros(3), np.array([100.0, 0, 0]))
+    variance = loops.DRIFT_RAD_PER_SQRT_M**2 * 100.0
+    assert np.allclose(np.diag(found)[:3], variance)
+    assert np.allclose(np.diag(found)[3:], [0.1**2, variance * 100.0**2 / 3, variance * 100.0**2 / 3], rtol=1e-3)
+    # To turn left on the way is to end left of it.
+    assert found[2, 4] == pytest.approx(0.5 * variance * 100.0, rel=1e-3)
+    back = way.covariance(np.array([100.0, 0, 0]), np.zeros(3))
+    assert back[2, 4] == pytest.approx(-found[2, 4], rel=1e-3)
+    # Without a trajectory it is straight.
+    assert np.allclose(Ways(sigma_scale=1e-3).covariance(np.zeros(3), np.array([100.0, 0, 0])), found, rtol=0.02)
+
+
+def test_positions_that_are_not_known_say_nothing() -> None:
+    case = simulate(*ring(4), np.random.default_rng(0))
+    unknown, known = np.full((5, 3), np.nan), np.full((5, 3), 0.01)
+    assert off_positions(case.seams[0], unknown, known) == 0.0
+    assert off_positions(case.seams[0], known, np.zeros((0, 3))) == 0.0
+    assert off_positions(case.seams[0], known, known) > loops.GATE_SIGMAS  # receivers that are a metre off
