@@ -5,10 +5,10 @@ by. Both have covariances: a seam its own, a scene that of a way through it, whi
 no better than the scene says. The misclosure is tested against their sum.
 
 A loop that closes well confirms all of its seams: a wrong one would have to be wrong by what its loop cannot tell. A
-seam that does not close a loop of confirmed ones is wrong. Where a loop does not close and several of its seams are on no
-loop that does, nothing in the graph says which of them is wrong; positions may, and else none of them is used
-[consistency by cycles: Olson, Recognizing places using spectrally clustered local matches, 2009; Latif et al., Robust
-loop closing over time, 2013]. Each seam is asked for its shortest loop, so that the cost grows with the seams.
+seam that does not close a loop of confirmed ones is wrong. Where a loop does not close and several of its seams are on
+no loop that does, nothing in the graph says which of them is wrong; positions may, and else none of them is used. Each
+seam is asked for its shortest loop, so that the cost grows with the seams [the idea: Zach, Klopschitz and Pollefeys,
+Disambiguating Visual Relations Using Loop Constraints, CVPR 2010].
 """
 
 from __future__ import annotations
