@@ -10,7 +10,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 
 from mrasfm_engine.aggregation.association import component_labels
-from mrasfm_engine.aggregation.loops import Loop, LoopJudge, Ways, seam_covariance
+from mrasfm_engine.aggregation.loops import Loop, LoopConsistency, ScenePaths, seam_covariance
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.pose_graph import Edges, optimise_pose_graph
@@ -42,10 +42,10 @@ class SeamGraph:
 
     Parameters
     ----------
-    ways
-        Through every scene, for what loops say; without, scenes have the errors of their images alone.
+    paths
+        Those through every scene, for what loops say; without, scenes have the errors of their images alone.
     off_positions
-        How many sigmas a seam is off positions; without, these say nothing.
+        Distance of a seam from positions, in sigmas; without, these say nothing.
     """
 
     def __init__(
@@ -53,20 +53,20 @@ class SeamGraph:
         names: Sequence[str],
         seams: Sequence[Seam],
         *,
-        ways: Sequence[Ways] | None = None,
+        paths: Sequence[ScenePaths] | None = None,
         off_positions: Callable[[int], float] = lambda _: 0.0,
     ) -> None:
         self.seams = list(seams)
         number = {name: k for k, name in enumerate(names)}
         self._ends = [(number[s.a], number[s.b]) for s in seams]
-        self._ways = [Ways()] * len(names) if ways is None else ways
+        self._paths = [ScenePaths()] * len(names) if paths is None else paths
         self._off_positions = off_positions
         self._of_scene = self._seams_of_scenes()
 
     def components(self) -> list[tuple[int, ...]]:
         """Scenes that accepted seams connect, the largest first, each with its members ascending."""
         groups: dict[int, list[int]] = {}
-        for scene, value in enumerate(component_labels(len(self._ways), (self._ends[k] for k in self._accepted()))):
+        for scene, value in enumerate(component_labels(len(self._paths), (self._ends[k] for k in self._accepted()))):
             groups.setdefault(value, []).append(scene)
         return sorted((tuple(g) for g in groups.values()), key=lambda g: (-len(g), g))
 
@@ -96,14 +96,14 @@ class SeamGraph:
 
     def without_contradictions(self) -> tuple[SeamGraph, tuple[Loop, ...]]:
         """The graph without seams that loops contradict or leave open, and the loops that do not close."""
-        judgement = LoopJudge(self.seams, self._ends, self._of_scene, self._ways, self._off_positions).judge()
+        assessment = LoopConsistency(self.seams, self._ends, self._of_scene, self._paths, self._off_positions).assess()
         result = copy(self)
         result.seams = [
-            replace(seam, accepted=False, reason=judgement.refused[k]) if k in judgement.refused else seam
+            replace(seam, accepted=False, reason=assessment.refused[k]) if k in assessment.refused else seam
             for k, seam in enumerate(self.seams)
         ]
         result._of_scene = result._seams_of_scenes()
-        return result, judgement.loops
+        return result, assessment.loops
 
     def balanced(self, chain: Chain) -> dict[int, Floats]:
         """Poses (by scene) with the errors of loops spread over their seams; the chain's first scene stays."""
@@ -133,7 +133,7 @@ class SeamGraph:
         return {scene: poses[k] for scene, k in row.items()}
 
     def _seams_of_scenes(self) -> list[list[int]]:
-        result: list[list[int]] = [[] for _ in self._ways]
+        result: list[list[int]] = [[] for _ in self._paths]
         for k in self._accepted():
             for end in self._ends[k]:
                 result[end].append(k)

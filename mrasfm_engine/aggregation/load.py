@@ -255,7 +255,7 @@ def _arrays(
 
 
 def _scale(report: dict[str, Any]) -> dict[str, Any]:
-    """What the refinement says of the scene's scale."""
+    """The part of a report on the scene's scale."""
     found = [stage["scale"] for stage in report.get("stages", ()) if "scale" in stage]
     return {"scale": found[-1]} if found else {}
 

@@ -1,7 +1,7 @@
 """Loops of seams: which seams other seams confirm, which they contradict, and what a loop leaves open.
 
 Round a loop of right seams one comes back to where one began, but for what the seams and the scenes between them err
-by. Both have covariances: a seam its own, a scene that of a way through it, which bends and has a scale that is known
+by. Both have covariances: a seam its own, a scene that of a path through it, which bends and has a scale that is known
 no better than the scene says. The misclosure is tested against their sum.
 
 A loop that closes well confirms all of its seams: a wrong one would have to be wrong by what its loop cannot tell. A
@@ -30,21 +30,21 @@ GATE_SIGMAS = 4.0  # of a loop and of positions: of a thousand right loops it re
 MAX_MISCLOSURE = float(chi2.isf(chi2.sf(GATE_SIGMAS**2, 1), 6))  # squared: as likely as one value beyond the gate
 # A loop that closes no worse than most right ones do confirms its seams; between the two it says nothing.
 CONFIRMING = float(chi2.isf(chi2.sf(2.0**2, 1), 6))
-# What images leave of a way: heading and tilt drift like a random walk. The similarity errors of reconstructed drives
+# What images leave of a path: heading and tilt drift like a random walk. The similarity errors of reconstructed drives
 # (0.01 to 0.07 m after 50 to 100 m, see docs/benchmarks/accuracy.md) are of this size.
 DRIFT_RAD_PER_SQRT_M = np.radians(0.02) / np.sqrt(10.0)
-STRAIGHT_PARTS = 32  # of a way of which only the ends are known
+STRAIGHT_PARTS = 32  # of a path of which only the ends are known
 LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # of a seam: it averages over the bends of both scenes there
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ways:
-    """Ways through a scene, from one seam to another.
+class ScenePaths:
+    """Paths through a scene, from one seam to another.
 
     Attributes
     ----------
     trajectory_m
-        (n, 3) of the scene's units, in its frame; where there is none, ways are straight.
+        (n, 3) of the scene's units, in its frame; where there is none, paths are straight.
     sigma_scale
         Relative standard deviation of the scene's lengths.
     """
@@ -53,21 +53,21 @@ class Ways:
     sigma_scale: float = 0.0
 
     @staticmethod
-    def of_scene(scene: SourceScene, *, most_scale: float) -> Ways:
-        """The ways of a reconstructed scene. Its lengths are no worse than `most_scale`, as seams compare them."""
+    def of_scene(scene: SourceScene, *, most_scale: float) -> ScenePaths:
+        """The paths through a scene. Its lengths are no worse than `most_scale`, as seams compare them."""
         known = scene.report.get("scale", {}).get("sigma_relative")
         sigma = float(known) if isinstance(known, int | float) and known >= 0 else most_scale
-        return Ways(trajectory_m=scene.trajectory_m, sigma_scale=min(sigma, most_scale))
+        return ScenePaths(trajectory_m=scene.trajectory_m, sigma_scale=min(sigma, most_scale))
 
     @cached_property
     def _turns(self) -> tuple[Floats, Floats]:
-        """Places (n - 1, 3) half way between the trajectory's units, and how far these are apart."""
+        """Places (n - 1, 3) in the middle between the trajectory's units, and how far these are apart."""
         return 0.5 * (self.trajectory_m[1:] + self.trajectory_m[:-1]), np.linalg.norm(
             np.diff(self.trajectory_m, axis=0), axis=1
         )
 
-    def _way(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
-        """Places (n, 3) on the way between two others, and the lengths (n,) of the way that they stand for."""
+    def _parts(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
+        """Places (n, 3) on the path between two others, and the lengths (n,) of it that they stand for."""
         chord_m = end_m - start_m
         share = (np.arange(STRAIGHT_PARTS) + 0.5) / STRAIGHT_PARTS
         straight = start_m + share[:, None] * chord_m, np.full(len(share), np.linalg.norm(chord_m) / len(share))
@@ -79,11 +79,11 @@ class Ways:
         return on_it if on_it[1].sum() > straight[1].sum() else straight
 
     def covariance(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Covariance (6, 6) of rotation and shift at the end of a way against its start, about its end, in the scene's
+        """Covariance (6, 6) of rotation and shift at the end of a path against its start, about its end, in the scene's
         axes.
         """
-        places_m, lengths_m = self._way(start_m, end_m)
-        by_turn = np.zeros((len(places_m), 6, 3))  # of the way's end, by a turn on it
+        places_m, lengths_m = self._parts(start_m, end_m)
+        by_turn = np.zeros((len(places_m), 6, 3))  # of the path's end, by a turn on it
         by_turn[:, :3], by_turn[:, 3:] = np.eye(3), -se3.skew(end_m - places_m)
         result: Floats = np.einsum("n,nik,njk->ij", DRIFT_RAD_PER_SQRT_M**2 * lengths_m, by_turn, by_turn)
         longer_m = self.sigma_scale * (end_m - start_m)
@@ -102,7 +102,7 @@ class Loop:
     shift_m, turn_deg
         The misclosure, at the place of the first seam.
     sigmas
-        How large it is: of a normal variable as unlikely.
+        Its size: that of a normal variable as unlikely.
     wrong
         The seam that is; None where nothing says which, or where all are confirmed by other loops.
     refused
@@ -119,16 +119,16 @@ class Loop:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judgement:
-    """What loops say of the seams."""
+class LoopAssessment:
+    """Seams and loops after they are assessed."""
 
     confirmed: Bools  # (seams,)
     refused: Mapping[int, str]  # seams that are not to be used, and why
     loops: tuple[Loop, ...]  # that do not close
 
 
-class LoopJudge:
-    """Judges the accepted seams of a graph by its loops.
+class LoopConsistency:
+    """Consistency of the accepted seams of a graph round its loops.
 
     Parameters
     ----------
@@ -136,10 +136,10 @@ class LoopJudge:
         Numbers of each seam's scenes.
     of_scene
         Accepted seams of every scene.
-    ways
-        Of every scene.
+    paths
+        Those through every scene.
     off_positions
-        How many sigmas a seam is off what positions say; 0 where they say nothing.
+        Distance of a seam, in sigmas, from what positions say; 0 where they say nothing.
     """
 
     def __init__(
@@ -147,21 +147,21 @@ class LoopJudge:
         seams: Sequence[Seam],
         ends: Sequence[tuple[int, int]],
         of_scene: Sequence[Sequence[int]],
-        ways: Sequence[Ways],
+        paths: Sequence[ScenePaths],
         off_positions: Callable[[int], float],
     ) -> None:
-        self._seams, self._ends, self._ways, self._off_positions = seams, ends, ways, off_positions
+        self._seams, self._ends, self._paths, self._off_positions = seams, ends, paths, off_positions
         self._of_scene = of_scene
         self._confirmed = np.zeros(len(seams), dtype=np.bool_)
         self._wrong: dict[int, str] = {}  # why
         self._open: dict[frozenset[int], Loop] = {}  # loops that do not close
         self._tested: set[frozenset[int]] = set()
 
-    def judge(self) -> Judgement:
+    def assess(self) -> LoopAssessment:
         """Confirm what closes, find what does not."""
         for k in sorted({k for seams in self._of_scene for k in seams}):
             if not self._confirmed[k]:
-                self._test(self._path(k, lambda _: True))
+                self._test(self._shortest_loop(k, lambda _: True))
         while self._narrowed():
             pass
         return self._explained()
@@ -176,7 +176,7 @@ class LoopJudge:
             if any(k in self._wrong for k in loop.seams):
                 continue
             for k in self._suspects(loop):
-                told |= self._test(self._path(k, lambda step: bool(self._confirmed[step])))
+                told |= self._test(self._shortest_loop(k, lambda step: bool(self._confirmed[step])))
             suspects = self._suspects(loop)
             if len(suspects) == 1:
                 self._wrong[suspects[0]] = f"it contradicts {_words(loop)}, whose other seams other loops confirm"
@@ -184,7 +184,7 @@ class LoopJudge:
                 continue
             for number, other in enumerate(suspects):
                 for k in {suspects[number - 1], suspects[(number + 1) % len(suspects)]} - {other}:
-                    told |= self._test(self._path(k, lambda step, but=other: step != but))  # type: ignore[misc]
+                    told |= self._test(self._shortest_loop(k, lambda step, but=other: step != but))  # type: ignore[misc]
         return told
 
     def _singled_out(self, loop: Loop) -> None:
@@ -195,8 +195,8 @@ class LoopJudge:
         if len(far) == 1:
             self._wrong[far[0]] = f"{_words(loop)} does not close, and positions are {off[far[0]]:.0f} sigmas off it"
 
-    def _explained(self) -> Judgement:
-        """What is wrong on the loops that do not close; suspects of which nothing tells more are refused."""
+    def _explained(self) -> LoopAssessment:
+        """The loops that do not close, with what is wrong on them; suspects of which nothing tells more are refused."""
         # A loop of fewer suspects says more; of several that tell the same, the shortest is shown.
         loops = sorted(self._open.values(), key=lambda one: (len(self._suspects(one)), len(one.seams), one.seams))
         for loop in loops:
@@ -209,7 +209,7 @@ class LoopJudge:
                 refused.setdefault(k, f"{_words(loop)} does not close, and nothing says which of its seams is wrong")
             explained = replace(loop, wrong=wrong[0] if len(wrong) == 1 else None, refused=own)
             shown.setdefault(own or loop.seams, explained)
-        return Judgement(confirmed=self._confirmed, refused=refused, loops=tuple(shown.values()))
+        return LoopAssessment(confirmed=self._confirmed, refused=refused, loops=tuple(shown.values()))
 
     def _suspects(self, loop: Loop) -> list[int]:
         return [k for k in loop.seams if not self._confirmed[k]]
@@ -236,7 +236,7 @@ class LoopJudge:
         )
         return False
 
-    def _path(self, seam: int, may: Callable[[int], bool]) -> list[int] | None:
+    def _shortest_loop(self, seam: int, may: Callable[[int], bool]) -> list[int] | None:
         """The shortest loop through a seam, it first, over other seams that `may` be used; None where there is none."""
         start, goal = self._ends[seam][1], self._ends[seam][0]
         came: dict[int, tuple[int, int]] = {start: (-1, -1)}
@@ -275,14 +275,14 @@ class LoopJudge:
             scene = scenes[-1]
             leave_m = self._place(k, scene)
             if number:
-                here.append(_error_at(pose, leave_m, self._ways[scene].covariance(arrived_m, leave_m)))
+                here.append(_error_at(pose, leave_m, self._paths[scene].covariance(arrived_m, leave_m)))
             a, b = self._ends[k]
             here.append(_error_at(pose if scene == a else pose @ se3.inverse(self._seams[k].a_from_b),
                                   self._place(k, a), seam_covariance(self._seams[k])))  # fmt: skip
             pose = pose @ (self._seams[k].a_from_b if scene == a else se3.inverse(self._seams[k].a_from_b))
             scenes.append(b if scene == a else a)
             arrived_m = self._place(k, scenes[-1])
-        here.append(_error_at(pose, first_m, self._ways[scenes[0]].covariance(arrived_m, first_m)))
+        here.append(_error_at(pose, first_m, self._paths[scenes[0]].covariance(arrived_m, first_m)))
         end_m = se3.apply(pose, first_m[None])[0]
         covariance = np.zeros((6, 6))
         for at_m, own in here:
@@ -316,7 +316,7 @@ def _words(loop: Loop) -> str:
 
 
 def off_positions(seam: Seam, sigma_a_m: Floats, sigma_b_m: Floats) -> float:
-    """How many sigmas a seam lies from where the positions of both scenes put them; 0 where they are not known.
+    """Distance of a seam, in sigmas, from where the positions of both scenes put them; 0 where they are not known.
 
     As a normal variable as unlikely as the shift (3,) at the seam's place.
 

@@ -92,7 +92,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
 
 
 def _finding(result: MapResult, loop: Loop) -> Finding:
-    """What a loop that does not close means for its seams."""
+    """Finding on a loop that does not close."""
     around = " - ".join(result.scenes[k].name for k in (*loop.scenes, loop.scenes[0]))
     off = f"{loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg, {loop.sigmas:.1f} sigmas"
     what = f"the seams {around} do not close, by {off}"

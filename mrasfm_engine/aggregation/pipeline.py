@@ -14,7 +14,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain, SeamGraph
 from mrasfm_engine.aggregation.load import name_scenes
-from mrasfm_engine.aggregation.loops import Loop, Ways, off_positions
+from mrasfm_engine.aggregation.loops import Loop, ScenePaths, off_positions
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, adjust_map
 from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
 from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner, placed
@@ -115,7 +115,7 @@ def _graph(
     graph, loops = SeamGraph(
         list(by_name),
         seams,
-        ways=[Ways.of_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
+        paths=[ScenePaths.of_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
         off_positions=lambda k: off_positions(
             seams[k],
             by_name[seams[k].a].sigma_position_m[seams[k].units_a],

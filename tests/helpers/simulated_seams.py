@@ -1,4 +1,4 @@
-"""Seams of simulated scenes: each scene drives through the places of its seams and is bent on the way."""
+"""Seams of simulated scenes: each scene drives through the places of its seams and is bent on its path."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from mrasfm_engine.aggregation.graph import SeamGraph
-from mrasfm_engine.aggregation.loops import DRIFT_RAD_PER_SQRT_M, LoopJudge, Ways, off_positions
+from mrasfm_engine.aggregation.loops import DRIFT_RAD_PER_SQRT_M, LoopConsistency, ScenePaths, off_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
@@ -30,23 +30,23 @@ class SimulatedSeams:
     world_from_scene: Floats  # (scenes, 4, 4)
     ends: list[tuple[int, int]]
     seams: list[Seam]
-    ways: list[Ways]
+    paths: list[ScenePaths]
     sigma_position_m: float  # of the scenes' frames, as their receivers place them
 
     def graph(self) -> SeamGraph:
         """The seams as the aggregation has them."""
         sigma_m = np.full((UNITS_AT_SEAM, 3), self.sigma_position_m)
         return SeamGraph(
-            [str(k) for k in range(len(self.ways))],
+            [str(k) for k in range(len(self.paths))],
             self.seams,
-            ways=self.ways,
+            paths=self.paths,
             off_positions=lambda k: off_positions(self.seams[k], sigma_m, sigma_m),
         )
 
-    def judge(self) -> LoopJudge:
-        """What judges the seams of `graph`, without positions."""
-        of_scene = [[k for k, pair in enumerate(self.ends) if scene in pair] for scene in range(len(self.ways))]
-        return LoopJudge(self.seams, self.ends, of_scene, self.ways, lambda _: 0.0)
+    def consistency(self) -> LoopConsistency:
+        """The loops of `graph`, without positions."""
+        of_scene = [[k for k, pair in enumerate(self.ends) if scene in pair] for scene in range(len(self.paths))]
+        return LoopConsistency(self.seams, self.ends, of_scene, self.paths, lambda _: 0.0)
 
     def without(self, k: int) -> SimulatedSeams:
         """The same without a seam."""
@@ -97,7 +97,7 @@ def town(rows: int, columns: int, seams: int, side_m: float = 60.0) -> tuple[Flo
 
 
 def simulate(middles: Floats, ends: Ends, rng: np.random.Generator, *, sigma_position_m: float = 1.0) -> SimulatedSeams:
-    """Scenes at middles (s, 3) that share places about half way with their neighbours."""
+    """Scenes at middles (s, 3) that share places in the middle between them and their neighbours, about."""
     count = len(middles)
     world_from_scene = se3.transform(se3.exp_so3(rng.normal(0, [0.02, 0.02, 1.0], (count, 3))), middles)
     receiver_m = rng.normal(0, sigma_position_m, (count, 3))
@@ -107,11 +107,11 @@ def simulate(middles: Floats, ends: Ends, rng: np.random.Generator, *, sigma_pos
             of_scene[scene].append(k)
     met_m = np.array([0.5 * (middles[a] + middles[b]) for a, b in ends])
     met_m += rng.normal(0, SPREAD_M, met_m.shape)  # no two seams of a scene are at one place
-    places, bends, ways = {}, {}, []
+    places, bends, paths = {}, {}, []
     for scene, own in enumerate(of_scene):
         local_m = se3.apply(se3.inverse(world_from_scene[scene]), met_m[own])
         trajectory_m, bent = _driven(local_m, rng)
-        ways.append(Ways(trajectory_m=trajectory_m, sigma_scale=SIGMA_SCALE))
+        paths.append(ScenePaths(trajectory_m=trajectory_m, sigma_scale=SIGMA_SCALE))
         for k, place_m, pose in zip(own, local_m, bent, strict=True):
             places[scene, k], bends[scene, k] = place_m, pose
     seams = []
@@ -123,13 +123,13 @@ def simulate(middles: Floats, ends: Ends, rng: np.random.Generator, *, sigma_pos
         coarse[:3, 3] += world_from_scene[a, :3, :3].T @ (receiver_m[b] - receiver_m[a])
         seams.append(_seam(a, b, found, coarse, se3.apply(bends[b, k], places[b, k][None])[0], rng))
     return SimulatedSeams(
-        world_from_scene=world_from_scene, ends=list(ends), seams=seams, ways=ways, sigma_position_m=sigma_position_m
+        world_from_scene=world_from_scene, ends=list(ends), seams=seams, paths=paths, sigma_position_m=sigma_position_m
     )
 
 
 def _driven(places_m: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """A way (n, 3) through places, and how its map is bent at each of them (places, 4, 4)."""
-    way, at, bends = [places_m[0]], np.eye(4), [np.eye(4)]
+    """A path (n, 3) through places, and how its map is bent at each of them (places, 4, 4)."""
+    path, at, bends = [places_m[0]], np.eye(4), [np.eye(4)]
     scale = 1.0 + rng.normal(0, SIGMA_SCALE)
     for start_m, end_m in pairwise(places_m):
         steps = max(2, round(float(np.linalg.norm(end_m - start_m)) / STEP_M))
@@ -140,9 +140,9 @@ def _driven(places_m: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]
             reached_m = se3.apply(at, (here_m - step_m)[None])[0] + scale * at[:3, :3] @ step_m
             turn = se3.exp_so3(rng.normal(0, DRIFT_RAD_PER_SQRT_M * np.sqrt(np.linalg.norm(step_m)), 3)) @ at[:3, :3]
             at = se3.transform(turn, reached_m - turn @ here_m)
-            way.append(here_m)
+            path.append(here_m)
         bends.append(at)
-    return np.array(way), np.array(bends)
+    return np.array(path), np.array(bends)
 
 
 def _about(turn: Floats, shift_m: Floats, at_m: Floats) -> Floats:

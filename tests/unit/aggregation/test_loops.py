@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import kstest
 
 from mrasfm_engine.aggregation import loops
-from mrasfm_engine.aggregation.loops import Ways, off_positions
+from mrasfm_engine.aggregation.loops import ScenePaths, off_positions
 from tests.helpers.simulated_seams import SimulatedSeams, ring, simulate, torus, town
 
 SIDE_M = 30.0  # of scenes: so far they know how they lie to decimetres round a ring of 20
@@ -69,16 +69,16 @@ def test_the_cost_grows_with_the_seams() -> None:
         case = simulate(*town(rows, 24, 3 * rows * 24), rng, sigma_position_m=20.0)
         wrong = {int(k): 5.0 for k in rng.choice(len(case.seams), rows // 2, replace=False)}
         case, tested = case.with_wrong(wrong, rng), [0]
-        closing = loops.LoopJudge._closing
+        closing = loops.LoopConsistency._closing
 
         def counted(
-            self: loops.LoopJudge, path: list[int], closing: object = closing, tested: list[int] = tested
+            self: loops.LoopConsistency, path: list[int], closing: object = closing, tested: list[int] = tested
         ) -> object:
             tested[0] += 1
             return closing(self, path)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(loops.LoopJudge, "_closing", counted)
+            patch.setattr(loops.LoopConsistency, "_closing", counted)
             assert set(wrong) <= refused(case)
         counts.append(tested[0])
     assert counts[1] <= 2.3 * counts[0]
@@ -91,28 +91,28 @@ def test_misclosures_are_as_large_as_their_covariance_says(monkeypatch: pytest.M
     squared = []
     for seed in range(150):
         case = simulate(*ring(8, SIDE_M), np.random.default_rng(seed))
-        _, off, covariance = case.judge()._closing(list(range(8)))
+        _, off, covariance = case.consistency()._closing(list(range(8)))
         squared.append(off @ np.linalg.solve(covariance, off))
     assert kstest(squared, "chi2", args=(6,)).pvalue > 1e-3
     # Seams without their scenes' bends would not be.
-    straight = replace(case, ways=[Ways()] * 8)
+    straight = replace(case, paths=[ScenePaths()] * 8)
     monkeypatch.setattr(loops, "DRIFT_RAD_PER_SQRT_M", 0.0)
-    assert np.trace(straight.judge()._closing(list(range(8)))[2]) < 0.7 * np.trace(covariance)
+    assert np.trace(straight.consistency()._closing(list(range(8)))[2]) < 0.7 * np.trace(covariance)
 
 
-def test_a_way_turns_what_comes_after_it() -> None:
-    """The covariance of a straight way is that of a random walk of its heading."""
-    way = Ways(trajectory_m=np.linspace([0, 0, 0], [100.0, 0, 0], 51), sigma_scale=1e-3)
-    found = way.covariance(np.zeros(3), np.array([100.0, 0, 0]))
+def test_a_path_turns_what_comes_after_it() -> None:
+    """The covariance of a straight path is that of a random walk of its heading."""
+    path = ScenePaths(trajectory_m=np.linspace([0, 0, 0], [100.0, 0, 0], 51), sigma_scale=1e-3)
+    found = path.covariance(np.zeros(3), np.array([100.0, 0, 0]))
     variance = loops.DRIFT_RAD_PER_SQRT_M**2 * 100.0
     assert np.allclose(np.diag(found)[:3], variance)
     assert np.allclose(np.diag(found)[3:], [0.1**2, variance * 100.0**2 / 3, variance * 100.0**2 / 3], rtol=1e-3)
-    # To turn left on the way is to end left of it.
+    # To turn left on the path is to end left of it.
     assert found[2, 4] == pytest.approx(0.5 * variance * 100.0, rel=1e-3)
-    back = way.covariance(np.array([100.0, 0, 0]), np.zeros(3))
+    back = path.covariance(np.array([100.0, 0, 0]), np.zeros(3))
     assert back[2, 4] == pytest.approx(-found[2, 4], rel=1e-3)
     # Without a trajectory it is straight.
-    assert np.allclose(Ways(sigma_scale=1e-3).covariance(np.zeros(3), np.array([100.0, 0, 0])), found, rtol=0.02)
+    assert np.allclose(ScenePaths(sigma_scale=1e-3).covariance(np.zeros(3), np.array([100.0, 0, 0])), found, rtol=0.02)
 
 
 def test_positions_that_are_not_known_say_nothing() -> None:
