@@ -96,7 +96,9 @@ class SeamGraph:
 
     def without_contradictions(self) -> tuple[SeamGraph, tuple[Loop, ...]]:
         """The graph without seams that loops contradict or leave open, and the loops that do not close."""
-        assessment = LoopConsistency(self.seams, self._ends, self._of_scene, self._paths, self._off_positions).assess()
+        assessment = LoopConsistency(
+            self.seams, self._ends, of_scene=self._of_scene, paths=self._paths, off_positions=self._off_positions
+        ).assess()
         result = copy(self)
         result.seams = [
             replace(seam, accepted=False, reason=assessment.refused[k]) if k in assessment.refused else seam

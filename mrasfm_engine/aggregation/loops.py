@@ -26,13 +26,16 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Bools, Floats
 
-GATE_SIGMAS = 4.0  # of a loop and of positions: of a thousand right loops it refuses none
+GATE_SIGMAS = 4.0  # of a loop and of positions: of right loops one in 16,000 is beyond
 MAX_MISCLOSURE = float(chi2.isf(chi2.sf(GATE_SIGMAS**2, 1), 6))  # squared: as likely as one value beyond the gate
 # A loop that closes no worse than most right ones do confirms its seams; between the two it says nothing.
 CONFIRMING = float(chi2.isf(chi2.sf(2.0**2, 1), 6))
 # What images leave of a path: heading and tilt drift like a random walk. The similarity errors of reconstructed drives
 # (0.01 to 0.07 m after 50 to 100 m, see docs/benchmarks/accuracy.md) are of this size.
 DRIFT_RAD_PER_SQRT_M = np.radians(0.02) / np.sqrt(10.0)
+# So many loops tell whether scenes of this map are bent by more, of which most have to be right.
+MIN_LOOPS, USUAL_MISCLOSURE = 10, float(chi2.median(6))
+UNKNOWN_SCALE_SHARE = 1.0 / 3.0  # of the largest difference between scenes that seams allow: a gate is several sigmas
 STRAIGHT_PARTS = 32  # of a path of which only the ends are known
 LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # of a seam: it averages over the bends of both scenes there
 
@@ -53,11 +56,12 @@ class ScenePaths:
     sigma_scale: float = 0.0
 
     @staticmethod
-    def of_scene(scene: SourceScene, *, most_scale: float) -> ScenePaths:
-        """The paths through a scene. Its lengths are no worse than `most_scale`, as seams compare them."""
+    def from_scene(scene: SourceScene, *, most_scale: float) -> ScenePaths:
+        """The paths through a scene, of which seams let scales differ by up to `most_scale`."""
         known = scene.report.get("scale", {}).get("sigma_relative")
-        sigma = float(known) if isinstance(known, int | float) and known >= 0 else most_scale
-        return ScenePaths(trajectory_m=scene.trajectory_m, sigma_scale=min(sigma, most_scale))
+        largest = UNKNOWN_SCALE_SHARE * most_scale
+        sigma = float(known) if isinstance(known, int | float) and known >= 0 else largest
+        return ScenePaths(trajectory_m=scene.trajectory_m, sigma_scale=min(sigma, largest))
 
     @cached_property
     def _turns(self) -> tuple[Floats, Floats]:
@@ -103,8 +107,10 @@ class Loop:
         The misclosure, at the place of the first seam.
     sigmas
         Its size: that of a normal variable as unlikely.
+    sigma_m, sigma_deg
+        Standard deviations of the misclosure, along the axes of which least is known.
     wrong
-        The seam that is; None where nothing says which, or where all are confirmed by other loops.
+        Seams that are; none where nothing says which, or where all are confirmed by other loops.
     refused
         Seams that are not used because of this loop.
     """
@@ -114,7 +120,9 @@ class Loop:
     shift_m: float
     turn_deg: float
     sigmas: float
-    wrong: int | None = None
+    sigma_m: float
+    sigma_deg: float
+    wrong: tuple[int, ...] = ()
     refused: tuple[int, ...] = ()
 
 
@@ -132,8 +140,8 @@ class LoopConsistency:
 
     Parameters
     ----------
-    ends
-        Numbers of each seam's scenes.
+    seams, ends
+        All seams, and the numbers of each one's scenes.
     of_scene
         Accepted seams of every scene.
     paths
@@ -146,51 +154,65 @@ class LoopConsistency:
         self,
         seams: Sequence[Seam],
         ends: Sequence[tuple[int, int]],
+        *,
         of_scene: Sequence[Sequence[int]],
         paths: Sequence[ScenePaths],
         off_positions: Callable[[int], float],
     ) -> None:
         self._seams, self._ends, self._paths, self._off_positions = seams, ends, paths, off_positions
         self._of_scene = of_scene
-        self._confirmed = np.zeros(len(seams), dtype=np.bool_)
+        self._accepted = sorted({k for own in of_scene for k in own})
+        # What the sharpest loop that confirms a seam leaves of it: standard deviations in m and deg.
+        self._left = np.full((len(seams), 2), np.inf)
         self._wrong: dict[int, str] = {}  # why
         self._open: dict[frozenset[int], Loop] = {}  # loops that do not close
-        self._tested: set[frozenset[int]] = set()
+        self._tested: dict[frozenset[int], tuple[Loop, float]] = {}  # and their squared misclosures
+        self._bent = 1.0  # variance of misclosures, of what is expected
 
     def assess(self) -> LoopAssessment:
         """Confirm what closes, find what does not."""
-        for k in sorted({k for seams in self._of_scene for k in seams}):
-            if not self._confirmed[k]:
-                self._test(self._shortest_loop(k, lambda _: True))
+        shortest = [self._shortest_loop(k, frozenset()) for k in self._accepted]
+        squared = [self._measured(path)[1] for path in {frozenset(p): p for p in shortest if p is not None}.values()]
+        if len(squared) >= MIN_LOOPS:
+            self._bent = max(1.0, float(np.median(squared)) / USUAL_MISCLOSURE)
+        for path in shortest:
+            self._test(path)
         while self._narrowed():
             pass
         return self._explained()
 
     def _narrowed(self) -> bool:
-        """Test suspects against confirmed seams alone, and on loops without one another; whether that told something.
+        """Test suspects on loops without wrong seams, of confirmed ones, and without one another; whether any was new.
 
         A suspect on no loop without its neighbours on this one is on none that could tell it from them.
         """
-        told = False
+        new = False
         for loop in list(self._open.values()):
-            if any(k in self._wrong for k in loop.seams):
-                continue
-            for k in self._suspects(loop):
-                told |= self._test(self._shortest_loop(k, lambda step: bool(self._confirmed[step])))
             suspects = self._suspects(loop)
+            if any(k in self._wrong for k in loop.seams):
+                # The others are on this loop no longer: what do they say without the wrong one?
+                for k in suspects:
+                    new |= k not in self._wrong and self._test(self._shortest_loop(k, frozenset()))
+                continue
             if len(suspects) == 1:
                 self._wrong[suspects[0]] = f"it contradicts {_words(loop)}, whose other seams other loops confirm"
-                told = True
+                new = True
                 continue
+            unconfirmed = frozenset(k for k in self._accepted if not self._is_confirmed(k))
             for number, other in enumerate(suspects):
+                new |= self._test(self._shortest_loop(other, unconfirmed - {other}))
                 for k in {suspects[number - 1], suspects[(number + 1) % len(suspects)]} - {other}:
-                    told |= self._test(self._shortest_loop(k, lambda step, but=other: step != but))  # type: ignore[misc]
-        return told
+                    new |= self._test(self._shortest_loop(k, frozenset({other})))
+        return new
+
+    def _is_confirmed(self, k: int) -> bool:
+        return bool(np.isfinite(self._left[k, 0]))
 
     def _singled_out(self, loop: Loop) -> None:
         """Take the seam for wrong that positions are far off, if there is one such among the loop's suspects."""
-        known = any(k in self._wrong for k in loop.seams)
-        off = {} if known else {k: self._off_positions(k) for k in self._suspects(loop)}
+        if any(k in self._wrong for k in loop.seams):
+            return
+        off = {k: self._off_positions(k) for k in self._suspects(loop)}
         far = [k for k, sigmas in off.items() if sigmas > GATE_SIGMAS]
         if len(far) == 1:
             self._wrong[far[0]] = f"{_words(loop)} does not close, and positions are {off[far[0]]:.0f} sigmas off it"
@@ -207,44 +229,60 @@ class LoopConsistency:
             own = wrong or tuple(self._suspects(loop))
             for k in own:
                 refused.setdefault(k, f"{_words(loop)} does not close, and nothing says which of its seams is wrong")
-            explained = replace(loop, wrong=wrong[0] if len(wrong) == 1 else None, refused=own)
-            shown.setdefault(own or loop.seams, explained)
-        return LoopAssessment(confirmed=self._confirmed, refused=refused, loops=tuple(shown.values()))
+            shown.setdefault(own or loop.seams, replace(loop, wrong=wrong, refused=own))
+        confirmed = np.isfinite(self._left[:, 0])
+        return LoopAssessment(confirmed=confirmed, refused=refused, loops=tuple(shown.values()))
 
     def _suspects(self, loop: Loop) -> list[int]:
-        return [k for k in loop.seams if not self._confirmed[k]]
+        """Seams of a loop that nothing confirms, or only a loop that could not tell an error of this size."""
+        left_m, left_deg = self._left[list(loop.seams)].T
+        may = (GATE_SIGMAS * left_m >= loop.shift_m) & (GATE_SIGMAS * left_deg >= loop.turn_deg)
+        return [k for k, suspect in zip(loop.seams, may.tolist(), strict=True) if suspect]
 
     def _test(self, path: list[int] | None) -> bool:
-        """Test the loop of a path of seams, unless it has been: one that closes well confirms them. Whether it does."""
-        if path is None or frozenset(path) in self._tested:
+        """Test the loop of a path of seams: one that closes well confirms them. Whether that told something new."""
+        if path is None:
             return False
-        key = frozenset(path)
-        self._tested.add(key)
-        scenes, misclosure, covariance = self._closing(path)
-        squared = float(misclosure @ np.linalg.solve(covariance, misclosure))
+        loop, squared = self._measured(path)
+        squared /= self._bent
         if squared <= CONFIRMING:
-            self._confirmed[path] = True
-            return True
-        if squared <= MAX_MISCLOSURE:
+            before = self._left[path].copy()
+            left = np.sqrt(self._bent) * np.array([loop.sigma_m, loop.sigma_deg])
+            self._left[path] = np.where((left < before).all(axis=1, keepdims=True), left, before)
+            return bool((np.isinf(before) & np.isfinite(self._left[path])).any())
+        key = frozenset(path)
+        if squared <= MAX_MISCLOSURE or key in self._open:
             return False
-        self._open[key] = Loop(
-            seams=tuple(path),
-            scenes=scenes,
-            shift_m=float(np.linalg.norm(misclosure[3:])),
-            turn_deg=float(np.degrees(np.linalg.norm(misclosure[:3]))),
-            sigmas=float(np.sqrt(chi2.isf(max(chi2.sf(squared, 6), 1e-300), 1))),
-        )
-        return False
+        self._open[key] = replace(loop, sigmas=_as_normal(squared, 6))
+        return True
 
-    def _shortest_loop(self, seam: int, may: Callable[[int], bool]) -> list[int] | None:
-        """The shortest loop through a seam, it first, over other seams that `may` be used; None where there is none."""
+    def _measured(self, path: list[int]) -> tuple[Loop, float]:
+        """The loop of a path of seams, and its squared misclosure."""
+        key = frozenset(path)
+        if key not in self._tested:
+            scenes, off, covariance = self._closing(path)
+            largest = [np.sqrt(np.linalg.eigvalsh(covariance[i : i + 3, i : i + 3])[-1]) for i in (3, 0)]
+            loop = Loop(
+                seams=tuple(path),
+                scenes=scenes,
+                shift_m=float(np.linalg.norm(off[3:])),
+                turn_deg=float(np.degrees(np.linalg.norm(off[:3]))),
+                sigmas=0.0,
+                sigma_m=float(largest[0]),
+                sigma_deg=float(np.degrees(largest[1])),
+            )
+            self._tested[key] = loop, float(off @ np.linalg.solve(covariance, off))
+        return self._tested[key]
+
+    def _shortest_loop(self, seam: int, without: frozenset[int]) -> list[int] | None:
+        """The shortest loop through a seam, it first, over seams that are not known to be wrong; None without one."""
         start, goal = self._ends[seam][1], self._ends[seam][0]
         came: dict[int, tuple[int, int]] = {start: (-1, -1)}
         queue = deque([start])
         while queue:
             scene = queue.popleft()
             for k, other in self._steps(scene):
-                if k == seam or other in came or k in self._wrong or not may(k):
+                if k == seam or other in came or k in self._wrong or k in without:
                     continue
                 came[other] = (scene, k)
                 if other == goal:
@@ -311,6 +349,12 @@ def _error_at(first_from_scene: Floats, at_m: Floats, covariance: Floats) -> tup
     return se3.apply(first_from_scene, at_m[None])[0], turned @ covariance @ turned.T
 
 
+def _as_normal(squared: float, freedoms: int) -> float:
+    """The size of a normal variable that is as unlikely as a chi-squared one."""
+    beyond = float(chi2.sf(squared, freedoms))
+    return float(np.sqrt(chi2.isf(beyond, 1))) if beyond > 0.0 else float(np.sqrt(squared))
+
+
 def _words(loop: Loop) -> str:
     return f"a loop of {len(loop.seams)} seams that is {loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg off"
 
@@ -335,4 +379,4 @@ def off_positions(seam: Seam, sigma_a_m: Floats, sigma_b_m: Floats) -> float:
     a_from_b = seam.a_from_b[:3, :3]
     covariance = of_a + a_from_b @ of_b @ a_from_b.T + seam_covariance(seam)[3:, 3:]
     squared = float(shift_m @ np.linalg.solve(covariance, shift_m))
-    return float(np.sqrt(chi2.isf(max(chi2.sf(squared, 3), 1e-300), 1)))
+    return _as_normal(squared, 3)

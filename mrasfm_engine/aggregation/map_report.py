@@ -29,6 +29,21 @@ from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
 from schemas.findings import Finding, warning
 
+MAX_FINDINGS = 5  # of a kind
+MEANINGS = {  # of loops that do not close, and what to do
+    "seam-contradicted": (
+        "wrong, and not used:",
+        "Look where these scenes share points: repeated structures, or a scene whose shape is wrong.",
+    ),
+    "loop-leaves-open": (
+        "nothing says which of them is wrong; not used:",
+        "Give a drive that shares places with several of these scenes, or better positions.",
+    ),
+    "loop-does-not-close": (
+        "other loops confirm each of them, and all are used",
+        "Compare the lengths of these scenes, and their calibrations.",
+    ),
+}
 CONNECTED, BY_POSITIONS = "connected", "placed by positions"
 BEFORE, AFTER = "before", "after"
 
@@ -51,7 +66,7 @@ class MapResult:
 
     @property
     def unconnected(self) -> list[str]:
-        """Scenes that share nothing with the map's other ones."""
+        """Scenes that no seam connects with the map's other ones."""
         connected = set(self.chains[0].scenes) if len(self.chains[0].scenes) > 1 else set()
         return [scene.name for k, scene in enumerate(self.scenes) if k not in connected]
 
@@ -70,14 +85,16 @@ class MapResult:
 
 def say_findings(run: stages.Run, result: MapResult) -> None:
     """Note scenes that are not connected, and seams that were refused for what they contradict."""
-    for loop in result.loops:
-        run.found(_finding(result, loop))
+    for finding in loop_findings(result.loops, [s.name for s in result.scenes], [(s.a, s.b) for s in result.seams]):
+        run.found(finding)
     names = result.unconnected
     if len(names) == len(result.scenes):
+        refused = any(seam.accepted for seam in result.found_seams)
         run.found(
             warning(
                 "nothing-connected",
-                "no two of the scenes see the same: all are placed by positions only",
+                "all scenes are placed by positions only: "
+                + ("no seam is left to use" if refused else "no two of them see the same"),
                 "Give drives whose trajectories meet, in similar light, or check their positions.",
             )
         )
@@ -91,27 +108,25 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
         )
 
 
-def _finding(result: MapResult, loop: Loop) -> Finding:
-    """Finding on a loop that does not close."""
-    around = " - ".join(result.scenes[k].name for k in (*loop.scenes, loop.scenes[0]))
-    off = f"{loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg, {loop.sigmas:.1f} sigmas"
-    what = f"the seams {around} do not close, by {off}"
-    if not loop.refused:
-        return warning(
-            "loop-does-not-close",
-            f"{what}; other loops confirm each of them, and all are used",
-            "Compare what the scenes' calibrations and positions say of their lengths.",
-        )
-    names = ", ".join(f"{result.seams[k].a} - {result.seams[k].b}" for k in loop.refused)
-    if loop.wrong is not None:
-        return warning(
-            "seam-contradicted", f"{what}: the seam {names} is wrong and not used", "Look at the pictures of that seam."
-        )
-    return warning(
-        "loop-leaves-open",
-        f"{what}, and nothing says which of them is wrong: not used are {names}",
-        "Give a drive that shares places with several of these scenes, or better positions.",
-    )
+def loop_findings(loops: Sequence[Loop], scenes: Sequence[str], seams: Sequence[tuple[str, str]]) -> list[Finding]:
+    """Findings on loops that do not close, by the names of scenes and of the seams' ends; the worst ones of a kind."""
+    kinds: dict[str, list[Loop]] = {}
+    for loop in loops:
+        code = "seam-contradicted" if loop.wrong else "loop-leaves-open" if loop.refused else "loop-does-not-close"
+        kinds.setdefault(code, []).append(loop)
+    found = []
+    for code, own in kinds.items():
+        worst = sorted(own, key=lambda loop: -loop.sigmas)[:MAX_FINDINGS]
+        for loop in worst:
+            around = " - ".join(scenes[k] for k in (*loop.scenes, loop.scenes[0]))
+            off = f"{loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg, {loop.sigmas:.1f} sigmas"
+            ends = ", ".join("{} - {}".format(*seams[k]) for k in loop.refused)
+            meaning, remedy = MEANINGS[code]
+            found.append(warning(code, f"the seams {around} do not close, by {off}; {meaning} {ends}".rstrip(), remedy))
+        if len(own) > len(worst):
+            rest = f"{len(own) - len(worst)} more loops do not close: map.json has all of them"
+            found.append(warning(code, rest, MEANINGS[code][1]))
+    return found
 
 
 def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
@@ -218,7 +233,7 @@ def _loop(result: MapResult, loop: Loop) -> dict[str, Any]:
         "turn_deg": loop.turn_deg,
         "sigmas": loop.sigmas,
         "refused": [[result.seams[k].a, result.seams[k].b] for k in loop.refused],
-        "wrong_seam_known": loop.wrong is not None,
+        "wrong_known": bool(loop.wrong),
     }
 
 

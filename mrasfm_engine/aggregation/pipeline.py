@@ -115,7 +115,7 @@ def _graph(
     graph, loops = SeamGraph(
         list(by_name),
         seams,
-        paths=[ScenePaths.of_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
+        paths=[ScenePaths.from_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
         off_positions=lambda k: off_positions(
             seams[k],
             by_name[seams[k].a].sigma_position_m[seams[k].units_a],

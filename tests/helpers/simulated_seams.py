@@ -46,7 +46,7 @@ class SimulatedSeams:
     def consistency(self) -> LoopConsistency:
         """The loops of `graph`, without positions."""
         of_scene = [[k for k, pair in enumerate(self.ends) if scene in pair] for scene in range(len(self.paths))]
-        return LoopConsistency(self.seams, self.ends, of_scene, self.paths, lambda _: 0.0)
+        return LoopConsistency(self.seams, self.ends, of_scene=of_scene, paths=self.paths, off_positions=lambda _: 0.0)
 
     def without(self, k: int) -> SimulatedSeams:
         """The same without a seam."""

@@ -108,7 +108,7 @@ def test_a_seam_that_others_contradict_goes(rng: np.random.Generator, wrong: int
     graph, loops = SeamGraph(["0", "1", "2", "3"], seams).without_contradictions()
     assert [k for k, s in enumerate(graph.seams) if not s.accepted] == [wrong]
     assert "contradicts" in graph.seams[wrong].reason
-    assert {loop.wrong for loop in loops} == {wrong}
+    assert {loop.wrong for loop in loops} == {(wrong,)}
     chain = graph.chain(0)
     assert len(chain.scenes) == 4
     assert 0 < largest_seam_error_m(graph.balanced(chain), world, [s for s in graph.seams if s.accepted]) < 0.2
