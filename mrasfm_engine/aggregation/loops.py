@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.types import Bools, Floats
+from mrasfm_engine.types import Floats
 
 GATE_SIGMAS = 4.0  # of a loop and of positions: of right loops one in 16,000 is beyond
 MAX_MISCLOSURE = float(chi2.isf(chi2.sf(GATE_SIGMAS**2, 1), 6))  # squared: as likely as one value beyond the gate
@@ -130,7 +130,6 @@ class Loop:
 class LoopAssessment:
     """Seams and loops after they are assessed."""
 
-    confirmed: Bools  # (seams,)
     refused: Mapping[int, str]  # seams that are not to be used, and why
     loops: tuple[Loop, ...]  # that do not close
 
@@ -230,8 +229,7 @@ class LoopConsistency:
             for k in own:
                 refused.setdefault(k, f"{_words(loop)} does not close, and nothing says which of its seams is wrong")
             shown.setdefault(own or loop.seams, replace(loop, wrong=wrong, refused=own))
-        confirmed = np.isfinite(self._left[:, 0])
-        return LoopAssessment(confirmed=confirmed, refused=refused, loops=tuple(shown.values()))
+        return LoopAssessment(refused=refused, loops=tuple(shown.values()))
 
     def _suspects(self, loop: Loop) -> list[int]:
         """Seams of a loop that nothing confirms, or only a loop that could not tell an error of this size."""
