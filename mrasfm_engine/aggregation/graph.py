@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 
@@ -57,6 +56,7 @@ class SeamGraph:
         off_positions: Callable[[int], float] = lambda _: 0.0,
     ) -> None:
         self.seams = list(seams)
+        self._names = names
         number = {name: k for k, name in enumerate(names)}
         self._ends = [(number[s.a], number[s.b]) for s in seams]
         self._paths = [ScenePaths()] * len(names) if paths is None else paths
@@ -89,23 +89,25 @@ class SeamGraph:
             used.append(k)
             for other in self._of_scene[new]:
                 heappush(reached, (self._weakness(other), other))
-        in_chain = set(used)
-        others = sorted({k for scene in order for k in self._of_scene[scene]} - in_chain)
+        others = sorted({k for scene in order for k in self._of_scene[scene]}.difference(used))
         closings = tuple(self._closing(k, poses, parent) for k in others)
         return Chain(scenes=tuple(order), seams=tuple(used), first_from_scene=poses, closings=closings)
 
     def without_contradictions(self) -> tuple[SeamGraph, tuple[Loop, ...]]:
         """The graph without seams that loops contradict or leave open, and the loops that do not close."""
-        assessment = LoopConsistency(
-            self.seams, self._ends, of_scene=self._of_scene, paths=self._paths, off_positions=self._off_positions
-        ).assess()
-        result = copy(self)
-        result.seams = [
+        assessment = self.consistency().assess()
+        seams = [
             replace(seam, accepted=False, reason=assessment.refused[k]) if k in assessment.refused else seam
             for k, seam in enumerate(self.seams)
         ]
-        result._of_scene = result._seams_of_scenes()
-        return result, assessment.loops
+        graph = SeamGraph(self._names, seams, paths=self._paths, off_positions=self._off_positions)
+        return graph, assessment.loops
+
+    def consistency(self) -> LoopConsistency:
+        """The loops of the graph's seams, not assessed yet."""
+        return LoopConsistency(
+            self.seams, self._ends, of_scene=self._of_scene, paths=self._paths, off_positions=self._off_positions
+        )
 
     def balanced(self, chain: Chain) -> dict[int, Floats]:
         """Poses (by scene) with the errors of loops spread over their seams; the chain's first scene stays."""

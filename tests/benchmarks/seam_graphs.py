@@ -76,9 +76,8 @@ def _town() -> Iterator[Figure]:
     wrong = {int(k): rng.uniform(*WRONG_M) for k in rng.choice(len(case.seams), TOWN_WRONG, replace=False)}
     graph = case.with_wrong(wrong, rng).graph()
     started_s = time.perf_counter()
-    judged, _ = graph.without_contradictions()
+    refused, _ = _refused(graph)
     seconds = time.perf_counter() - started_s
-    refused = {k for k, seam in enumerate(judged.seams) if not seam.accepted}
     title = f"{TOWN[0] * TOWN[1]} scenes, {len(case.seams)} seams, {TOWN_WRONG} wrong"
     yield exactly("24b", f"{title}: refused", len(refused & set(wrong)), TOWN_WRONG)
     share = 1.0 - len(refused - set(wrong)) / (len(case.seams) - TOWN_WRONG)

@@ -103,7 +103,7 @@ def moving_shadows(drive: Path, work: Path, title: str) -> Iterator[Figure]:
     mrasfm("reconstruct", drive, "--out", with_it)
     _reconstruct_without(drive, without, like=with_it)
     share = wrong_share(drive, without)
-    yield Figure(line="6a", what=f"{title}: wrong among verified road matches", value=share, above=0.2, most=0.7)
+    yield Figure(line="6a", what=f"{title}: wrong among verified road matches", value=share, above=0.3, most=0.7)
     before, after = road_errors_m(drive, without), road_errors_m(drive, with_it)
     bad_before, bad_after = int((before.error_m > BAD_M).sum()), int((after.error_m > BAD_M).sum())
     good = before.error_m <= BAD_M

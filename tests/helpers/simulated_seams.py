@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from mrasfm_engine.aggregation.graph import SeamGraph
-from mrasfm_engine.aggregation.loops import DRIFT_RAD_PER_SQRT_M, LoopConsistency, ScenePaths, off_positions
+from mrasfm_engine.aggregation.loops import DRIFT_RAD_PER_SQRT_M, ScenePaths, off_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
@@ -42,11 +42,6 @@ class SimulatedSeams:
             paths=self.paths,
             off_positions=lambda k: off_positions(self.seams[k], sigma_m, sigma_m),
         )
-
-    def consistency(self) -> LoopConsistency:
-        """The loops of `graph`, without positions."""
-        of_scene = [[k for k, pair in enumerate(self.ends) if scene in pair] for scene in range(len(self.paths))]
-        return LoopConsistency(self.seams, self.ends, of_scene=of_scene, paths=self.paths, off_positions=lambda _: 0.0)
 
     def without(self, k: int) -> SimulatedSeams:
         """The same without a seam."""

@@ -138,13 +138,13 @@ def test_misclosures_are_as_large_as_their_covariance_says(monkeypatch: pytest.M
     squared = []
     for seed in range(150):
         case = simulate(*ring(8, SIDE_M), np.random.default_rng(seed))
-        _, off, covariance = case.consistency()._closing(list(range(8)))
+        _, off, covariance = case.graph().consistency()._closing(list(range(8)))
         squared.append(off @ np.linalg.solve(covariance, off))
     assert kstest(squared, "chi2", args=(6,)).pvalue > 1e-3
     # Seams without their scenes' bends would not be.
     straight = replace(case, paths=[ScenePaths()] * 8)
     monkeypatch.setattr(loops, "DRIFT_RAD_PER_SQRT_M", 0.0)
-    assert np.trace(straight.consistency()._closing(list(range(8)))[2]) < 0.7 * np.trace(covariance)
+    assert np.trace(straight.graph().consistency()._closing(list(range(8)))[2]) < 0.7 * np.trace(covariance)
 
 
 def test_a_path_turns_what_comes_after_it() -> None:
