@@ -48,7 +48,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 4, Stage.MAPPING: 7}
+VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 4, Stage.MAPPING: 8}
 
 
 @dataclass

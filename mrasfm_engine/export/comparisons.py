@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.export.colmap import RIG_ID, frame_of_image
 from mrasfm_engine.export.readers import ModelImage, ModelPoints, transforms
+from mrasfm_engine.export.road import DECIMALS
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
 from schemas import DriveManifest
@@ -22,6 +23,7 @@ POSE_TOLERANCE = 1e-6  # metres, and elements of rotation matrices
 GEODETIC_TOLERANCE_M = 1e-4
 PLY_TOLERANCE_M = 1e-3  # coordinates are float32 up to some kilometres from the origin
 ROUNDING = 1e-9  # of numbers that are written with all their digits
+RELIEF_ROUNDING = 0.5001 * 10.0**-DECIMALS
 GEODETIC_FIELDS = ("world_crs", "world_crs_wkt2", "height_datum", "origin", "ecef_from_local")
 
 
@@ -152,7 +154,7 @@ def ply(scene: Scene, rows: NDArray[Any]) -> Rows:
 
 
 def road(scene: Scene, document: dict[str, Any]) -> Rows:
-    """The patches of the road, and that points said to be on one are near its plane."""
+    """The patches and the relief of the road, and that points said to be on a patch are near its plane."""
     assert scene.road is not None
     surface, on_road = scene.road.surface, np.flatnonzero(scene.point_patches >= 0)
     centre, normal = (
@@ -163,6 +165,15 @@ def road(scene: Scene, document: dict[str, Any]) -> Rows:
     yield Row("a patch's normal", normal, surface.normal, ROUNDING)
     yield Row("a normal's length", np.linalg.norm(normal, axis=1), np.ones(len(normal)), ROUNDING)
     yield Row("the sum of the patches' points", sum(patch["points"] for patch in document["patches"]), len(on_road))
+    relief = document["relief"]
+    for name, given in (
+        ("node_m", surface.relief.node_m),
+        ("height_m", surface.relief.height_m),
+        ("slope", surface.relief.slope),
+        ("sigma_m", surface.relief.sigma_m),
+    ):
+        found = np.array(relief[name], dtype=np.float64).reshape(-1, *given.shape[1:])
+        yield Row(f"the relief's {name}", found, given, RELIEF_ROUNDING)
     away = np.linalg.norm(scene.points_m[on_road] - centre[scene.point_patches[on_road]], axis=1)
     yield Row("a point near its patch", bool((away < 2 * document["patch_radius_m"]).all()), True)
 

@@ -84,6 +84,47 @@ def fit_height_plane(
     )
 
 
+def refit_height_planes(
+    planes: Floats, first: Ints, xy_m: Floats, height_m: Floats, sigma_m: Floats, weight: Floats,
+    slopes: Floats, sigma_slope: float,
+) -> tuple[Floats, Floats, Ints]:  # fmt: skip
+    """Planes (k, 3) of offset and slope, each optimised again over its own points.
+
+    Parameters
+    ----------
+    planes, slopes
+        Planes (k, 3) near the wanted ones, and expected slopes (k, 2).
+    first
+        Points of plane k are rows `first[k]` to `first[k + 1]` of the arrays of points, which are as in
+        `fit_height_plane`, each point's coordinates from its own patch's centre.
+
+    Returns
+    -------
+    The planes, the share of the weight that agrees with each (k,), and how many points do (k,).
+    """
+    result, support, count = planes.copy(), np.zeros(len(planes)), np.zeros(len(planes), dtype=np.int64)
+    _refit(result, first, xy_m, height_m, sigma_m, weight, slopes, sigma_slope, support, count)
+    return result, support, count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refit(
+    planes: Any, first: Any, xy: Any, height: Any, sigma: Any, weight: Any, slopes: Any, sigma_slope: float,
+    support: Any, count: Any,
+) -> None:  # fmt: skip
+    for k in range(len(planes)):
+        lo, hi = first[k], first[k + 1]
+        _optimise(planes[k], xy[lo:hi], height[lo:hi], sigma[lo:hi], weight[lo:hi], slopes[k], sigma_slope)
+        agree, total = 0.0, 0.0
+        for n in range(lo, hi):
+            total += weight[n]
+            off = height[n] - planes[k, 0] - xy[n, 0] * planes[k, 1] - xy[n, 1] * planes[k, 2]
+            if abs(off) < GATE_SIGMAS * sigma[n]:
+                agree += weight[n]
+                count[k] += 1
+        support[k] = agree / total if total > 0.0 else 0.0
+
+
 def _hypotheses(
     xy: Floats,
     height: Floats,

@@ -325,4 +325,4 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> N
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
     mapper.complete()  # filters, too
     if mapper.config.mapping.semantic_triangulation:
-        log.roads.append(drop_off_road(mapper))
+        log.roads.append(drop_off_road(mapper, before=log.roads[-1] if log.roads else None))

@@ -177,6 +177,7 @@ def _road(judged: RoadAssessment | str) -> dict[str, Any]:
         "patches": len(road.surface),
         "points": len(kept),
         "kept": int(kept.sum()),
+        "kept_off_the_surface": int((kept & np.isfinite(judged.distance_m) & ~judged.is_on_surface).sum()),
         "dropped": int((~kept).sum()),
         "kept_where_no_surface_is": int((kept & np.isnan(judged.distance_m)).sum()),
         "roughness_m": road.roughness_m,

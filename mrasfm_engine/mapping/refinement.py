@@ -176,7 +176,7 @@ def refine(
             mapper.complete()
         observations, points = mapper.filter(mapper.config.mapping.filter_error_px)
         if mapper.config.mapping.semantic_triangulation:
-            result.road = drop_off_road(mapper, for_map=is_last)
+            result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
         result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
         result.observations_dropped += observations
         result.points_dropped += points

@@ -1,8 +1,8 @@
 """Semantic-aided triangulation: points of the road that are off its surface are dropped.
 
 Edges of shadows that move with cars, and wrong matches on asphalt, triangulate above and below the road. Where masks
-label the road, every point of it must lie on its surface. Without masks the vehicle's trajectory decides: nothing
-stands below the road, and nothing stood in the lane that the vehicle drove.
+label the road, every point of it must lie on its surface, or agree with the points around it: kerbs are steps. Without
+masks the vehicle's trajectory decides: nothing stands below the road, and nothing stood in the lane that it drove.
 """
 
 from __future__ import annotations
@@ -15,12 +15,17 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from mrasfm_engine.triangulation.road_prior import points_below_trajectory, standing_is_impossible
-from mrasfm_engine.triangulation.road_surface import FittedRoad, fit_road
+from mrasfm_engine.triangulation.road_surface import (
+    MAX_SLOPE_CHANGE,
+    FittedRoad,
+    KnownPatches,
+    fit_road,
+    largest_offset_m,
+)
 from mrasfm_engine.triangulation.triangulate import cam_from_world
 from mrasfm_engine.triangulation.uncertainty import point_covariances
 from mrasfm_engine.types import Bools, Floats, Ints
 
-MAX_SLOPE_CHANGE = 0.05  # of the road beyond its last patch
 SIGMA_PX_RANGE = (0.5, 2.0)  # keypoints share errors that residuals do not show
 
 
@@ -33,9 +38,14 @@ class RoadAssessment:
     tracks: Ints
     points_m: Floats
     distance_m: Floats  # signed, to the surface; NaN where there is none
-    patch: Ints  # -1 where there is none
     limit_m: Floats  # how far from the surface a point of its uncertainty may be
     is_inlier: Bools
+
+    @property
+    def is_on_surface(self) -> Bools:
+        """Points (n,) on the surface; other inliers are marked by being on no patch."""
+        on: Bools = self.is_inlier & (np.abs(self.distance_m) <= self.limit_m)
+        return on
 
     @property
     def road(self) -> Road:
@@ -49,50 +59,45 @@ class RoadAssessment:
         )
 
 
-def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
+def assess_road(mapper: Mapper, *, for_map: bool, known: KnownPatches | None = None) -> RoadAssessment | str:
     """Fit the road's surface to the mapper's points and judge each that is taken for the road's; else why not.
 
     Parameters
     ----------
     for_map
         Whether the points are for the map. Before, only those are off that are by their own uncertainty.
+    known
+        Patches of an earlier fit, to start from.
     """
     config = mapper.config.mapping
-    world_from_rig = mapper.state.world_from_rig[mapper.registered]
-    source, tracks = RoadSource.MASKS, np.flatnonzero(mapper.triangulated & (mapper.track_class == ROAD))
-    if not (mapper.track_class == ROAD).any():
-        if _all_images_are_masked(mapper):
-            return "no keypoint lies on the road of the masks"
-        if not for_map:
-            return "without masks, the road is judged in the finished scene only: too unsure to bear on poses"
-        source = RoadSource.GEOMETRY
-        tracks = np.flatnonzero(mapper.triangulated & (mapper.track_class == UNKNOWN))
-        below = points_below_trajectory(mapper.state.points_m[tracks], world_from_rig, _lowest_camera_m(mapper))
-        if below is None:
-            return "without masks, no points lie on one level below the vehicle's trajectory"
-        tracks = tracks[below]
+    units = np.flatnonzero(mapper.registered)
+    world_from_rig = mapper.state.world_from_rig[units]
+    found = _points_of_the_road(mapper, world_from_rig, for_map=for_map)
+    if isinstance(found, str):
+        return found
+    source, tracks = found
     points = mapper.state.points_m[tracks]
     sigma = height_sigmas_m(mapper, tracks, world_from_rig)
+    # In the map, what is off the road is wrong however uncertain it is; to poses, weak rays do no harm.
+    max_offset_m = config.road_max_offset_m if for_map else np.inf
     fitted = fit_road(
         points,
         sigma,
         world_from_rig,
         radius_m=config.road_patch_m,
         rng=np.random.default_rng(mapper.config.seed),
+        max_offset_m=max_offset_m,
         rounds=2 if for_map else 1,
+        units=units,
+        known=known,
+        threads=mapper.config.threads,
     )
     if fitted is None:
         return f"{len(tracks)} points of the road are too few, or lie on no surface"
-    distance, patch = fitted.surface.locate(points)
-    limit = config.road_sigmas * np.hypot(sigma, fitted.roughness_m)
-    if for_map:
-        # In the map, what is off the road is wrong however uncertain it is; to poses, weak rays do no harm.
-        limit = np.minimum(limit, max(config.road_max_offset_m, config.road_sigmas * fitted.roughness_m))
-    off = np.abs(distance) > limit
-    # Where no patch reaches, the nearest one is an estimate, the weaker the farther away.
-    alone = np.isnan(distance)
-    offset, beyond = fitted.surface.beyond(points[alone])
-    off[alone] = np.abs(offset) > limit[alone] + MAX_SLOPE_CHANGE * beyond
+    limit = config.road_sigmas * np.sqrt(sigma**2 + fitted.roughness_m**2 + fitted.sigma_m**2)
+    limit = np.minimum(limit, largest_offset_m(max_offset_m, fitted.roughness_m))
+    off = (np.abs(fitted.offset_m) > limit + MAX_SLOPE_CHANGE * fitted.beyond_m) & ~fitted.supported
+    distance = np.where(fitted.patch < 0, np.nan, fitted.offset_m)
     if source is RoadSource.GEOMETRY:
         off &= standing_is_impossible(points, distance, world_from_rig)
     return RoadAssessment(
@@ -101,18 +106,38 @@ def assess_road(mapper: Mapper, *, for_map: bool) -> RoadAssessment | str:
         tracks=tracks,
         points_m=points,
         distance_m=distance,
-        patch=patch,
         limit_m=limit,
         is_inlier=~off,
     )
 
 
-def drop_off_road(mapper: Mapper, *, for_map: bool = False) -> RoadAssessment | str:
-    """Judge the road's points and drop those off its surface; they wait until `Mapper.complete` or `Mapper.readmit`."""
-    judgement = assess_road(mapper, for_map=for_map)
+def drop_off_road(
+    mapper: Mapper, *, for_map: bool = False, before: RoadAssessment | str | None = None
+) -> RoadAssessment | str:
+    """Judge the road's points and drop those off its surface; they wait until `Mapper.complete` or `Mapper.readmit`.
+
+    For the map the surface is found from nothing, else from the one of the assessment `before`.
+    """
+    known = before.fitted.known if isinstance(before, RoadAssessment) and not for_map else None
+    judgement = assess_road(mapper, for_map=for_map, known=known)
     if isinstance(judgement, RoadAssessment):
         mapper.drop(judgement.tracks[~judgement.is_inlier])
     return judgement
+
+
+def _points_of_the_road(mapper: Mapper, world_from_rig: Floats, *, for_map: bool) -> tuple[RoadSource, Ints] | str:
+    """Tracks whose points are taken for the road's, and what says so; else why there are none."""
+    if (mapper.track_class == ROAD).any():
+        return RoadSource.MASKS, np.flatnonzero(mapper.triangulated & (mapper.track_class == ROAD))
+    if _all_images_are_masked(mapper):
+        return "no keypoint lies on the road of the masks"
+    if not for_map:
+        return "without masks, the road is judged in the finished scene only: too unsure to bear on poses"
+    tracks = np.flatnonzero(mapper.triangulated & (mapper.track_class == UNKNOWN))
+    below = points_below_trajectory(mapper.state.points_m[tracks], world_from_rig, _lowest_camera_m(mapper))
+    if below is None:
+        return "without masks, no points lie on one level below the vehicle's trajectory"
+    return RoadSource.GEOMETRY, tracks[below]
 
 
 def height_sigmas_m(mapper: Mapper, tracks: Ints, world_from_rig: Floats) -> Floats:

@@ -48,8 +48,8 @@ def build_scene(
     georeferenced = refinement.georeferenced
     patches, judged = np.full(len(mapper.tracks), -1, dtype=np.int32), refinement.road
     if isinstance(judged, RoadAssessment):
-        on_surface = judged.is_inlier & (np.abs(judged.distance_m) <= judged.limit_m)
-        patches[judged.tracks[on_surface]] = judged.patch[on_surface]
+        on_surface = judged.is_on_surface
+        patches[judged.tracks[on_surface]] = judged.fitted.patch[on_surface]
     return Scene(
         drive=mapper.drive,
         unit_registered=mapper.registered.copy(),

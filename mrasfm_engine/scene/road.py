@@ -1,13 +1,14 @@
-"""The road's surface as overlapping plane patches, and what a scene says of it."""
+"""The road's surface as overlapping plane patches with a relief on them, and what a scene says of it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
 from mrasfm_engine.geometry.neighbours import nearest
+from mrasfm_engine.scene.road_relief import Relief
 from mrasfm_engine.types import Bools, Floats, Ints
 
 SAME_LEVEL_M = 1.0  # patches farther apart in height are of different roads, above one another
@@ -23,7 +24,7 @@ class RoadSource(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RoadSurface:
-    """Plane patches whose weighted mean is the surface. All lengths are metres of the scene's frame.
+    """Plane patches whose weighted mean, with the relief on it, is the surface. Metres of the scene's frame.
 
     A patch holds within `radius_m` of its centre, horizontally; its weight falls to zero there, so that the surface has
     no steps.
@@ -33,6 +34,7 @@ class RoadSurface:
     centre_m: Floats  # (n, 3)
     normal: Floats  # (n, 3) unit, upwards
     radius_m: float
+    relief: Relief = field(default_factory=Relief.none)
 
     def __len__(self) -> int:
         return len(self.centre_m)
@@ -42,6 +44,20 @@ class RoadSurface:
 
         Where roads lie above one another, the nearer one counts. Beyond all patches the distance is NaN, the patch -1.
         """
+        distance, patch = self.locate_on_patches(points_m)
+        inside = patch >= 0
+        height, _ = self.relief.at(self.feet(points_m[inside], distance[inside]))
+        distance[inside] -= height
+        return distance, patch
+
+    def feet(self, points_m: Floats, distance_m: Floats) -> Floats:
+        """Places (p, 3) in the horizontal frame below points at signed distances (p,) from the patches."""
+        feet: Floats = points_m @ self.axes.T
+        feet[:, 2] -= distance_m
+        return feet
+
+    def locate_on_patches(self, points_m: Floats) -> tuple[Floats, Ints]:
+        """As `locate`, without the relief."""
         distance, patch = np.full(len(points_m), np.nan), np.full(len(points_m), -1, dtype=np.int64)
         if not len(self) or not len(points_m):
             return distance, patch

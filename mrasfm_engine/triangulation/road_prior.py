@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.geometry.neighbours import nearest
-from mrasfm_engine.triangulation.road_surface import MIN_POINTS, horizontal_axes, most_frequent
+from mrasfm_engine.triangulation.road_patches import MIN_POINTS
+from mrasfm_engine.triangulation.road_surface import horizontal_axes, most_frequent
 from mrasfm_engine.types import Bools, Floats
 
 CORRIDOR_M = 3.0  # to both sides of the trajectory: a lane

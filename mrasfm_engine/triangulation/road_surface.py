@@ -1,37 +1,53 @@
-"""Surface of the road from points on it: local plane patches along the trajectory, each found by LO-RANSAC.
+"""Surface of the road from points on it: plane patches along the trajectory, and the relief on them.
 
-A single plane does not fit a hill, patches of about 12 m do. Each patch is fitted to the points around its centre, with
-more weight on near ones, and with a normal near that of its neighbours and near the vehicle's up. The weighted mean of
-the patches is the surface.
+A single plane does not fit a hill, patches of about 12 m do. Their weighted mean does not follow a speed bump, a crown
+or a parking bay; the relief, fitted to the points that are supported by those around them, does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from mrasfm_engine.geometry.height_plane import GATE_SIGMAS, HeightPlane, fit_height_plane
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.height_plane import GATE_SIGMAS
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.scene.road import RoadSurface, patch_weight
-from mrasfm_engine.types import Floats
+from mrasfm_engine.triangulation.road_patches import (
+    MIN_POINTS,
+    Patches,
+    RoadSample,
+    add_patches,
+    points_around,
+    refit,
+    thinned,
+)
+from mrasfm_engine.triangulation.road_relief import fit_relief
+from mrasfm_engine.triangulation.road_support import find_supported
+from mrasfm_engine.types import Bools, Floats, Ints
 
-SPACING = 0.75  # of patches' centres, in radii: neighbours overlap
-MIN_POINTS = 8  # of a patch, that agree with its plane
-LEVEL_M = 2.5  # points farther from where the road is expected are not of this patch's road
 ROUGHNESS_M = (0.008, 0.03)  # how uneven roads are, with what planes leave of their curvature: bounds
 FIRST_ROUGHNESS_M = 0.02
-STEP_M = 0.3  # of a patch's height against what its neighbours' planes say, at most
 ROUGHNESS_STEPS = 3
+RELIEF_ROUNDS = 2  # the second with the roughness that the first has left
 SURE_SHARE = 0.33  # of the points, those of the smallest uncertainty, which determine the roughness
-SIGMA_SLOPE_RIG = 0.05  # of the road's slope against the vehicle's
-MAX_SLOPE_RIG = 0.2
-SIGMA_SLOPE_NEIGHBOURS = 0.02  # of a patch's slope against its neighbours'
-MAX_SLOPE_NEIGHBOURS = 0.1
-MIN_SUPPORT = 0.15  # of a patch, of the weight of its points
 HEIGHT_BIN_M = 0.1
+MAX_SLOPE_CHANGE = 0.05  # of the road beyond its last patch
+# Patches are fitted to the most precise points of every square: hundreds of points tell a plane as well as thousands.
+THINNED_CELLS = 8  # a radius
+THINNED_POINTS = 2  # a square
+GROWN = 1.5  # times the points that a patch was found among: it is looked for anew
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownPatches:
+    """Patches of an earlier fit, each fixed to the unit nearest to it: poses may have moved since."""
+
+    unit: Ints  # (k,)
+    centre_in_rig_m: Floats  # (k, 3)
+    normal_in_rig: Floats  # (k, 3)
+    points: Ints  # (k,) among which each was found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,18 +55,14 @@ class FittedRoad:
     """The surface, and what was learnt about it on the way."""
 
     surface: RoadSurface
-    roughness_m: float  # standard deviation of the road about its patches
+    roughness_m: float  # standard deviation of the road about the surface
     rig_height_m: float  # of the rig's origin above the road
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Points:
-    """Points in the horizontal frame."""
-
-    xy: Floats
-    height: Floats
-    sigma: Floats  # of the height, from triangulation
-    tree: cKDTree
+    offset_m: Floats  # (n,) signed distances of the points from the surface; beyond its patches, from the nearest one
+    beyond_m: Floats  # (n,) how far beyond the patches they are
+    sigma_m: Floats  # (n,) of the surface at the points
+    supported: Bools  # (n,) points that agree with the road around them
+    patch: Ints  # (n,) -1 where there is none
+    known: KnownPatches
 
 
 def horizontal_axes(world_from_rig: Floats) -> Floats:
@@ -102,7 +114,11 @@ def fit_road(
     *,
     radius_m: float,
     rng: np.random.Generator,
+    max_offset_m: float = np.inf,
     rounds: int = 2,
+    units: Ints | None = None,
+    known: KnownPatches | None = None,
+    threads: int = 1,
 ) -> FittedRoad | None:
     """The surface through points of the road, robustly: half of them and more may be wrong.
 
@@ -114,8 +130,13 @@ def fit_road(
         The vehicle's poses (u, 4, 4), z up.
     radius_m
         Of a patch.
+    max_offset_m
+        From the road, beyond which a point is not supported however uncertain it is; see `largest_offset_m`.
     rounds
         Of fitting: after the first the roughness is known, and with it which points can be the road's.
+    units, known
+        Numbers (u,) of the poses' units, and patches of an earlier fit: they are fitted again from where they are, and
+        planes are searched for only where the road is new.
 
     Returns
     -------
@@ -123,23 +144,128 @@ def fit_road(
     """
     if len(points_m) < MIN_POINTS or not len(world_from_rig):
         return None
-    rig_height = rig_height_above(points_m, world_from_rig, reach_m=2 * radius_m)
+    axes = horizontal_axes(world_from_rig)
+    units = np.arange(len(world_from_rig)) if units is None else units
+    some = thinned(points_m @ axes.T, sigma_m, cell_m=radius_m / THINNED_CELLS, most=THINNED_POINTS)
+    points, sigma = points_m[some], sigma_m[some]
+    rig_height = rig_height_above(points, world_from_rig, reach_m=2 * radius_m)
     if rig_height is None:
         return None
-    axes = horizontal_axes(world_from_rig)
-    xyz = points_m @ axes.T
-    points = _Points(xy=xyz[:, :2], height=xyz[:, 2], sigma=sigma_m, tree=cKDTree(xyz[:, :2]))
+    sample = RoadSample.from_points(points @ axes.T, sigma)
     below = (world_from_rig[:, :3, 3] - rig_height * world_from_rig[:, :3, 2]) @ axes.T
     slopes = _slopes(world_from_rig[:, :3, 2] @ axes.T)
-    roughness, fitted = FIRST_ROUGHNESS_M, None
-    for _ in range(rounds):
-        fitted = _grow(points, below, slopes, axes, radius_m=radius_m, roughness_m=roughness, rng=rng)
-        if fitted is None:
+    patches = Patches(radius_m=radius_m)
+    if known is not None:
+        patches = _placed(known, sample, world_from_rig, units, axes, radius_m)
+    roughness, surface = FIRST_ROUGHNESS_M, None
+    for done in range(rounds):
+        if patches.centre:
+            patches = refit(sample, patches, roughness_m=roughness)
+        if not done or not patches.centre:
+            add_patches(sample, below, slopes, patches, roughness_m=roughness, rng=rng)
+        if not patches.centre:
             return None
-        fitted = _moved_by_residuals(points, points_m, fitted, roughness_m=roughness)
-        roughness = _roughness(points_m, sigma_m, fitted, roughness)
-    assert fitted is not None
-    return FittedRoad(surface=fitted, roughness_m=roughness, rig_height_m=rig_height)
+        surface = _moved_by_residuals(sample, points, _surface(patches, axes), roughness_m=roughness)
+        roughness = _roughness(surface.locate_on_patches(points)[0], sigma, roughness)
+    assert surface is not None
+    return _with_relief(
+        surface,
+        points_m,
+        sigma_m,
+        roughness_m=roughness,
+        rig_height_m=rig_height,
+        max_offset_m=max_offset_m,
+        known=_known(patches, surface, world_from_rig, units),
+        threads=threads,
+    )
+
+
+def largest_offset_m(wanted_m: float, roughness_m: float) -> float:
+    """Farthest that a point may be from the surface so that it is no farther than wanted from the road.
+
+    The road is off its surface by its roughness; where that is much, three times as much is the least.
+    """
+    return max(wanted_m - roughness_m, GATE_SIGMAS * roughness_m)
+
+
+def _with_relief(
+    surface: RoadSurface,
+    points_m: Floats,
+    sigma_m: Floats,
+    *,
+    roughness_m: float,
+    rig_height_m: float,
+    max_offset_m: float,
+    known: KnownPatches,
+    threads: int,
+) -> FittedRoad:
+    """The patches with the relief that the points say they have, and the points' distances to it."""
+    offset, patch = surface.locate_on_patches(points_m)
+    # Where no patch reaches, the nearest one is an estimate, the weaker the farther away.
+    alone, beyond = patch < 0, np.zeros(len(points_m))
+    offset[alone], beyond[alone] = surface.beyond(points_m[alone])
+    feet = surface.feet(points_m, offset)
+    sigma = np.hypot(sigma_m, MAX_SLOPE_CHANGE * beyond / GATE_SIGMAS)
+    height, uncertain = np.zeros(len(points_m)), np.zeros(len(points_m))
+    relief, supported = surface.relief, np.zeros(len(points_m), dtype=np.bool_)
+    # Until the relief is known, what the patches miss of the road's shape counts as its roughness.
+    for _ in range(RELIEF_ROUNDS):
+        most = largest_offset_m(max_offset_m, roughness_m) + MAX_SLOPE_CHANGE * beyond
+        supported = find_supported(feet, offset, sigma, most, roughness_m=roughness_m, threads=threads)
+        carries = supported & ~alone
+        relief = fit_relief(feet[carries], offset[carries], sigma[carries], roughness_m=roughness_m, threads=threads)
+        height, uncertain = relief.at(feet)
+        away = np.where(alone, offset, offset - height)
+        roughness_m = _roughness(np.where(alone, np.nan, away), sigma_m, roughness_m)
+    return FittedRoad(
+        surface=replace(surface, relief=relief),
+        roughness_m=roughness_m,
+        rig_height_m=rig_height_m,
+        offset_m=away,
+        beyond_m=beyond,
+        sigma_m=np.where(np.isfinite(uncertain), uncertain, 0.0),
+        supported=supported,
+        patch=patch,
+        known=known,
+    )
+
+
+def _surface(patches: Patches, axes: Floats) -> RoadSurface:
+    slope = np.stack(patches.slope)
+    normal = np.column_stack([-slope, np.ones(len(slope))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    centre = np.column_stack([np.stack(patches.centre), patches.offset])
+    return RoadSurface(axes=axes, centre_m=centre @ axes, normal=normal @ axes, radius_m=patches.radius_m)
+
+
+def _known(patches: Patches, surface: RoadSurface, world_from_rig: Floats, units: Ints) -> KnownPatches:
+    trajectory = world_from_rig[:, :3, 3] @ surface.axes.T
+    row = nearest(trajectory[:, :2], (surface.centre_m @ surface.axes.T)[:, :2])[1][:, 0]
+    rig_from_world = se3.inverse(world_from_rig[row])
+    return KnownPatches(
+        unit=units[row],
+        centre_in_rig_m=np.einsum("nij,nj->ni", rig_from_world[:, :3, :3], surface.centre_m) + rig_from_world[:, :3, 3],
+        normal_in_rig=np.einsum("nij,nj->ni", rig_from_world[:, :3, :3], surface.normal),
+        points=np.array(patches.points, dtype=np.int64),
+    )
+
+
+def _placed(
+    known: KnownPatches, sample: RoadSample, world_from_rig: Floats, units: Ints, axes: Floats, radius_m: float
+) -> Patches:
+    """Known patches where the poses of their units are now; without those whose points have become many more."""
+    place = np.full(max(int(units.max()), int(known.unit.max(initial=0))) + 1, -1, dtype=np.int64)
+    place[units] = np.arange(len(units))
+    row = place[known.unit]
+    pose = world_from_rig[row]
+    centre = (np.einsum("nij,nj->ni", pose[:, :3, :3], known.centre_in_rig_m) + pose[:, :3, 3]) @ axes.T
+    normal = np.einsum("nij,nj->ni", pose[:, :3, :3], known.normal_in_rig) @ axes.T
+    slope, patches = _slopes(normal), Patches(radius_m=radius_m)
+    if len(centre):
+        now = np.diff(points_around(sample.tree, centre[:, :2], radius_m)[0])
+        for n in np.flatnonzero((row >= 0) & (now <= GROWN * known.points)):
+            patches.append(centre[n, :2], float(centre[n, 2]), slope[n], int(known.points[n]))
+    return patches
 
 
 def _slopes(normal: Floats) -> Floats:
@@ -148,19 +274,18 @@ def _slopes(normal: Floats) -> Floats:
     return result
 
 
-def _roughness(points_m: Floats, sigma_m: Floats, surface: RoadSurface, roughness_m: float) -> float:
+def _roughness(distance_m: Floats, sigma_m: Floats, roughness_m: float) -> float:
     """Standard deviation of the road about the surface, from points whose own uncertainty is small.
 
     `roughness_m` is what it was taken for so far. Wrong points lie near the surface too: only those within the gate of
     the fit have a say, and the gate narrows with what they say.
     """
-    distance, _ = surface.locate(points_m)
     for _ in range(ROUGHNESS_STEPS):
-        near = np.flatnonzero(np.abs(distance) < GATE_SIGMAS * np.hypot(sigma_m, roughness_m))
+        near = np.flatnonzero(np.abs(distance_m) < GATE_SIGMAS * np.hypot(sigma_m, roughness_m))
         if len(near) < MIN_POINTS:
             return roughness_m
         sure = near[sigma_m[near] <= np.quantile(sigma_m[near], SURE_SHARE)]
-        variance = robust_sigma(distance[sure]) ** 2 - float(np.median(sigma_m[sure])) ** 2
+        variance = robust_sigma(distance_m[sure]) ** 2 - float(np.median(sigma_m[sure])) ** 2
         roughness_m = float(np.sqrt(np.clip(variance, ROUGHNESS_M[0] ** 2, ROUGHNESS_M[1] ** 2)))
     return roughness_m
 
@@ -170,179 +295,27 @@ def robust_sigma(values: Floats) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 
 
-@dataclass(kw_only=True)
-class _Patches:
-    """Patches found so far."""
-
-    centre: list[Floats]  # (2,)
-    offset: list[float]
-    slope: list[Floats]  # (2,)
-
-    def expected(self, at: Floats, reach_m: float) -> tuple[float, Floats] | None:
-        """Height and slope (2,) at a place by the patches around it, if there are any."""
-        if not self.centre:
-            return None
-        away = at - np.stack(self.centre)
-        weight = patch_weight(np.linalg.norm(away, axis=1), reach_m)
-        if not weight.any():
-            return None
-        slope = np.stack(self.slope)
-        height = np.array(self.offset) + (away * slope).sum(1)
-        # Of roads above one another the one that is nearest counts.
-        level = height[weight.argmax()]
-        weight = np.where(np.abs(height - level) < 0.5 * LEVEL_M, weight, 0.0) / weight.sum()
-        weight /= weight.sum()
-        return float(weight @ height), weight @ slope
-
-
-def _grow(
-    points: _Points,
-    below: Floats,
-    rig_slopes: Floats,
-    axes: Floats,
-    *,
-    radius_m: float,
-    roughness_m: float,
-    rng: np.random.Generator,
-) -> RoadSurface | None:
-    """Patches below the vehicle's trajectory first, best supported first, then outwards over the rest of the points."""
-    centres = _cover(below, SPACING * radius_m)
-    candidates = []
-    for n in centres:
-        plane = _fit(
-            points, below[n], rig_slopes[n], SIGMA_SLOPE_RIG, MAX_SLOPE_RIG, radius_m, roughness_m=roughness_m, rng=rng
-        )
-        if plane is not None:
-            candidates.append((plane.support * plane.inliers.sum(), n, plane))
-    patches = _Patches(centre=[], offset=[], slope=[])
-    for _, n, plane in sorted(candidates, key=lambda c: -c[0]):
-        known = patches.expected(below[n, :2], 2 * radius_m)
-        final: HeightPlane | None = plane
-        if known is not None and abs(known[0] - below[n, 2]) < LEVEL_M:
-            at = np.append(below[n, :2], known[0])
-            final = _beside(points, at, known[1], radius_m, roughness_m=roughness_m, rng=rng)
-        if final is not None:
-            _append(patches, below[n, :2], final)
-    if not patches.centre:
-        return None
-    _spread(points, patches, radius_m, roughness_m=roughness_m, rng=rng)
-    slope = np.stack(patches.slope)
-    normal = np.column_stack([-slope, np.ones(len(slope))])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    centre = np.column_stack([np.stack(patches.centre), patches.offset])
-    return RoadSurface(axes=axes, centre_m=centre @ axes, normal=normal @ axes, radius_m=radius_m)
-
-
-def _moved_by_residuals(points: _Points, points_m: Floats, surface: RoadSurface, *, roughness_m: float) -> RoadSurface:
+def _moved_by_residuals(
+    sample: RoadSample, points_m: Floats, surface: RoadSurface, *, roughness_m: float
+) -> RoadSurface:
     """The surface with every patch moved by the mean residual of its points, along its normal.
 
     Planes cut through crests and span dips. What they leave of a road's curvature is the same all over a patch, so that
     its points tell it (twicing; Tukey, Exploratory Data Analysis, 1977).
     """
-    distance, _ = surface.locate(points_m)
-    gate = GATE_SIGMAS * np.hypot(points.sigma, roughness_m)
+    distance, _ = surface.locate_on_patches(points_m)
+    gate = GATE_SIGMAS * np.hypot(sample.sigma, roughness_m)
     near = np.abs(distance) < gate
-    information = 1.0 / (points.sigma**2 + roughness_m**2)
-    moved = surface.centre_m.copy()
-    for n, centre in enumerate(surface.centre_m @ surface.axes.T):
-        rows = np.array(points.tree.query_ball_point(centre[:2], surface.radius_m), dtype=np.int64)
-        rows = rows[near[rows]]
-        if len(rows) < MIN_POINTS:
-            continue
-        weight = patch_weight(np.hypot(*(points.xy[rows] - centre[:2]).T), surface.radius_m) * information[rows]
-        # Tukey's weights, as in the fit: points near the gate are as likely wrong as right.
-        weight *= (1.0 - (distance[rows] / gate[rows]) ** 2) ** 2
-        moved[n] += surface.normal[n] * float(weight @ distance[rows] / weight.sum())
-    return replace(surface, centre_m=moved)
-
-
-def _append(patches: _Patches, xy: Floats, plane: HeightPlane) -> None:
-    patches.centre.append(xy)
-    patches.offset.append(plane.offset_m)
-    patches.slope.append(plane.slope)
-
-
-def _cover(xyz: Floats, spacing_m: float) -> Sequence[int]:
-    """Choose places (n, 3), in their order, at least the spacing from all chosen before, or on another level."""
-    chosen: list[int] = []
-    for n in range(len(xyz)):
-        away = xyz[chosen] - xyz[n]
-        if not ((np.hypot(away[:, 0], away[:, 1]) < spacing_m) & (np.abs(away[:, 2]) < LEVEL_M)).any():
-            chosen.append(n)
-    return chosen
-
-
-def _spread(
-    points: _Points, patches: _Patches, radius_m: float, *, roughness_m: float, rng: np.random.Generator
-) -> None:
-    """Add patches over points that none reaches yet, each next to a known one: ahead of it, in side streets."""
-    reach = nearest(np.stack(patches.centre), points.xy)[0][:, 0]
-    tried = np.zeros(len(reach), dtype=np.bool_)
-    while True:
-        open_points = np.flatnonzero(~tried & (reach >= SPACING * radius_m) & (reach < 1.5 * radius_m))
-        if not len(open_points):
-            return
-        n = open_points[reach[open_points].argmin()]
-        at = points.xy[n]
-        known = patches.expected(at, 2 * radius_m)
-        assert known is not None  # a patch is within one and a half radii
-        plane = _beside(points, np.append(at, known[0]), known[1], radius_m, roughness_m=roughness_m, rng=rng)
-        if plane is None:
-            tried[np.hypot(*(points.xy - at).T) < 0.25 * radius_m] = True
-            continue
-        _append(patches, at, plane)
-        reach = np.minimum(reach, np.hypot(*(points.xy - at).T))
-
-
-def _beside(
-    points: _Points, at: Floats, slope: Floats, radius_m: float, *, roughness_m: float, rng: np.random.Generator
-) -> HeightPlane | None:
-    """A patch at a place (3,) whose height and slope are expected from its neighbours: no road has steps."""
-    plane = _fit(
-        points,
-        at,
-        slope,
-        SIGMA_SLOPE_NEIGHBOURS,
-        MAX_SLOPE_NEIGHBOURS,
-        radius_m,
-        roughness_m=roughness_m,
-        rng=rng,
-        level_m=STEP_M + MAX_SLOPE_NEIGHBOURS * radius_m,
+    # Tukey's weights, as in the fit: points near the gate are as likely wrong as right.
+    share = np.where(near, (1.0 - (np.where(near, distance, 0.0) / gate) ** 2) ** 2, 0.0)
+    share /= sample.sigma**2 + roughness_m**2
+    centre = (surface.centre_m @ surface.axes.T)[:, :2]
+    first, rows = points_around(sample.tree, centre, surface.radius_m)
+    owner = np.repeat(np.arange(len(centre)), np.diff(first))
+    rows, owner = rows[near[rows]], owner[near[rows]]
+    weight = patch_weight(np.hypot(*(sample.xy[rows] - centre[owner]).T), surface.radius_m) * share[rows]
+    total, moved, count = (
+        np.bincount(owner, of, minlength=len(centre)) for of in (weight, weight * distance[rows], np.ones(len(rows)))
     )
-    return plane if plane is not None and abs(plane.offset_m - at[2]) < STEP_M else None
-
-
-def _fit(
-    points: _Points,
-    at: Floats,
-    slope: Floats,
-    sigma_slope: float,
-    max_slope_change: float,
-    radius_m: float,
-    *,
-    roughness_m: float,
-    rng: np.random.Generator,
-    level_m: float = LEVEL_M,
-) -> HeightPlane | None:
-    """The plane at a place (3,) where the road is expected; None where less than MIN_SUPPORT of the points agree.
-
-    Points farther than `level_m` from the expected level are left out.
-    """
-    rows = np.array(points.tree.query_ball_point(at[:2], radius_m), dtype=np.int64)
-    if len(rows) < MIN_POINTS:
-        return None
-    local = points.xy[rows] - at[:2]
-    level = np.abs(points.height[rows] - at[2] - local @ slope) < level_m
-    rows, local = rows[level], local[level]
-    plane = fit_height_plane(
-        local,
-        points.height[rows],
-        np.hypot(points.sigma[rows], roughness_m),
-        patch_weight(np.hypot(*local.T), radius_m),
-        expected_slope=slope,
-        sigma_slope=sigma_slope,
-        max_slope_change=max_slope_change,
-        min_points=MIN_POINTS,
-        rng=rng,
-    )
-    return plane if plane is not None and plane.support >= MIN_SUPPORT else None
+    step = np.where(count >= MIN_POINTS, moved / np.maximum(total, 1e-12), 0.0)
+    return replace(surface, centre_m=surface.centre_m + step[:, None] * surface.normal)

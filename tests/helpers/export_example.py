@@ -11,6 +11,7 @@ import pycolmap
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
+from mrasfm_engine.scene.road_relief import Relief
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import ROAD
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
@@ -156,6 +157,12 @@ def scene_with_road(*, far: bool = False) -> Scene:
         centre_m=np.array([[2.0, 0.0, -1.5], [8.0, 0.0, -1.5]]),
         normal=np.tile([0.0, 0.0, 1.0], (2, 1)),
         radius_m=8.0,
+        relief=Relief(
+            node_m=np.array([[4.5, 0.5, -1.5], [5.5, -0.5, -1.5]]),
+            height_m=np.array([0.02, -0.01]),
+            slope=np.array([[0.01, -0.02], [0.0, 0.005]]),
+            sigma_m=np.array([0.005, 0.007]),
+        ),
     )
     shift = np.array([0.0, 0.0, off_m])
     before = np.concatenate([points[:20], points[:20] + shift, points[:20] - shift])

@@ -34,6 +34,22 @@ def test_the_road_is_written_with_the_scene(tmp_path: Path, monkeypatch: pytest.
     assert {p.name for p in out.iterdir()} == FILES
 
 
+def test_the_surface_is_computed_from_the_file_as_it_says(tmp_path: Path) -> None:
+    scene = scene_with_road()
+    assert scene.road is not None
+    write_scene(scene, tmp_path / "scene", {})
+    document = json.loads((tmp_path / "scene" / "road.json").read_text())
+    axes, relief = np.array(document["axes"]), document["relief"]
+    for x, y in ((5.0, 0.0), (4.2, 0.9), (2.0, 1.0), (7.7, -0.4)):
+        away = np.array([x, y]) - np.array(relief["node_m"])[:, :2]
+        weight = np.maximum(1 - (away**2).sum(1) / relief["radius_m"] ** 2, 0.0) ** 2
+        value = np.array(relief["height_m"]) + (away * np.array(relief["slope"])).sum(1)
+        height = (weight * value).sum() / (weight.sum() + 0.05)
+        distance, _ = scene.road.surface.locate(np.array([[x, y, -1.5 + height]]) @ axes)
+        assert distance == pytest.approx([0.0], abs=2e-4)
+        assert (height != 0.0) == (x != 7.7 and x != 2.0)
+
+
 @pytest.mark.parametrize("name", ["point_classes", "point_patches"])
 def test_a_ply_with_other_classes_or_patches_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
@@ -46,10 +62,18 @@ def test_a_ply_with_other_classes_or_patches_is_refused(
     assert_nothing_published(tmp_path / "scene")
 
 
-def test_a_road_file_that_says_something_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("part", ["patches", "relief"])
+def test_a_road_file_that_says_something_else_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
     scene, original = scene_with_road(), road.road_document
     assert scene.road is not None
-    surface = replace(scene.road.surface, centre_m=scene.road.surface.centre_m + 0.01)
+    surface = scene.road.surface
+    surface = (
+        replace(surface, centre_m=surface.centre_m + 0.01)
+        if part == "patches"
+        else replace(surface, relief=replace(surface.relief, height_m=surface.relief.height_m + 0.001))
+    )
     wrong = replace(scene, road=replace(scene.road, surface=surface))
     monkeypatch.setattr(road, "road_document", lambda _: original(wrong))
     with pytest.raises(MrasfmError, match=r"road\.json was written but does not read back"):

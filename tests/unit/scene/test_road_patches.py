@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mrasfm_engine.scene.road import RoadSurface, Thickness
+from mrasfm_engine.scene.road_relief import Relief
 
 
 def ramp_surface() -> RoadSurface:
@@ -54,6 +57,31 @@ def test_roads_above_one_another() -> None:
     distance, patch = surface.locate(np.array([[0.5, 0.0, 0.1], [0.5, 0.0, 4.8]]))
     assert distance == pytest.approx([0.1, -0.2])
     assert patch.tolist() == [0, 1]
+
+
+def test_the_relief_lies_on_the_patches_and_fades_out() -> None:
+    """On the ramp, 10 cm high and level along it; where no node is near, there are the patches alone."""
+    node = np.array([[10.0, 0.0, 1.0], [11.0, 0.0, 1.1], [10.5, 0.8, 1.05]])
+    relief = Relief(node_m=node, height_m=np.full(3, 0.1), slope=np.zeros((3, 2)), sigma_m=np.full(3, 0.01))
+    surface = replace(ramp_surface(), relief=relief)
+    x = np.linspace(10, 18, 81)
+    points = np.column_stack([x, 0.2 + 0 * x, 0.1 * x])
+    offset = ramp_surface().locate(points)[0] - surface.locate(points)[0]
+    assert offset[5] == pytest.approx(0.1, rel=0.05)
+    assert np.abs(offset[x > 13.0]).max() == 0.0
+    assert 0 < np.abs(np.diff(offset)).max() < 0.03
+    height, sigma = relief.at(surface.feet(points, surface.locate_on_patches(points)[0]))
+    assert sigma[0] == pytest.approx(0.01)
+    assert np.isnan(sigma[-1])
+    assert height[-1] == 0.0
+
+
+def test_a_relief_belongs_to_its_own_level() -> None:
+    relief = Relief(
+        node_m=np.array([[0.0, 0.0, 0.0]]), height_m=np.array([0.1]), slope=np.zeros((1, 2)), sigma_m=np.array([0.01])
+    )
+    height, _ = relief.at(np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 5.0]]))
+    assert height == pytest.approx([0.1 / 1.05, 0.0])
 
 
 def test_thickness() -> None:
