@@ -15,13 +15,7 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from mrasfm_engine.triangulation.road_prior import points_below_trajectory, standing_is_impossible
-from mrasfm_engine.triangulation.road_surface import (
-    MAX_SLOPE_CHANGE,
-    FittedRoad,
-    KnownPatches,
-    fit_road,
-    largest_offset_m,
-)
+from mrasfm_engine.triangulation.road_surface import FittedRoad, KnownPatches, fit_road
 from mrasfm_engine.triangulation.triangulate import cam_from_world
 from mrasfm_engine.triangulation.uncertainty import point_covariances
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -94,9 +88,8 @@ def assess_road(mapper: Mapper, *, for_map: bool, known: KnownPatches | None = N
     )
     if fitted is None:
         return f"{len(tracks)} points of the road are too few, or lie on no surface"
-    limit = config.road_sigmas * np.sqrt(sigma**2 + fitted.roughness_m**2 + fitted.sigma_m**2)
-    limit = np.minimum(limit, largest_offset_m(max_offset_m, fitted.roughness_m))
-    off = (np.abs(fitted.offset_m) > limit + MAX_SLOPE_CHANGE * fitted.beyond_m) & ~fitted.supported
+    limit = fitted.limits_m(sigma, sigmas=config.road_sigmas, max_offset_m=max_offset_m)
+    off = fitted.off(limit)
     distance = np.where(fitted.patch < 0, np.nan, fitted.offset_m)
     if source is RoadSource.GEOMETRY:
         off &= standing_is_impossible(points, distance, world_from_rig)

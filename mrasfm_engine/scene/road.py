@@ -56,13 +56,13 @@ class RoadSurface:
         feet[:, 2] -= distance_m
         return feet
 
-    def locate_on_patches(self, points_m: Floats) -> tuple[Floats, Ints]:
+    def locate_on_patches(self, points_m: Floats, *, threads: int = 1) -> tuple[Floats, Ints]:
         """As `locate`, without the relief."""
         distance, patch = np.full(len(points_m), np.nan), np.full(len(points_m), -1, dtype=np.int64)
         if not len(self) or not len(points_m):
             return distance, patch
         xyz, centre, normal = points_m @ self.axes.T, self.centre_m @ self.axes.T, self.normal @ self.axes.T
-        reach, near = nearest(centre[:, :2], xyz[:, :2], count=NEIGHBOURS, within_m=self.radius_m)
+        reach, near = nearest(centre[:, :2], xyz[:, :2], count=NEIGHBOURS, within_m=self.radius_m, threads=threads)
         found = np.isfinite(reach)
         # Distances to the patches' planes along their normals.
         offset = np.where(found, ((xyz[:, None] - centre[near]) * normal[near]).sum(2), np.inf)

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from mrasfm_engine.types import Floats
 
-BLEND_M = 2.0  # from a node, up to which it counts
-BLENDED = 16  # nearest nodes that count at one place
+BLEND_M = 2.0  # from a node, up to which it counts: there is one for every square metre
+BLENDED = 12  # nearest nodes that count at one place
 NO_RELIEF = 0.05  # weight of no relief at all: where no node is near, the relief fades out
 LEVEL_M = 1.0  # nodes farther above or below belong to other roads
 
@@ -40,7 +40,7 @@ class Relief:
     def _kd_tree(self) -> cKDTree:
         return cKDTree(self.node_m)
 
-    def at(self, foot_m: Floats) -> tuple[Floats, Floats]:
+    def at(self, foot_m: Floats, *, threads: int = 1) -> tuple[Floats, Floats]:
         """Heights (p,) above the patches at places (p, 3) on them, and their standard deviations (p,).
 
         Where no node is near, the height is zero and its standard deviation NaN.
@@ -49,7 +49,8 @@ class Relief:
         if not len(self) or not len(foot_m):
             return height, sigma
         count = min(BLENDED, len(self))
-        found = self._kd_tree.query(foot_m, k=count, distance_upper_bound=float(np.hypot(BLEND_M, LEVEL_M)))
+        reach_m = float(np.hypot(BLEND_M, LEVEL_M))
+        found = self._kd_tree.query(foot_m, k=count, distance_upper_bound=reach_m, workers=threads)
         distance, node = (np.asarray(a).reshape(len(foot_m), count) for a in found)
         node = np.where(np.isfinite(distance), node, 0)
         away = foot_m[:, None] - self.node_m[node]

@@ -30,9 +30,11 @@ def fit_relief(foot_m: Floats, offset_m: Floats, sigma_m: Floats, *, roughness_m
     if not len(foot_m):
         return Relief.none()
     cell = np.floor(foot_m / [NODE_M, NODE_M, LEVELS_M]).astype(np.int64)
-    cells, member = np.unique(cell, axis=0, return_inverse=True)
-    counts = np.bincount(member.ravel(), minlength=len(cells)).clip(1)
-    node = np.column_stack([np.bincount(member.ravel(), foot_m[:, k], minlength=len(cells)) / counts for k in range(3)])
+    cell -= cell.min(axis=0)
+    rows, columns = cell[:, 1].max() + 1, cell[:, 2].max() + 1
+    cells, member = np.unique((cell[:, 0] * rows + cell[:, 1]) * columns + cell[:, 2], return_inverse=True)
+    counts = np.bincount(member, minlength=len(cells))
+    node = np.column_stack([np.bincount(member, foot_m[:, k], minlength=len(cells)) / counts for k in range(3)])
     found = cKDTree(foot_m).query(node, k=min(NEAREST, len(foot_m)), distance_upper_bound=REACH_M, workers=threads)
     away = np.asarray(found[0], dtype=np.float64).reshape(len(node), -1)
     row: Ints = np.where(np.isfinite(away), np.asarray(found[1]).reshape(away.shape), 0).astype(np.int64)

@@ -64,6 +64,16 @@ class FittedRoad:
     patch: Ints  # (n,) -1 where there is none
     known: KnownPatches
 
+    def limits_m(self, sigma_m: Floats, *, sigmas: float, max_offset_m: float) -> Floats:
+        """Distances (n,) from the surface that points of these standard deviations may have, by themselves."""
+        limit: Floats = sigmas * np.sqrt(sigma_m**2 + self.roughness_m**2 + self.sigma_m**2)
+        return np.minimum(limit, largest_offset_m(max_offset_m, self.roughness_m))
+
+    def off(self, limit_m: Floats) -> Bools:
+        """Points (n,) beyond their limits that those around them do not support either."""
+        away: Bools = np.abs(self.offset_m) > limit_m + MAX_SLOPE_CHANGE * self.beyond_m
+        return away & ~self.supported
+
 
 def horizontal_axes(world_from_rig: Floats) -> Floats:
     """Rows (3, 3): two horizontal axes and up, from the mean up direction of vehicle poses (n, 4, 4)."""
@@ -172,6 +182,7 @@ def fit_road(
         surface,
         points_m,
         sigma_m,
+        sample=some,
         roughness_m=roughness,
         rig_height_m=rig_height,
         max_offset_m=max_offset_m,
@@ -193,35 +204,39 @@ def _with_relief(
     points_m: Floats,
     sigma_m: Floats,
     *,
+    sample: Ints,
     roughness_m: float,
     rig_height_m: float,
     max_offset_m: float,
     known: KnownPatches,
     threads: int,
 ) -> FittedRoad:
-    """The patches with the relief that the points say they have, and the points' distances to it."""
-    offset, patch = surface.locate_on_patches(points_m)
+    """The patches with the relief that the points say they have, and the points' distances to it.
+
+    The roughness is told by the sample of the points.
+    """
+    offset, patch = surface.locate_on_patches(points_m, threads=threads)
     # Where no patch reaches, the nearest one is an estimate, the weaker the farther away.
     alone, beyond = patch < 0, np.zeros(len(points_m))
     offset[alone], beyond[alone] = surface.beyond(points_m[alone])
     feet = surface.feet(points_m, offset)
     sigma = np.hypot(sigma_m, MAX_SLOPE_CHANGE * beyond / GATE_SIGMAS)
-    height, uncertain = np.zeros(len(points_m)), np.zeros(len(points_m))
     relief, supported = surface.relief, np.zeros(len(points_m), dtype=np.bool_)
     # Until the relief is known, what the patches miss of the road's shape counts as its roughness.
+    sample = sample[~alone[sample]]
     for _ in range(RELIEF_ROUNDS):
         most = largest_offset_m(max_offset_m, roughness_m) + MAX_SLOPE_CHANGE * beyond
         supported = find_supported(feet, offset, sigma, most, roughness_m=roughness_m, threads=threads)
         carries = supported & ~alone
         relief = fit_relief(feet[carries], offset[carries], sigma[carries], roughness_m=roughness_m, threads=threads)
-        height, uncertain = relief.at(feet)
-        away = np.where(alone, offset, offset - height)
-        roughness_m = _roughness(np.where(alone, np.nan, away), sigma_m, roughness_m)
+        height, _ = relief.at(feet[sample], threads=threads)
+        roughness_m = _roughness(offset[sample] - height, sigma_m[sample], roughness_m)
+    height, uncertain = relief.at(feet, threads=threads)
     return FittedRoad(
         surface=replace(surface, relief=relief),
         roughness_m=roughness_m,
         rig_height_m=rig_height_m,
-        offset_m=away,
+        offset_m=offset - np.where(alone, 0.0, height),
         beyond_m=beyond,
         sigma_m=np.where(np.isfinite(uncertain), uncertain, 0.0),
         supported=supported,

@@ -7,7 +7,7 @@
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
-| 6 | the road under moving shadows, and of a real drive on held-out images, with and without semantics |
+| 6 | the road: bumps and bays; under moving shadows, and of a real drive on held-out images, with and without semantics |
 | 7 | covered cameras: their images' poses, and what is left without camera set registration |
 | 8 | a camera with a wrong extrinsic; what a straight street lets a drive observe |
 | 9 | cameras that are not simultaneous, against the same drive with cameras that are |
@@ -63,6 +63,7 @@ from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
+from tests.benchmarks.road_shapes import road_shapes
 from tests.benchmarks.seam_graphs import seam_graphs
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
@@ -93,7 +94,7 @@ LINES = {
     "3": Line(by_seed=(rendered, rendered_loop)),
     "4": Line(timed=(fresh_clone,)),
     "5": Line(timed=(service,)),
-    "6": Line(by_seed=(shadowed_road,), untimed=(real_road,)),
+    "6": Line(timed=(road_shapes,), by_seed=(shadowed_road,), untimed=(real_road,)),
     "7": Line(by_seed=(occlusion,)),
     "8": Line(by_seed=(recalibration, straight_street)),
     "9": Line(by_seed=(motion,)),

@@ -45,7 +45,7 @@ from tests.benchmarks.table import Figure
 SIZE = ("--cameras", 6, "--units", 20, "--width", 640, "--height", 360, "--spacing-m", 1.6)
 RAMP_PERCENT = 6
 LEVEL_SEED = 1  # its street is measured without the ramp as well
-HARD = ("--moving-shadows", 190, "--tight")
+HARD = ("--moving-shadows", 240, "--tight")
 OFF = "[mapping]\nsemantic_triangulation = false\n"
 BAD_M = 0.05
 WRONG_PX = 3.0  # a match is wrong where the true road point of one end is farther from the other

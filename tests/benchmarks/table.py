@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -53,6 +54,14 @@ def exactly(line: str, what: str, value: int, expected: int) -> Figure:
 def failed(line: str, what: str, why: str) -> Figure:
     """A figure that could not be measured."""
     return Figure(line=line, what=what, value=math.nan, most=math.inf, remark=why)
+
+
+def reference_loop_s() -> float:
+    """Seconds that ten million additions take here and now."""
+    started_s, total = time.perf_counter(), 0
+    for number in range(10_000_000):
+        total += number
+    return time.perf_counter() - started_s
 
 
 def show(figures: Sequence[Figure], console: Console) -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pytest
@@ -12,13 +11,12 @@ from mrasfm_engine.triangulation.road_surface import (
     FittedRoad,
     KnownPatches,
     fit_road,
-    largest_offset_m,
     most_frequent,
     rig_height_above,
 )
+from tests.helpers.road_shapes import SHAPES, bump
 
 Profile = Callable[[np.ndarray], np.ndarray]
-Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
 LENGTH_M = 60.0
 NOISE_M = 0.01
 
@@ -117,43 +115,27 @@ def test_kerbs_that_masks_call_road_do_not_lift_the_lane() -> None:
 
 def is_on(road: FittedRoad) -> np.ndarray:
     """Points (n,) that the road has, as the mapping judges them."""
-    limit = min(3 * np.hypot(NOISE_M, road.roughness_m), largest_offset_m(0.05, road.roughness_m))
-    on: np.ndarray = road.supported | (np.abs(road.offset_m) <= limit)
-    return on
-
-
-def bump(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A speed bump of 10 cm over 4 m of the way."""
-    away = np.abs(x - 30.0)
-    return np.where(away < 2.0, 0.05 * (1 + np.cos(np.pi * away / 2.0)), 0.0) + 0 * y
-
-
-def bay(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A parking bay behind a kerb of 12 cm."""
-    return np.where((np.abs(x - 26.0) < 6.0) & (y > 2.5), 0.12, 0.0)
-
-
-def crown(x: np.ndarray, y: np.ndarray, *, share: float = 0.035) -> np.ndarray:
-    """A road that falls to both sides."""
-    return -share * np.abs(y) + 0 * x
+    limit = road.limits_m(np.full(len(road.offset_m), NOISE_M), sigmas=3.0, max_offset_m=0.05)
+    return ~road.off(limit)
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.2])
 @pytest.mark.parametrize("a_square_metre", [2, 10])
-@pytest.mark.parametrize("shape", [bump, bay, crown, partial(crown, share=0.025)])
-def test_bumps_bays_and_crowns_are_the_road(shape: Shape, a_square_metre: int, wrong_share: float) -> None:
+@pytest.mark.parametrize("shape", SHAPES)
+def test_bumps_bays_and_crowns_are_the_road(shape: str, a_square_metre: int, wrong_share: float) -> None:
     """Of the points that the shape moves, at most 3 % are off, 5 % beside wrong ones; of those, most are."""
     lost, left = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed + 100)
         points = road_points(level, a_square_metre * 700, seed=seed)
-        points[:, 2] += shape(points[:, 0], points[:, 1])
+        raised_m = SHAPES[shape](points[:, 0], points[:, 1])
+        points[:, 2] += raised_m
         wrong = rng.random(len(points)) < wrong_share
         points[wrong, 2] += rng.choice([-1, 1], int(wrong.sum())) * rng.uniform(0.1, 0.8, int(wrong.sum()))
         road = fit(points, poses(level, 1.5), max_offset_m=0.05)
         assert road is not None
         on = is_on(road)
-        moved = np.abs(shape(points[:, 0], points[:, 1])) > 0
+        moved = raised_m != 0
         lost.append((~on)[moved & ~wrong].mean())
         left.append(on[wrong].mean() if wrong.any() else 0.0)
     assert 0 <= np.mean(lost) <= (0.05 if wrong_share else 0.03)
