@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numba import njit
 
-from mrasfm_engine.types import Floats
+from mrasfm_engine.parallel import in_ranges
+from mrasfm_engine.types import Floats, Ints
 
-BLEND_M = 2.0  # from a node, up to which it counts: there is one for every square metre
-BLENDED = 12  # nearest nodes that count at one place
+NODE_M = 1.0  # between nodes: a speed bump is some metres long
+BLEND_M = 2.0  # from a node, up to which it counts
 NO_RELIEF = 0.05  # weight of no relief at all: where no node is near, the relief fades out
 LEVEL_M = 1.0  # nodes farther above or below belong to other roads
 
@@ -36,30 +39,52 @@ class Relief:
         """No nodes: the patches alone are the surface."""
         return Relief(node_m=np.zeros((0, 3)), height_m=np.zeros(0), slope=np.zeros((0, 2)), sigma_m=np.zeros(0))
 
-    @cached_property
-    def _kd_tree(self) -> cKDTree:
-        return cKDTree(self.node_m)
-
     def at(self, foot_m: Floats, *, threads: int = 1) -> tuple[Floats, Floats]:
         """Heights (p,) above the patches at places (p, 3) on them, and their standard deviations (p,).
 
         Where no node is near, the height is zero and its standard deviation NaN.
         """
         height, sigma = np.zeros(len(foot_m)), np.full(len(foot_m), np.nan)
-        if not len(self) or not len(foot_m):
-            return height, sigma
-        count = min(BLENDED, len(self))
-        reach_m = float(np.hypot(BLEND_M, LEVEL_M))
-        found = self._kd_tree.query(foot_m, k=count, distance_upper_bound=reach_m, workers=threads)
-        distance, node = (np.asarray(a).reshape(len(foot_m), count) for a in found)
-        node = np.where(np.isfinite(distance), node, 0)
-        away = foot_m[:, None] - self.node_m[node]
-        counts = np.isfinite(distance) & (np.abs(away[..., 2]) < LEVEL_M)
-        reach = np.minimum((away[..., 0] ** 2 + away[..., 1] ** 2) / BLEND_M**2, 1.0)
-        weight = np.where(counts, (1.0 - reach) ** 2, 0.0)
-        value = self.height_m[node] + (away[..., :2] * self.slope[node]).sum(2)
-        total = weight.sum(1)
-        height = (weight * value).sum(1) / (total + NO_RELIEF)
-        some = total > 0
-        sigma[some] = (weight * self.sigma_m[node]).sum(1)[some] / total[some]
+        if len(self):
+            in_ranges(threads, len(foot_m), partial(_at, *self._by_square, foot_m, height, sigma))
         return height, sigma
+
+    @cached_property
+    def _by_square(self) -> tuple[Ints, Ints, int, Floats]:
+        """Squares of NODE_M with nodes, in the order of their numbers: the numbers (n,), of a corner (2,) and a row.
+
+        And what the nodes are (n, 7): position, height, slope, standard deviation.
+        """
+        square = np.floor(self.node_m[:, :2] / NODE_M).astype(np.int64)
+        corner = square.min(axis=0)
+        row = int(square[:, 1].max() - corner[1]) + 1
+        number = (square[:, 0] - corner[0]) * row + square[:, 1] - corner[1]
+        order = np.argsort(number, kind="stable")
+        nodes = np.column_stack([self.node_m, self.height_m, self.slope, self.sigma_m])
+        return number[order], corner, row, np.ascontiguousarray(nodes[order])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _at(number: Any, corner: Any, row: int, node: Any, foot: Any, height: Any, sigma: Any, lo: int, hi: int) -> None:
+    """Heights and standard deviations at places lo to hi; the nodes around each are runs of squares, one by column."""
+    reach = math.ceil(BLEND_M / NODE_M)
+    for i in range(lo, hi):
+        x, y, z = foot[i, 0], foot[i, 1], foot[i, 2]
+        column, line = math.floor(x / NODE_M) - corner[0], math.floor(y / NODE_M) - corner[1]
+        first, last = max(line - reach, 0), min(line + reach, row - 1)
+        total, value, deviation = 0.0, 0.0, 0.0
+        for c in range(column - reach, column + reach + 1):
+            if c < 0 or first > last:
+                continue
+            n = np.searchsorted(number, c * row + first)
+            while n < len(number) and number[n] <= c * row + last:
+                dx, dy = x - node[n, 0], y - node[n, 1]
+                far = (dx * dx + dy * dy) / (BLEND_M * BLEND_M)
+                if far < 1.0 and abs(z - node[n, 2]) < LEVEL_M:
+                    w = (1.0 - far) ** 2
+                    total += w
+                    value += w * (node[n, 3] + dx * node[n, 4] + dy * node[n, 5])
+                    deviation += w * node[n, 6]
+                n += 1
+        if total > 0.0:
+            height[i], sigma[i] = value / (total + NO_RELIEF), deviation / total

@@ -11,10 +11,9 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.parallel import in_ranges
-from mrasfm_engine.scene.road_relief import Relief
+from mrasfm_engine.scene.road_relief import NODE_M, Relief
 from mrasfm_engine.types import Floats, Ints
 
-NODE_M = 1.0  # between nodes: a speed bump is some metres long
 LEVELS_M = 4.0  # of height that share a node: roads above one another are farther apart
 NEAREST = 24  # points that a node's plane is fitted to: they leave a tenth of a point's noise in its two slopes
 REACH_M = 3.0
