@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
+from typing import Any
 
 import numpy as np
+from numba import njit
 
 from mrasfm_engine.geometry.neighbours import nearest
+from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.road_relief import Relief
 from mrasfm_engine.types import Bools, Floats, Ints
 
 SAME_LEVEL_M = 1.0  # patches farther apart in height are of different roads, above one another
 NEIGHBOURS = 12  # nearest patches that count at one place
+SMALLEST_WEIGHT = 1e-9  # of a patch within its radius: no point there is without one
 
 
 class RoadSource(StrEnum):
@@ -63,17 +68,8 @@ class RoadSurface:
             return distance, patch
         xyz, centre, normal = points_m @ self.axes.T, self.centre_m @ self.axes.T, self.normal @ self.axes.T
         reach, near = nearest(centre[:, :2], xyz[:, :2], count=NEIGHBOURS, within_m=self.radius_m, threads=threads)
-        found = np.isfinite(reach)
-        # Distances to the patches' planes along their normals.
-        offset = np.where(found, ((xyz[:, None] - centre[near]) * normal[near]).sum(2), np.inf)
-        level = offset[np.arange(len(xyz)), np.abs(offset).argmin(1)]
-        level = np.where(np.isfinite(level), level, 0.0)
-        same = found & (np.abs(offset - level[:, None]) < SAME_LEVEL_M)
-        weight = np.where(same, patch_weight(reach, self.radius_m), 0.0)
-        total = weight.sum(1)
-        inside = total > 0
-        distance[inside] = (weight * np.where(same, offset, 0.0)).sum(1)[inside] / total[inside]
-        patch[inside] = near[inside, weight[inside].argmax(1)]
+        known = (xyz, centre, normal, reach, near, self.radius_m)
+        in_ranges(threads, len(xyz), partial(_blend, *known, distance, patch))
         return distance, patch
 
     def beyond(self, points_m: Floats) -> tuple[Floats, Floats]:
@@ -90,8 +86,47 @@ class RoadSurface:
 def patch_weight(reach_m: Floats, radius_m: float) -> Floats:
     """Weight of a patch at a horizontal distance from its centre: 1 there, 0 from its radius on."""
     scaled = np.minimum(np.where(np.isfinite(reach_m), reach_m, radius_m) / radius_m, 1.0)
-    result: Floats = np.maximum((1.0 - scaled**2) ** 2, 1e-9) * (scaled < 1.0)
+    result: Floats = np.maximum((1.0 - scaled**2) ** 2, SMALLEST_WEIGHT) * (scaled < 1.0)
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(
+    xyz: Any,
+    centre: Any,
+    normal: Any,
+    reach: Any,
+    near: Any,
+    radius: float,
+    distance: Any,
+    patch: Any,
+    lo: int,
+    hi: int,
+) -> None:
+    """Mean distances of points lo to hi along the normals of their nearest patches (n, k), and the heaviest patch."""
+    count = reach.shape[1]
+    offset = np.empty(count)
+    for i in range(lo, hi):
+        level = np.inf
+        for k in range(count):
+            if reach[i, k] == np.inf:
+                continue
+            j = near[i, k]
+            offset[k] = 0.0
+            for axis in range(3):
+                offset[k] += (xyz[i, axis] - centre[j, axis]) * normal[j, axis]
+            if abs(offset[k]) < abs(level):
+                level = offset[k]
+        total, value, heaviest = 0.0, 0.0, 0.0
+        for k in range(count):
+            if reach[i, k] < radius and abs(offset[k] - level) < SAME_LEVEL_M:
+                weight = max((1.0 - (reach[i, k] / radius) ** 2) ** 2, SMALLEST_WEIGHT)
+                total += weight
+                value += weight * offset[k]
+                if weight > heaviest:
+                    heaviest, patch[i] = weight, near[i, k]
+        if total > 0.0:
+            distance[i] = value / total
 
 
 @dataclass(frozen=True, kw_only=True)
