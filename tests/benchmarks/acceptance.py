@@ -7,7 +7,7 @@
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
 | 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
-| 6 | the road: bumps and bays; under moving shadows, and of a real drive on held-out images, with and without semantics |
+| 6 | the road: bumps and bays, moving shadows, a real drive on held-out images, with and without semantics |
 | 7 | covered cameras: their images' poses, and what is left without camera set registration |
 | 8 | a camera with a wrong extrinsic; what a straight street lets a drive observe |
 | 9 | cameras that are not simultaneous, against the same drive with cameras that are |

@@ -1,10 +1,10 @@
 """Line 6: the road with and without semantic-aided triangulation, against the truth and on held-out images.
 
 Rendered drives (the worst seed counts): a street with traffic, level for one seed and on a hill with a ramp of 6 %
-for all, over which shadows move so that more than 25 % of the verified matches between keypoints on the road are wrong. A
-point of the road is bad where it is farther than 5 cm from the true surface, in the frame of the truth after a rigid
-alignment of the vehicle's poses. A true point stays where any of its observations observes a point of the scene that
-was made with semantics.
+for all, over which shadows move so that more than a quarter of the verified matches between keypoints on the road are
+wrong. A point of the road is bad where it is farther than 5 cm from the true surface, in the frame of the truth after a
+rigid alignment of the vehicle's poses. A true point stays where any of its observations observes a point of the scene
+that was made with semantics.
 
 Real drive (kitti02, masks of a network): the surface is fitted to points that only units of even number see, and points
 are judged by what those units see of them. What is measured are points of the same tracks, triangulated from units of
