@@ -27,6 +27,7 @@ from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_small
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import Bools, Bytes, Cancel, Floats, Floats32, Ints
+from schemas.findings import Finding, warning
 
 WIDTH_PX = 480  # of the images looked at: an outline is then true to a thousandth of the width
 MAX_IMAGES = 64  # of a camera that are read: more hardly sharpen a mean
@@ -53,6 +54,7 @@ MIN_EVIDENCE_PX = WIDTH_PX / 16  # less than this of an outline can be dirt or o
 CONSTANT_LEVELS = 2  # change of a value that rounding and compression alone explain
 MIN_CONSTANT_SHARE = 0.002  # of an image; less is not worth a mask
 MIN_BORDER_EDGE = 0.5  # of the outline of constant pixels; that of a black or saturated sky moves
+LARGE_SHARE = 1 / 3  # of an image; bonnets and boot lids fill a quarter of one and less
 MARGIN_SHARE = 0.004  # of an image's width around the mask, in which keypoints still depend on the outline
 
 
@@ -122,12 +124,30 @@ def find_own_cars(drive: Drive, *, threads: int, cancel: Cancel | None = None) -
     with ThreadPoolExecutor(threads) as pool:
         for index in np.unique(np.linspace(0, len(units) - 1, min(MAX_IMAGES, len(units))).round().astype(int)):
             images = images_of[units[index]]
-            looks = [(statistics[i.camera], small) for i, small in zip(images, pool.map(look, images), strict=True)]
-            # An image of another size than its camera is refused by name when features are extracted.
-            looks = [(of_camera, small) for of_camera, small in looks if small is not None]
+            # An image of another size than its camera's is refused by name when features are extracted.
+            looks = [
+                (statistics[image.camera], small)
+                for image, small in zip(images, pool.map(look, images), strict=True)
+                if small is not None
+            ]
             if _vehicle_moved(looks):
                 list(pool.map(lambda of_one: of_one[0].add(of_one[1]), looks))
         return list(pool.map(lambda camera: _judge(drive, camera, statistics[camera]), range(len(statistics))))
+
+
+def large_share_finding(camera: str, mask: Bools | None) -> list[Finding]:
+    """Warn if a camera sees little but the own car."""
+    share = 0.0 if mask is None else float(mask.mean())
+    if share <= LARGE_SHARE:
+        return []
+    return [
+        warning(
+            "own-car-large",
+            f"{share:.0%} of the images of camera {camera} stay while the vehicle moves and are left out",
+            f"Look at own_car/{camera}.png of the scene; if it covers more than the vehicle itself, set "
+            "`own_car = false` under [features] and give masks.",
+        )
+    ]
 
 
 def _vehicle_moved(looks: Sequence[tuple[_Statistics, Bytes]]) -> bool:
@@ -151,7 +171,7 @@ def _judge(drive: Drive, camera: int, statistics: _Statistics) -> OwnCar:
 def with_margin(mask: Bools) -> Bools:
     """The mask (h, w) and the pixels around it whose keypoints would depend on its outline."""
     side = 2 * max(1, round(MARGIN_SHARE * mask.shape[1])) + 1
-    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 class _Statistics:
@@ -183,12 +203,12 @@ class _Statistics:
     @property
     def gradient(self) -> Floats32:
         """Mean gradient (2, h, w, 3) along x and y, in grey levels per pixel."""
-        return self._gradient / np.float32(self.count)
+        return np.asarray(self._gradient / self.count, dtype=np.float32)
 
     @property
     def energy(self) -> Floats32:
         """Mean square (h, w) of the gradient over all channels."""
-        return self._energy / np.float32(self.count)
+        return np.asarray(self._energy / self.count, dtype=np.float32)
 
     @property
     def change(self) -> Floats32:

@@ -14,11 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from mrasfm_engine.types import Bools, Floats, Floats32, Ints
 
 # Share of a gradient's energy that stays. An edge whose contrast varies by three times its mean keeps a tenth; of n
-# gradients without anything in common more than 3/n remains in one pixel of twenty. The double of it is an edge for sure.
+# gradients without anything in common more than 3/n remains in one pixel of twenty. Twice as much is an edge for sure.
 MIN_LASTING_SHARE = 0.12
 NOISE_SHARES = 3.0
 RESOLUTION = 0.5  # of gradients, in grey levels: what 8 bits resolve
@@ -32,7 +33,7 @@ RIM_PX = 5  # from the outline, where the surfaces on its two sides are compared
 
 ALONG_MOTION = 0.6  # worth of an edge along the motion, which the world has too, against one across it
 NO_EDGE = 0.5  # cost of a pixel of outline without an edge: half of what is won by one with an edge
-AREA = 0.01  # worth of a pixel between outline and border that changes little: decides between equal outlines
+AREA = 0.005  # worth of a pixel between outline and border that changes little: decides between equal outlines
 GROUND_QUANTILE = 0.75  # of the changes below the horizon: that of ground, if it fills a quarter of them or more
 # A second outline outside the first is sought, as a mirrored skyline stays as well as the edge of the paint. It is held
 # to more: edges along the motion are not worth anything, and its sides cost more.
@@ -177,7 +178,7 @@ def _below(heights: Ints, rows: int) -> Bools:
 
 def _snapped(heights: Ints, strength: Floats32) -> Ints:
     """Heights moved inwards to the middle of their edge."""
-    rows, columns = strength.shape
+    rows = len(strength)
     result = heights.copy()
     for column in np.flatnonzero(heights):
         top = rows - heights[column]
@@ -202,7 +203,7 @@ def _tidied(mask: Bools) -> Bools:
     return np.asarray(area[gap:-gap, gap:-gap] > 0)
 
 
-def _best_heights(crossing: Floats32, area: Floats32, side: Floats32) -> Ints:
+def _best_heights(crossing: NDArray[Any], area: NDArray[Any], side: NDArray[Any]) -> Ints:
     """Heights (w,) of the outline with the largest sum.
 
     Parameters
@@ -221,7 +222,7 @@ def _best_heights(crossing: Floats32, area: Floats32, side: Floats32) -> Ints:
 
 @njit(cache=True, nogil=True)
 def _find_path(crossing: Any, area: Any, side: Any, heights: Any) -> None:
-    """Viterbi over columns; a change of height costs the sides passed, so that two sweeps find each best predecessor."""
+    """Viterbi over columns: a change of height costs the sides passed, so that two sweeps find all predecessors."""
     rows, columns = crossing.shape
     value, passed = np.zeros(rows + 1), np.zeros(rows + 1)
     best_value = np.zeros(rows + 1)

@@ -79,7 +79,7 @@ def own_car_before(lens: Lens, rng: np.random.Generator) -> OwnCar | None:
     panel = _PANELS.get(lens.camera.name)
     if panel is None:
         return None
-    centre = np.array(panel.centre_m) + [0.0, 0.0, rng.uniform(-0.03, 0.03)]
+    centre = np.array(panel.centre_m) + np.array([0.0, 0.0, rng.uniform(-0.03, 0.03)])
     half = np.array(panel.half_axes_m)
     rig_from_cam = lens.camera.rig_from_cam
     rays = np.concatenate([lens.pixels, np.ones((*lens.pixels.shape[:2], 1))], -1) @ rig_from_cam[:3, :3].T
