@@ -46,9 +46,9 @@ RESOLUTION = 0.5  # of gradients, in grey levels: what 8 bits resolve
 # Sine of how steeply a ray must fall: ground that is seen 10 degrees below the horizon from 1.5 m is 8.5 m away, so
 # that it passes within the way of a few images, and traffic keeps farther away than that.
 MIN_FALL = 0.17
-# Evidence along the outline. In drives without own car what follows kerbs and noise has under an eighth of it; half of
-# the length of a curved outline is across the motion where the camera looks along it.
-MIN_EVIDENCE_SHARE = 1 / 6
+# Evidence along the outline. Where a camera looks along the motion, half of the length of a curved outline is across
+# it, and its contrast varies: a tenth remains with few images. What follows kerbs and noise has none on average.
+MIN_EVIDENCE_SHARE = 1 / 16
 MIN_EVIDENCE_PX = WIDTH_PX / 16  # less than this of an outline can be dirt or one thing that moves along
 
 CONSTANT_LEVELS = 2  # change of a value that rounding and compression alone explain

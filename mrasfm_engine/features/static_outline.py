@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from mrasfm_engine.types import Bools, Floats, Floats32, Ints
 
 # Share of a gradient's energy that stays. An edge whose contrast varies by three times its mean keeps a tenth; of n
-# gradients without anything in common more than 3/n remains in one pixel of twenty. Twice as much is an edge for sure.
+# gradients without anything in common up to 2/n remains. Twice as much is an edge for sure.
 MIN_LASTING_SHARE = 0.12
-NOISE_SHARES = 3.0
+NOISE_SHARES = 2.0
 RESOLUTION = 0.5  # of gradients, in grey levels: what 8 bits resolve
 WINDOW_PX = 0.7  # sigma of the neighbourhood whose gradients count together
 # Paint mirrors the world smaller and fainter than it is, so that its detail changes less than that of what is behind.
@@ -36,10 +36,10 @@ NO_EDGE = 0.5  # cost of a pixel of outline without an edge: half of what is won
 AREA = 0.005  # worth of a pixel between outline and border that changes little: decides between equal outlines
 GROUND_QUANTILE = 0.75  # of the changes below the horizon: that of ground, if it fills a quarter of them or more
 # A second outline outside the first is sought, as a mirrored skyline stays as well as the edge of the paint. It is held
-# to more: edges along the motion are not worth anything, and its sides cost more.
+# to more: edges along the motion are worth nothing, and its sides cost more.
 OUTER_PASSES = 3
 OUTER_WORTH = 2.0
-OUTER_ALONG_MOTION = 0.15  # share across the motion below which an edge is a kerb's or a marking's
+OUTER_ALONG_MOTION = 0.05  # share across the motion below which an edge is a kerb's: 13 degrees off its direction
 OUTER_NO_SIDE = 2.0
 OUTER_FALL = 0.17  # beyond the least fall, from which on the evidence counts in full: traffic is nearer the horizon
 SAME_EDGE_PX = 3
@@ -194,13 +194,21 @@ def _along(heights: Ints, values: Floats32) -> Floats32:
 
 
 def _tidied(mask: Bools) -> Bools:
-    """The area without narrow gaps and spikes."""
+    """The area without narrow gaps and spikes, and without dents: sheet metal is convex.
+
+    A dent is where the paint mirrors what looks like the ground beside it. Spikes (an aerial) make no hull.
+    """
     width = mask.shape[1]
     gap, spike = (max(3, round(share * width) // 2 * 2 + 1) for share in (GAP_SHARE, SPIKE_SHARE))
     area = cv2.copyMakeBorder(mask.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_REPLICATE)
-    for operation, side in ((cv2.MORPH_CLOSE, gap), (cv2.MORPH_OPEN, spike)):
-        area = cv2.morphologyEx(area, operation, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
-    return np.asarray(area[gap:-gap, gap:-gap] > 0)
+    closed, body = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)) for side in (gap, spike))
+    area = cv2.morphologyEx(cv2.morphologyEx(area, cv2.MORPH_CLOSE, closed), cv2.MORPH_OPEN, body)
+    hulls = np.zeros_like(area)
+    for contour in cv2.findContours(
+        cv2.morphologyEx(area, cv2.MORPH_OPEN, closed), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )[0]:
+        cv2.fillConvexPoly(hulls, cv2.convexHull(contour), 1)
+    return np.asarray((area | hulls)[gap:-gap, gap:-gap] > 0)
 
 
 def _best_heights(crossing: NDArray[Any], area: NDArray[Any], side: NDArray[Any]) -> Ints:
