@@ -12,10 +12,12 @@ Pixels whose value never changes, at the border of an image (black borders, bars
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -38,6 +40,8 @@ MIN_IMAGES = 12
 # far the image moves where the vehicle moves; passing traffic does it too, but not in most cameras at the same time.
 MOVED_PX, MOVING_QUANTILE = 1.0, 0.75
 COARSE_PX = 2.0  # sigma, so that noise is no change
+# Of the way, in each of which the car is seen: a lorry in the next lane comes and goes.
+PARTS = 4
 SMOOTHING_PX = 0.8  # sigma against noise and compression, before gradients
 FINE_PX = 2.5  # sigma of the detail whose change tells moving surfaces
 DARK = 8.0  # grey levels, about the noise of dark pixels: detail is relative to brightness above it
@@ -51,6 +55,7 @@ MIN_FALL = 0.17
 MIN_EVIDENCE_SHARE = 1 / 16
 MIN_EVIDENCE_PX = WIDTH_PX / 16  # less than this of an outline can be dirt or one thing that moves along
 
+JPEG_BLOCK_PX = 16  # side of a block with subsampled colours
 CONSTANT_LEVELS = 2  # change of a value that rounding and compression alone explain
 MIN_CONSTANT_SHARE = 0.002  # of an image; less is not worth a mask
 MIN_BORDER_EDGE = 0.5  # of the outline of constant pixels; that of a black or saturated sky moves
@@ -180,6 +185,8 @@ class _Statistics:
     def __init__(self) -> None:
         self.count = 0
         self.last: Floats32 | None = None  # outlines of the last image
+        self._parts: list[Floats32] = []  # sums of gradients over consecutive images
+        self._images_in_part = 1
 
     def add(self, image: Bytes) -> None:
         """Count an image (h, w, 3)."""
@@ -188,22 +195,36 @@ class _Statistics:
         detail = (smooth - _smoothed(image, FINE_PX)) / (smooth + DARK)
         energy = (gradient**2).sum((0, 3))
         if self.count == 0:
-            self._gradient, self._energy, self._detail, self._detail_squared = gradient, energy, detail, detail**2
+            self._energy, self._detail, self._detail_squared = energy, detail, detail**2
             self._lowest, self._highest = image.copy(), image.copy()
         else:
-            self._gradient += gradient
             self._energy += energy
             self._detail += detail
             self._detail_squared += detail**2
             np.minimum(self._lowest, image, out=self._lowest)
             np.maximum(self._highest, image, out=self._highest)
+        self._add_to_part(gradient)
         self.last = _outlines(image)
         self.count += 1
 
+    def _add_to_part(self, gradient: Floats32) -> None:
+        """Keep sums over parts of equally many images; where there are too many parts, neighbours are joined."""
+        if self.count % self._images_in_part == 0:
+            if len(self._parts) == 2 * PARTS:
+                self._parts = [a + b for a, b in zip(self._parts[::2], self._parts[1::2], strict=True)]
+                self._images_in_part *= 2
+            self._parts.append(np.zeros_like(gradient))
+        self._parts[-1] += gradient
+
     @property
-    def gradient(self) -> Floats32:
-        """Mean gradient (2, h, w, 3) along x and y, in grey levels per pixel."""
-        return np.asarray(self._gradient / self.count, dtype=np.float32)
+    def gradients(self) -> Floats32:
+        """Mean gradients (parts, 2, h, w, 3) along x and y of consecutive parts of the way, in grey levels per pixel.
+
+        They are weighted so that their mean is that of all images.
+        """
+        bounds = np.linspace(0, len(self._parts), PARTS + 1).round().astype(int)
+        sums = [sum(self._parts[a:b], np.float32(0)) for a, b in pairwise(bounds)]
+        return np.asarray(np.stack(sums) * (PARTS / self.count), dtype=np.float32)
 
     @property
     def energy(self) -> Floats32:
@@ -249,12 +270,13 @@ def _static_region(drive: Drive, camera: int, statistics: _Statistics) -> Bools:
     """Pixels (h, w) of the small images that show the own car or never change."""
     fall, flow, side = _world_motion(drive, camera, statistics.energy.shape)
     edges = StaticEdges.from_sums(
-        statistics.gradient, statistics.energy, statistics.change, statistics.count, fall=fall, flow=flow
+        statistics.gradients, statistics.energy, statistics.change, statistics.count, fall=fall, flow=flow
     )
     found = trace_outline(edges.turned(side))
     is_car = found.evidence_px >= MIN_EVIDENCE_PX and found.evidence_share >= MIN_EVIDENCE_SHARE
     mask = np.rot90(found.mask, -side) if is_car else np.zeros(fall.shape, np.bool_)
-    return np.ascontiguousarray(mask | _constant_border(statistics.constant, edges.edge))
+    block_px = math.ceil(JPEG_BLOCK_PX * mask.shape[1] / drive.cameras[camera].width)
+    return np.ascontiguousarray(mask | _constant_border(statistics.constant, edges.edge, block_px))
 
 
 def _world_motion(drive: Drive, camera: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, int]:
@@ -285,8 +307,11 @@ def _world_motion(drive: Drive, camera: int, shape: tuple[int, ...]) -> tuple[Fl
     return (-(rays @ up) - MIN_FALL).reshape(height, width), flow.reshape(height, width, 2), side
 
 
-def _constant_border(constant: Bools, edge: Floats32) -> Bools:
-    """Areas (h, w) of constant pixels that reach the image's border and that an edge separates from the rest."""
+def _constant_border(constant: Bools, edge: Floats32, block_px: int) -> Bools:
+    """Areas (h, w) of constant pixels that reach the image's border and that an edge separates from the rest.
+
+    Compression mixes a block of `block_px` at the edge with the rest, so that the areas are grown to the edge.
+    """
     height, width = constant.shape
     # What is written in a bar may change.
     window = cv2.getStructuringElement(cv2.MORPH_RECT, (width // 20 * 2 + 1, height // 20 * 2 + 1))
@@ -296,14 +321,16 @@ def _constant_border(constant: Bools, edge: Floats32) -> Bools:
     labels = cv2.connectedComponents(closed, connectivity=4)[1]
     border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     result = np.zeros(constant.shape, np.bool_)
-    near = cv2.dilate(edge, np.ones((5, 5), np.uint8))
+    block = np.ones((2 * block_px + 1, 2 * block_px + 1), np.uint8)
+    near = cv2.dilate(edge, block)
     for label in _present(border):
         area = labels == label
         outline = cv2.dilate(area.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_) & ~area
         is_whole = constant[area].mean() > 0.5
         if is_whole and area.mean() > MIN_CONSTANT_SHARE and outline.any() and near[outline].mean() > MIN_BORDER_EDGE:
             result |= area
-    return result
+    grown = (cv2.dilate(result.astype(np.uint8), block) > 0) & (edge > MIN_BORDER_EDGE)
+    return np.asarray(cv2.morphologyEx((result | grown).astype(np.uint8), cv2.MORPH_CLOSE, block) > 0)
 
 
 def _present(labels: Ints | Bytes) -> Sequence[int]:

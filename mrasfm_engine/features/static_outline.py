@@ -23,6 +23,7 @@ from mrasfm_engine.types import Bools, Floats, Floats32, Ints
 MIN_LASTING_SHARE = 0.12
 NOISE_SHARES = 2.0
 RESOLUTION = 0.5  # of gradients, in grey levels: what 8 bits resolve
+LEAST_PART = 0.5  # of the mean contrast, that an edge has in every part of the way
 WINDOW_PX = 0.7  # sigma of the neighbourhood whose gradients count together
 # Paint mirrors the world smaller and fainter than it is, so that its detail changes less than that of what is behind.
 # Half of the change or less is another surface for sure.
@@ -53,6 +54,7 @@ class StaticEdges:
 
     edge: Floats32  # 0 to 1: an edge stays here
     evidence: Floats32  # 0 to 1: as well, and it is near ground and across the motion
+    always: Floats32  # 0 to 1: the edge is there in every part of the way
     step: Floats32  # 0 to 1: what is outside changes more
     step_evidence: Floats32  # 0 to 1: as well, across the motion
     strength: Floats32  # of the mean gradient
@@ -61,19 +63,21 @@ class StaticEdges:
 
     @classmethod
     def from_sums(
-        cls, gradient: Floats32, energy: Floats32, change: Floats32, count: int, *, fall: Floats, flow: Floats
+        cls, gradients: Floats32, energy: Floats32, change: Floats32, count: int, *, fall: Floats, flow: Floats
     ) -> StaticEdges:
         """Judge mean gradients.
 
         Parameters
         ----------
-        gradient, energy
-            Mean (2, h, w, channels) and mean square (h, w) of the gradients of a number `count` of images.
+        gradients, energy
+            Means (parts, 2, h, w, channels) over parts of the way, and mean square (h, w) over all of it, of gradients of
+            a number `count` of images.
         change
             Standard deviation (h, w) of fine detail over time.
         fall, flow
             See `StaticEdges.fall`; directions (h, w, 2) in which the world moves.
         """
+        gradient = gradients.mean(0)
         lasting = _windowed((gradient**2).sum((0, 3)))
         share = lasting / (_windowed(energy) + RESOLUTION**2)
         share = (count * share - 1) / (count - 1)  # what remains of gradients without anything in common is taken off
@@ -87,6 +91,7 @@ class StaticEdges:
         return cls(
             edge=edge,
             evidence=edge * near * _across(gradient, flow),
+            always=_always(gradients),
             step=step,
             step_evidence=step * _across(slope[..., None], flow),
             strength=np.sqrt(lasting),
@@ -136,7 +141,7 @@ def trace_outline(edges: StaticEdges) -> Outline:
             break
         heights = np.where(farther, found, heights)
     heights = _snapped(heights, edges.strength)
-    along, is_outline = _along(heights, edges.evidence), heights > 0
+    along, is_outline = _along(heights, edges.evidence * edges.always), heights > 0
     length = int(is_outline.sum())
     return Outline(
         mask=_tidied(_below(heights, rows)),
@@ -163,6 +168,14 @@ def _across(gradient: Floats32, flow: Floats) -> Floats32:
     x, y = flow[..., 0], flow[..., 1]
     along = (xx * x**2 + 2 * xy * x * y + yy * y**2) / (xx + yy + 1e-9)
     return np.asarray(along, dtype=np.float32)
+
+
+def _always(gradients: Floats32) -> Floats32:
+    """How much of the mean of gradients (parts, 2, h, w, channels) is there in the part that has least of it."""
+    mean = gradients.mean(0)
+    energy = _windowed((mean**2).sum((0, 3))) + 1e-6
+    least = np.min([_windowed((part * mean).sum((0, 3))) / energy for part in gradients], axis=0)
+    return np.asarray(np.clip(least / LEAST_PART, 0, 1), dtype=np.float32)
 
 
 def _shifted(values: Floats32, rows: int) -> Floats32:
