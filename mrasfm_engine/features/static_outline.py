@@ -70,8 +70,8 @@ class StaticEdges:
         Parameters
         ----------
         gradients, energy
-            Means (parts, 2, h, w, channels) over parts of the way, and mean square (h, w) over all of it, of gradients of
-            a number `count` of images.
+            Means (parts, 2, h, w, channels) over parts of the way, and mean square (h, w) over all of it, of the
+            gradients of a number `count` of images.
         change
             Standard deviation (h, w) of fine detail over time.
         fall, flow
