@@ -72,7 +72,7 @@ class NotFound(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class OwnCar:
-    """What was found out about one camera."""
+    """Result of the search in one camera."""
 
     mask: Bools | None  # (h, w) at the camera's full size; None: nothing found
     reason: NotFound | None  # where there is no mask
@@ -280,7 +280,7 @@ def _static_region(drive: Drive, camera: int, statistics: _Statistics) -> Bools:
 
 
 def _world_motion(drive: Drive, camera: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, int]:
-    """Where the ground is and where it moves in a camera's image, if the vehicle goes straight on.
+    """Fall of the rays of a camera and motion of its image, if the vehicle goes straight on.
 
     Returns
     -------

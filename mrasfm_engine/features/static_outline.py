@@ -34,12 +34,12 @@ RIM_PX = 5  # from the outline, where the surfaces on its two sides are compared
 
 ALONG_MOTION = 0.6  # worth of an edge along the motion, which the world has too, against one across it
 NO_EDGE = 0.5  # cost of a pixel of outline without an edge: half of what is won by one with an edge
-AREA = 0.005  # worth of a pixel between outline and border that changes little: decides between equal outlines
+AREA = 0.01  # worth of a pixel between outline and border that changes little: decides between equal outlines
 GROUND_QUANTILE = 0.75  # of the changes below the horizon: that of ground, if it fills a quarter of them or more
 # A second outline outside the first is sought, as a mirrored skyline stays as well as the edge of the paint. It is held
 # to more: edges along the motion are worth nothing, and its sides cost more.
 OUTER_PASSES = 3
-OUTER_WORTH = 2.0
+OUTER_WORTH = 3.0
 OUTER_ALONG_MOTION = 0.05  # share across the motion below which an edge is a kerb's: 13 degrees off its direction
 OUTER_NO_SIDE = 2.0
 OUTER_FALL = 0.17  # beyond the least fall, from which on the evidence counts in full: traffic is nearer the horizon
@@ -50,7 +50,7 @@ GAP_SHARE, SPIKE_SHARE = 1 / 20, 1 / 70  # of the width: narrower gaps and spike
 
 @dataclass(frozen=True, kw_only=True)
 class StaticEdges:
-    """What the gradients of one camera's images say of every pixel (h, w)."""
+    """Judgement of every pixel (h, w) by the gradients of one camera's images."""
 
     edge: Floats32  # 0 to 1: an edge stays here
     evidence: Floats32  # 0 to 1: as well, and it is near ground and across the motion
@@ -107,7 +107,7 @@ class StaticEdges:
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """What lies below the best outline, and how sure it is."""
+    """Area below the best outline, and how sure it is."""
 
     mask: Bools  # (h, w)
     evidence_px: float  # length of the outline that the world cannot have
@@ -171,7 +171,7 @@ def _across(gradient: Floats32, flow: Floats) -> Floats32:
 
 
 def _always(gradients: Floats32) -> Floats32:
-    """How much of the mean of gradients (parts, 2, h, w, channels) is there in the part that has least of it."""
+    """Share (h, w) of the mean of gradients (parts, 2, h, w, channels) that the part with least of it has."""
     mean = gradients.mean(0)
     energy = _windowed((mean**2).sum((0, 3))) + 1e-6
     least = np.min([_windowed((part * mean).sum((0, 3))) / energy for part in gradients], axis=0)
@@ -216,11 +216,14 @@ def _tidied(mask: Bools) -> Bools:
     area = cv2.copyMakeBorder(mask.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_REPLICATE)
     closed, body = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)) for side in (gap, spike))
     area = cv2.morphologyEx(cv2.morphologyEx(area, cv2.MORPH_CLOSE, closed), cv2.MORPH_OPEN, body)
-    hulls = np.zeros_like(area)
-    for contour in cv2.findContours(
-        cv2.morphologyEx(area, cv2.MORPH_OPEN, closed), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )[0]:
-        cv2.fillConvexPoly(hulls, cv2.convexHull(contour), 1)
+    hulls, bodies = np.zeros_like(area), area.copy()
+    bodies[-gap:] = 0  # low strips beside the car are no part of its body
+    bodies = cv2.morphologyEx(bodies, cv2.MORPH_OPEN, closed)
+    count, labels = cv2.connectedComponents(area)
+    for label in range(1, count):
+        body = cv2.findNonZero(bodies * (labels == label))
+        if body is not None:
+            cv2.fillConvexPoly(hulls, cv2.convexHull(body), 1)
     return np.asarray((area | hulls)[gap:-gap, gap:-gap] > 0)
 
 

@@ -209,7 +209,7 @@ def _render_drive(
 
 
 def _own_cars(options: SynthOptions, lenses: list[Lens]) -> list[OwnCar | None]:
-    """What each camera sees of the vehicle, the same in all drives."""
+    """Each camera's view of the vehicle, the same in all drives."""
     if not options.own_car:
         return [None] * len(lenses)
     rng = np.random.default_rng([options.seed, 5])

@@ -39,7 +39,7 @@ _PANELS = {
 
 @dataclass(frozen=True, kw_only=True)
 class OwnCar:
-    """What one camera sees of its vehicle: the same pixels in every image."""
+    """One camera's view of its vehicle: the same pixels in every image."""
 
     mask: Bools  # (h, w)
     depth_m: Floats32  # (h, w) along the camera's z axis; of pixels of the mask
