@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.features.static_outline import StaticEdges, trace_outline
+from mrasfm_engine.features.static_outline import RESOLUTION, StaticEdges, trace_outline
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_small
@@ -33,7 +33,7 @@ from schemas.findings import Finding, warning
 
 WIDTH_PX = 480  # of the images looked at: an outline is then true to a thousandth of the width
 MAX_IMAGES = 64  # of a camera that are read: more hardly sharpen a mean
-# Of a camera that differ. The mean of n gradients that have nothing in common keeps 1/n of their energy: with fewer
+# Of a camera that differ. The mean of n gradients that have nothing in common keeps 1/n of their energy: of fewer
 # images that is as much as an edge keeps whose contrast varies.
 MIN_IMAGES = 12
 # An image counts as another one if a quarter of its pixels with contrast changed by what one pixel's shift changes. So
@@ -45,7 +45,6 @@ PARTS = 4
 SMOOTHING_PX = 0.8  # sigma against noise and compression, before gradients
 FINE_PX = 2.5  # sigma of the detail whose change tells moving surfaces
 DARK = 8.0  # grey levels, about the noise of dark pixels: detail is relative to brightness above it
-RESOLUTION = 0.5  # of gradients, in grey levels: what 8 bits resolve
 
 # Sine of how steeply a ray must fall: ground that is seen 10 degrees below the horizon from 1.5 m is 8.5 m away, so
 # that it passes within the way of a few images, and traffic keeps farther away than that.
