@@ -52,6 +52,10 @@ class FeatureConfig(_Section):
     class_margin_px: Annotated[int, Field(ge=0)] = Field(
         2, description="keypoints nearer than this to the border of a class in the mask have no class"
     )
+    own_car: bool = Field(
+        True,
+        description="no keypoints on the vehicle itself, which is found by the edges that stay while it moves",
+    )
     max_side_px: Count = Field(
         1600, description="larger images are extracted at reduced size; coordinates stay those of the full image"
     )

@@ -18,7 +18,9 @@ from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.features.extraction import extract_features
+from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_finding
 from mrasfm_engine.io import left_out_images
+from mrasfm_engine.io.images import mask_of_png, mask_png
 from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
 from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
@@ -39,7 +41,7 @@ from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.triangulation.tracks import Keypoints
-from mrasfm_engine.types import CountProgress, StageProgress
+from mrasfm_engine.types import Bools, CountProgress, StageProgress
 from mrasfm_engine.visualization.pictures import draw_pictures
 from schemas.artifacts import CHECKPOINT_FOLDER, Stage
 from schemas.findings import as_json
@@ -48,7 +50,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 2, Stage.MATCHES: 4, Stage.MAPPING: 8}
+VERSIONS = {Stage.FEATURES: 3, Stage.MATCHES: 4, Stage.MAPPING: 8}
 
 
 @dataclass
@@ -62,6 +64,7 @@ class Run:
     cancel: Callable[[], bool]
     content_sha256: Mapping[str, str] | None = None  # of the drive's files by name, where the caller knows them
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
+    own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once its images were looked at
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
 
     @cached_property
@@ -168,16 +171,20 @@ def features(run: Run) -> list[ImageFeatures]:
     """Keypoints and descriptors of all images."""
 
     def work() -> tuple[Arrays, dict[str, Any]]:
+        own_cars: list[OwnCar] = []
+        if run.config.features.own_car:
+            own_cars = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
         found = extract_features(
             run.drive,
             run.components.extractor,
             threads=run.config.threads,
             segmenter=run.components.segmenter,
             class_margin_px=run.config.features.class_margin_px,
+            own_cars=[car.mask for car in own_cars],
             progress=run.step(Stage.FEATURES),
             cancel=run.cancel,
         )
-        arrays = _pack_features(found)
+        arrays = _pack_features(found) | _pack_own_cars(own_cars)
         return arrays, {
             "images": len(found),
             "keypoints": int(arrays["counts"].sum()),
@@ -185,6 +192,10 @@ def features(run: Run) -> list[ImageFeatures]:
             "images_with_mask": {
                 "given": sum(image.mask is not None for image in run.drive.images),
                 "made_by_model": sum(f.made_mask is not None for f in found),
+            },
+            "own_car": {
+                camera.name: car.report()
+                for camera, car in zip(run.drive.cameras if own_cars else [], own_cars, strict=True)
             },
             "images_with_under_100_keypoints": [
                 run.drive.images[i].file for i in np.flatnonzero(arrays["counts"] < 100) if not found[i].left_out
@@ -199,6 +210,10 @@ def features(run: Run) -> list[ImageFeatures]:
     arrays, report = run.stage(Stage.FEATURES, run.feature_settings, work)
     left_out = {image["file"]: Incomplete(image["reason"]) for image in report["images_left_out"]}
     _say_left_out(run, left_out)
+    run.own_cars = _unpack_own_cars(arrays) or [None for _ in run.drive.cameras]
+    run.report["own_car"] = report["own_car"]
+    for camera, mask in zip(run.drive.cameras, run.own_cars, strict=True):
+        run.report["findings"] += [as_json(finding) for finding in large_share_finding(camera.name, mask)]
     if len(left_out) == len(run.drive.images):
         raise left_out_images.nothing_left(left_out)
     if not arrays["counts"].sum():
@@ -226,6 +241,23 @@ def _pack_features(found: Sequence[ImageFeatures]) -> Arrays:
         "mask_bytes": np.array([len(mask) for mask in masks], dtype=np.int64),
         "masks": np.concatenate(masks),
     }
+
+
+def _pack_own_cars(own_cars: Sequence[OwnCar]) -> Arrays:
+    masks = [
+        np.zeros(0, np.uint8) if car.mask is None else mask_png(car.mask.astype(np.uint8) * 255) for car in own_cars
+    ]
+    return {
+        "own_car_bytes": np.array([len(mask) for mask in masks], dtype=np.int64),
+        "own_cars": np.concatenate([np.zeros(0, np.uint8), *masks]),
+    }
+
+
+def _unpack_own_cars(arrays: Arrays) -> list[Bools | None]:
+    if not len(arrays["own_car_bytes"]):
+        return []
+    masks = np.split(arrays["own_cars"], np.cumsum(arrays["own_car_bytes"])[:-1])
+    return [mask_of_png(mask) > 0 if len(mask) else None for mask in masks]
 
 
 def _unpack_features(arrays: Arrays, left_out: Sequence[Incomplete | None]) -> list[ImageFeatures]:
@@ -400,6 +432,7 @@ def scene(
         }
     )
     result = build_scene(mapper, refinement, found, pairs, known, notes=run.drive.manifest.notes)
+    result.own_cars = run.own_cars
     run.progress(Stage.REFINEMENT, 1, 1)
     return result
 

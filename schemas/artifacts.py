@@ -35,6 +35,7 @@ CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING})  # seam
 REPORT_FILE = "report.json"
 MAP_FILE = "map.json"
 PICTURES_FOLDER = "pictures"
+OWN_CAR_FOLDER = "own_car"  # CAMERA.png, 255 where a camera shows the vehicle itself
 TEXT_MODEL_FOLDER = "model/text"
 SCENES_FOLDER = "scenes"  # of a map: its scenes as an aggregation reads them
 SEAMS_FOLDER = "seams"  # of a map: its seams, for the next version
@@ -58,7 +59,7 @@ def seam_checkpoint(a: str, b: str) -> str:
 
 def is_read_by_aggregation(path: str) -> bool:
     """Return whether an aggregation reads this file of a scene."""
-    return not path.startswith((f"{PICTURES_FOLDER}/", f"{TEXT_MODEL_FOLDER}/"))
+    return not path.startswith((f"{PICTURES_FOLDER}/", f"{OWN_CAR_FOLDER}/", f"{TEXT_MODEL_FOLDER}/"))
 
 
 def is_read_by_next_version(path: str) -> bool:

@@ -62,6 +62,9 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add("--readout-ms", float, "rolling shutter: time from the first row to the last; slow to render")
     add("--drop-images", float, "fraction of images that are missing", metavar="FRACTION")
     parser.add_argument(
+        "--own-car", action="store_true", help="the front camera sees the bonnet, the back camera the boot lid"
+    )
+    parser.add_argument(
         "--occlude",
         dest="occluded_cameras",
         type=lambda text: tuple(name for name in text.split(",") if name),

@@ -2,8 +2,8 @@
 
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
 `poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
-scene can be aggregated without the drive), `pictures/` where any were drawn, `road.json` where the road was found, and
-`report.json`. One with a `report.json` is complete.
+scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a camera shows the
+vehicle itself, `road.json` where the road was found, and `report.json`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from mrasfm_engine.export import (
 )
 from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
+from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
-from schemas.artifacts import PICTURES_FOLDER
+from schemas.artifacts import OWN_CAR_FOLDER, PICTURES_FOLDER
 
 NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
 ROAD_FILE = "road.json"
@@ -66,7 +67,7 @@ def write_scene(
     """
     check_scene(scene)
     needed = _size_bytes(scene) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=(PICTURES_FOLDER, ROAD_FILE)) as work:
+    with publishing(out, needed, replaced=(PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE)) as work:
         _write(scene, work, report, pictures)
 
 
@@ -91,6 +92,7 @@ def summary(scene: Scene) -> dict[str, Any]:
 def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes]) -> None:
     read_back = ReadBack(work)
     figures = write_common(scene, work, pictures, read_back)
+    picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
     feature_database.write_features(scene, work / "features.db")
     if scene.road is not None:
         write_json(work / ROAD_FILE, road.road_document(scene))
@@ -127,11 +129,24 @@ def _checks(scene: Scene, pictures: Mapping[str, bytes]) -> list[Check]:
     return [
         *common_checks(scene, pictures),
         *([] if scene.road is None else [road_check]),
+        *(
+            Check(f"{OWN_CAR_FOLDER}/{name}", Path.read_bytes, partial(comparisons.content, data))
+            for name, data in _own_car_files(scene).items()
+        ),
         Check("features.db", readers.database, partial(comparisons.features, scene)),
         Check("poses.tum", readers.tum, partial(comparisons.tum, scene, registered)),
         Check("calibration.json", readers.json_object, partial(comparisons.calibration, scene)),
         Check(MANIFEST_FILE, readers.manifest, partial(comparisons.manifest, scene)),
     ]
+
+
+def _own_car_files(scene: Scene) -> dict[str, bytes]:
+    """PNG files by name: of each camera that shows the own car."""
+    return {
+        f"{camera.name}.png": mask_png(mask.astype(np.uint8) * 255).tobytes()
+        for camera, mask in zip(scene.drive.cameras, scene.own_cars, strict=True)
+        if mask is not None
+    }
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.features.own_car import with_margin
 from mrasfm_engine.features.segmentation import Segmenter
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
@@ -61,6 +62,7 @@ def extract_features(
     threads: int,
     segmenter: Segmenter | None = None,
     class_margin_px: int = 2,
+    own_cars: Sequence[Bools | None] = (),
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> list[ImageFeatures]:
@@ -69,6 +71,8 @@ def extract_features(
     Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
     have the class of what they show; within `class_margin_px` of another class they are unknown. Images without a mask
     get theirs from `segmenter`, if there is one; it comes with their features.
+
+    Nothing is extracted where `own_cars` is True either: masks (h, w) by camera, as the pixels show the own car.
 
     An image whose pixels are not all there has no keypoints, and `left_out` says why: the grey that fills it up has
     texture at its border.
@@ -96,6 +100,7 @@ def extract_features(
                 f"{camera.width}x{camera.height}",
                 remedy="Give the calibration of images of this size, or images of the calibration's size.",
             )
+        outside = outside_own_car[image.camera] if outside_own_car else None
         made_mask = None
         if image.mask is not None:
             mask = read_mask(drive.root / image.mask, drive.manifest.label_map)
@@ -110,13 +115,15 @@ def extract_features(
             mask = segmenter.segment(rgb)
             made_mask = mask_png(mask)
         else:
-            return extractor.extract(rgb, None)
+            return extractor.extract(rgb, outside)
         codes = class_codes(mask, label_map)
-        found = extractor.extract(rgb, usable_pixels(codes))
+        usable = usable_pixels(codes)
+        found = extractor.extract(rgb, usable if outside is None else usable & outside)
         classes = classes_at(confident_classes(codes, class_margin_px), found.xy_px)
         return replace(found, classes=classes, made_mask=made_mask)
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()
+    outside_own_car = [None if mask is None else ~with_margin(mask) for mask in own_cars]
     result: list[ImageFeatures | Incomplete] = []
     with one_opencv_thread(), ThreadPoolExecutor(threads) as pool:
         futures = [pool.submit(one, index) for index in range(len(drive.images))]

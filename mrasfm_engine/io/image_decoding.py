@@ -70,6 +70,20 @@ def decode_jpeg(data: Bytes, colours: Colours, header: ImageHeader, path: Path) 
     return _of_size(pixels, header, path)
 
 
+def decode_jpeg_small(data: Bytes, width_px: int) -> Bytes | None:
+    """Pixels (height, width, 3) reduced by a power of two to `width_px` or somewhat more.
+
+    None where libjpeg has any complaint: `decode_jpeg` judges it.
+    """
+    try:
+        pixels = simplejpeg.decode_jpeg(
+            data, "RGB", fastdct=False, fastupsample=False, min_width=width_px, min_factor=1, strict=True
+        )
+    except ValueError:
+        return None
+    return np.asarray(pixels, dtype=np.uint8)
+
+
 def decode_png(data: Bytes, flags: int, header: ImageHeader, path: Path) -> Bytes | NDArray[np.uint16]:
     """Pixels as OpenCV's flags say; `path` is for messages.
 

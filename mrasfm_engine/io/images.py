@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.image_decoding import decode_jpeg, decode_png
+from mrasfm_engine.io.image_decoding import decode_jpeg, decode_jpeg_small, decode_png
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular
 from mrasfm_engine.types import Bytes
 from schemas import LabelMap
@@ -50,6 +50,24 @@ def read_image_rgb(path: Path) -> Bytes:
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, axis=2)
     return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_image_small(path: Path, size_px: tuple[int, int], width_px: int) -> Bytes | None:
+    """An image as `read_image_rgb`, at a width of `width_px` at most; a JPEG is not decoded to its full size.
+
+    Returns
+    -------
+    None if the image is not of `size_px`, width and height.
+    """
+    data, header = _load(path)
+    if (header.width, header.height) != size_px:
+        return None
+    image = decode_jpeg_small(data, width_px) if header.format == "JPEG" else None
+    image = read_image_rgb(path) if image is None else image
+    if header.width <= width_px:
+        return image
+    size = (width_px, max(1, round(header.height * width_px / header.width)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:

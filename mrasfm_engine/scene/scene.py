@@ -124,6 +124,8 @@ class Scene:
     point_classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     point_patches: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     road: Road | None = None
+    # by camera: where it shows the vehicle itself (h, w), None where it was not found
+    own_cars: list[Bools | None] = field(default_factory=list)
     # (cameras,) of a map: which vehicle each camera is on; empty where all are on one
     rig_of_camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
@@ -132,6 +134,8 @@ class Scene:
             self.point_classes = np.zeros(len(self.points_m), np.uint8)
         if not len(self.point_patches):
             self.point_patches = np.full(len(self.points_m), -1, np.int32)
+        if not self.own_cars:
+            self.own_cars = [None for _ in self.drive.cameras]
         if not len(self.rig_of_camera):
             self.rig_of_camera = np.zeros(len(self.calibration), np.int64)
 

@@ -25,6 +25,7 @@ from mrasfm_engine.synthetic.light import along_street, daylight, dusk
 from mrasfm_engine.synthetic.motion import Motion, drive_motion
 from mrasfm_engine.synthetic.moving_shadows import street_heading
 from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.own_car import OwnCar, own_car_before
 from mrasfm_engine.synthetic.render import Lens, View, develop, render
 from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
 from mrasfm_engine.synthetic.scene_in_time import SceneInTime, build_scene
@@ -35,6 +36,7 @@ from schemas import DriveManifest, Frame, FrameImage, LabelMap, Rig, RoughPose, 
 
 FIRST_EPOCH_US = 1_750_000_000_000_000
 _BETWEEN_DRIVES_US = 3_600_000_000
+TRUE_OWN_CAR_FOLDER = "truth_own_car"  # 255 where a camera sees the vehicle itself
 _WORKERS = 2
 _BAND_MS = 0.5  # of a rolling shutter's rows that are rendered as one instant
 
@@ -176,6 +178,11 @@ def _render_drive(
             (folder / "masks" / camera.name).mkdir(parents=True)
     (folder / "drive.json").write_text(manifest.model_dump_json(exclude_none=True, indent=1) + "\n")
     _write_truth(folder, options, rig, shots, world_from_rig, unit_us, world.layout.ground)
+    own_cars = _own_cars(options, lenses)
+    for camera, own_car in zip(rig, own_cars, strict=True):
+        if own_car is not None:
+            (folder / TRUE_OWN_CAR_FOLDER).mkdir(exist_ok=True)
+            _write(folder / TRUE_OWN_CAR_FOLDER / f"{camera.name}.png", own_car.mask.astype(np.uint8) * 255, [])
     with ThreadPoolExecutor(_WORKERS) as pool:
         tasks = [
             pool.submit(
@@ -188,6 +195,7 @@ def _render_drive(
                 start_us=start_us,
                 drive=drive,
                 motion=motion,
+                own_car=own_cars[shot.camera],
             )
             for shot in shots
         ]
@@ -198,6 +206,14 @@ def _render_drive(
         finally:
             for task in tasks:
                 task.cancel()
+
+
+def _own_cars(options: SynthOptions, lenses: list[Lens]) -> list[OwnCar | None]:
+    """Each camera's view of the vehicle, the same in all drives."""
+    if not options.own_car:
+        return [None] * len(lenses)
+    rng = np.random.default_rng([options.seed, 5])
+    return [own_car_before(lens, rng) for lens in lenses]
 
 
 def _plan(
@@ -338,6 +354,7 @@ def _take(
     start_us: int,
     drive: int,
     motion: Motion,
+    own_car: OwnCar | None,
 ) -> None:
     """Render, expose and write one image and its mask."""
     at_s = (shot.timestamp_us - start_us) / 1e6
@@ -345,6 +362,8 @@ def _take(
         view = _rolling(options, scene, lens, at_s, motion)
     else:
         view = _view(options, scene, lens, at_s, shot.world_from_cam)
+    if own_car is not None:
+        view = own_car.drawn_over(view, lens, scene.light, shot.world_from_cam)
     # An image's noise must not depend on which thread comes first.
     rng = np.random.default_rng([options.seed, 4, drive, shot.unit, shot.camera])
     gain = scene.light.gain * float(np.exp(0.5 * options.exposure_jitter * rng.normal()))

@@ -64,6 +64,7 @@ class SynthOptions:
     time_skew_ms: float = 0.0  # the images of a unit are taken up to that long apart
     readout_ms: float = 0.0  # rolling shutter: from the first row of an image to the last
     drop_images: float = 0.0  # fraction of images that are missing
+    own_car: bool = False  # the front camera sees the vehicle's bonnet, the back camera its boot lid
     occluded_cameras: tuple[str, ...] = ()  # a lorry covers most of their images for half of the drive
 
     gnss: bool = True

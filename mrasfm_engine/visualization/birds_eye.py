@@ -176,18 +176,25 @@ def _nearest_first(scene: Scene) -> Ints:
 def read_view(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
     """An image (h, w, 3), and where it shows what stands still (h, w), None where no mask says so.
 
-    A margin belongs to what moves, as masks are not exact.
+    The own car counts as masked where it was found. A margin belongs to what moves, as masks are not exact.
     """
     image, root, made = scene.drive.images[index], scene.drive.root, scene.features[index].made_mask
+    own_car = scene.own_cars[image.camera]
     rgb = read_image_rgb(root / image.file)
     label_map = scene.drive.manifest.label_map
     if image.mask is not None:
         mask = read_mask(root / image.mask, label_map)
     elif made is not None:
         mask = mask_of_png(made)
-    else:
+    elif own_car is None:
         return rgb, None
-    usable = usable_pixels(class_codes(mask, label_map or LabelMap.cityscapes()))
+    else:
+        mask = None
+    usable = np.ones(rgb.shape[:2], np.bool_)
+    if mask is not None:
+        usable = usable_pixels(class_codes(mask, label_map or LabelMap.cityscapes()))
+    if own_car is not None:
+        usable = usable & ~own_car
     side = 2 * max(1, round(MASK_MARGIN_SHARE * rgb.shape[1])) + 1
     return rgb, cv2.erode(usable.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 

@@ -26,6 +26,7 @@
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
 | 24 | which of many seams is wrong, by loops of simulated scenes |
+| 25 | the own car in images without masks, rendered and real; a bar with the time over a fifth of all images |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -59,6 +60,7 @@ from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
 from tests.benchmarks.occlusion import occlusion
+from tests.benchmarks.own_car import bar_with_time, real_own_car, rendered_own_car
 from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
@@ -113,6 +115,7 @@ LINES = {
     "22": Line(timed=(surround_peers,)),
     "23": Line(untimed=(simulated_routes,)),
     "24": Line(timed=(seam_graphs,)),
+    "25": Line(untimed=(real_own_car,), by_seed=(rendered_own_car, bar_with_time)),
 }
 
 

@@ -15,11 +15,12 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.synthetic import World, gnss, small_options
 from mrasfm_engine.synthetic.calibration import given_cameras
-from mrasfm_engine.synthetic.drive_writer import render_drives
+from mrasfm_engine.synthetic.drive_writer import TRUE_OWN_CAR_FOLDER, render_drives
 from mrasfm_engine.synthetic.mesh import Label
 from mrasfm_engine.synthetic.motion import drive_motion
 from mrasfm_engine.synthetic.occluder import place_truck
 from mrasfm_engine.synthetic.options import SpeedProfile, SynthOptions
+from mrasfm_engine.synthetic.own_car import UNLABELLED
 from mrasfm_engine.synthetic.rigs import TrueCamera, mounts, true_cameras
 from mrasfm_engine.synthetic.streets import lay_out
 from schemas import DriveManifest, Pose, SemanticClass
@@ -358,3 +359,26 @@ def test_command_line_reaches_the_options() -> None:
     assert options.occluded_cameras == ("front", "back")
     assert not options.gnss
     assert options.ramp_percent == 6.0
+
+
+def test_own_car(tmp_path: Path) -> None:
+    """The front camera sees the bonnet, the back camera the boot lid; only there images change."""
+    options = SynthOptions(cameras=4, **TINY)
+    plain, own = tmp_path / "plain", tmp_path / "own"
+    render_drives(options, plain)
+    render_drives(replace(options, own_car=True), own)
+    assert not (plain / TRUE_OWN_CAR_FOLDER).exists()
+    assert {path.name for path in (own / TRUE_OWN_CAR_FOLDER).iterdir()} == {"front.png", "back.png"}
+    for camera in ("front", "back"):
+        mask = cv2.imread(str(own / TRUE_OWN_CAR_FOLDER / f"{camera}.png"), cv2.IMREAD_UNCHANGED) == 255
+        assert 0.05 < mask.mean() < 0.3
+        assert mask[-1].any()
+        assert not mask[: mask.shape[0] // 2].any()
+        labels = cv2.imread(str(own / f"masks/{camera}/000000.png"), cv2.IMREAD_UNCHANGED)
+        assert (labels[mask] == UNLABELLED).all()
+        before, after = (cv2.imread(str(folder / f"images/{camera}/000000.jpg")).astype(int) for folder in (plain, own))
+        away = ~cv2.dilate(mask.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool)
+        assert np.abs(after - before)[away].max() <= 20  # the paint's border touches neighbouring blocks of the JPEG
+        later = cv2.imread(str(own / f"images/{camera}/000001.jpg")).astype(int)
+        assert 1 < np.abs(later - after)[mask].mean() < 60  # what the paint mirrors changes
+    assert (own / "images/left/000000.jpg").read_bytes() == (plain / "images/left/000000.jpg").read_bytes()
