@@ -26,6 +26,7 @@
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
 | 24 | which of many seams is wrong, by loops of simulated scenes |
+| 27 | the road's picture of the best views: markings against the painted ones |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -63,6 +64,7 @@ from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
+from tests.benchmarks.road_picture import real_pictures, rendered_markings
 from tests.benchmarks.road_shapes import road_shapes
 from tests.benchmarks.seam_graphs import seam_graphs
 from tests.benchmarks.semantics import real_road, shadowed_road
@@ -113,6 +115,7 @@ LINES = {
     "22": Line(timed=(surround_peers,)),
     "23": Line(untimed=(simulated_routes,)),
     "24": Line(timed=(seam_graphs,)),
+    "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
 }
 
 
