@@ -258,7 +258,8 @@ class OutputConfig(_Section):
     """Files besides the scene itself."""
 
     pictures: bool = Field(
-        True, description="the road from above before and after recalibration, as PNG; reads every image again"
+        True,
+        description="the road from above: a GeoTIFF, and PNGs before and after recalibration; reads every image again",
     )
 
 

@@ -10,6 +10,7 @@ from mrasfm_engine import stages
 from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.export.publishing import scratch_folder
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.preflight.drive_reader import read_drive
@@ -75,11 +76,12 @@ def reconstruct(
         matches = stages.matches(run, features, prior)
         model = stages.mapping(run, features, matches, prior)
         scene = stages.scene(run, model, features, matches, prior)
-        pictures = stages.pictures(run, scene)
-    if cancel():
-        raise CancelledError
-    run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
-    run.begin(Stage.EXPORT)
-    write_scene(scene, out, run.report, pictures)
+        with scratch_folder(out) as scratch:
+            pictures = stages.pictures(run, scene, scratch)
+            if cancel():
+                raise CancelledError
+            run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
+            run.begin(Stage.EXPORT)
+            write_scene(scene, out, run.report, pictures)
     run.progress(Stage.EXPORT, 1, 1)
     return run.report

@@ -17,6 +17,7 @@ import numpy as np
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, ReconstructionError
+from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_finding
 from mrasfm_engine.io import left_out_images
@@ -437,8 +438,8 @@ def scene(
     return result
 
 
-def pictures(run: Run, result: Scene) -> dict[str, bytes]:
-    """The pictures of a scene as PNG files by name; see `draw_pictures`."""
+def pictures(run: Run, result: Scene, scratch: Path) -> PictureFiles:
+    """The pictures of a scene as files by name, large ones in the folder `scratch`; see `draw_pictures`."""
     if not run.config.output.pictures:
         return {}
 
@@ -449,7 +450,7 @@ def pictures(run: Run, result: Scene) -> dict[str, bytes]:
 
     started = time.perf_counter()
     run.begin(Stage.PICTURES)
-    files, report = draw_pictures(result, seed=run.config.seed, progress=step)
+    files, report = draw_pictures(result, scratch=scratch, seed=run.config.seed, progress=step)
     seconds = round(time.perf_counter() - started, 3)
     run.report["stages"].append({"stage": Stage.PICTURES, "seconds": seconds, "reused": False, **report})
     run.progress(Stage.PICTURES, 1, 1)

@@ -6,7 +6,7 @@ table covers is refused as well: nothing is published unread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import comparisons, readers
 from mrasfm_engine.export.colmap import text_model_fits
 from mrasfm_engine.export.comparisons import Rows
+from mrasfm_engine.export.picture_files import LargeFile, PictureFiles
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import PICTURES_FOLDER, REPORT_FILE
 
@@ -47,7 +48,7 @@ def binary_model_checks(scene: Scene) -> list[Check]:
     ]
 
 
-def common_checks(scene: Scene, pictures: Mapping[str, bytes]) -> list[Check]:
+def common_checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
     """Checks of the other files that scenes and maps have alike."""
     text = [
         Check("model/text/images.txt", readers.images_text, partial(comparisons.images, scene)),
@@ -60,11 +61,14 @@ def common_checks(scene: Scene, pictures: Mapping[str, bytes]) -> list[Check]:
         Check("frame.json", readers.json_object, partial(comparisons.frame, scene)),
         Check("poses.json", readers.json_object, partial(comparisons.poses, scene)),
         Check(REPORT_FILE, readers.json_object, comparisons.nothing),
-        *(
-            Check(f"{PICTURES_FOLDER}/{name}", Path.read_bytes, partial(comparisons.content, data))
-            for name, data in pictures.items()
-        ),
+        *(_picture_check(f"{PICTURES_FOLDER}/{name}", data) for name, data in pictures.items()),
     ]
+
+
+def _picture_check(name: str, data: bytes | LargeFile) -> Check:
+    if isinstance(data, LargeFile):
+        return Check(name, readers.sha256, partial(comparisons.content, data.sha256))
+    return Check(name, Path.read_bytes, partial(comparisons.content, data))
 
 
 class ReadBack:

@@ -6,16 +6,18 @@ import errno
 import os
 import secrets
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from mrasfm_engine.errors import StorageError
+from mrasfm_engine.errors import StorageError, storage_error
 from schemas.artifacts import REPORT_FILE
 
 COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
+SCRATCH_PREFIX = ".scratch-"
 
 
 @contextmanager
@@ -52,14 +54,39 @@ def publishing(out: Path, needed_bytes: int, *, replaced: Sequence[str] = ()) ->
         raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
 
 
+@contextmanager
+def scratch_folder(out: Path) -> Iterator[Path]:
+    """An empty folder inside `out`, on its disk, that is gone when the `with` block ends; those of killed runs go too.
+
+    Raises
+    ------
+    StorageError
+        Where it cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(out, f"{SCRATCH_PREFIX}*")
+        scratch = Path(tempfile.mkdtemp(prefix=SCRATCH_PREFIX, dir=out))
+    except OSError as error:
+        raise storage_error(out, error) from error
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _remove_leftovers(folder: Path, pattern: str) -> None:
+    for leftover in folder.glob(pattern):
+        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
 def _prepare(needed: int, out: Path, home: Path) -> None:
     """Make the folder to work in, clear what killed runs left there, and see that the files will fit."""
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
     home.mkdir(parents=True, exist_ok=True)
-    for leftover in home.glob(f".{out.name}.partial-*"):
-        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
-            shutil.rmtree(leftover, ignore_errors=True)
+    _remove_leftovers(home, f".{out.name}.partial-*")
     free = shutil.disk_usage(home).free
     if free < needed:
         raise StorageError(

@@ -31,20 +31,19 @@ from mrasfm_engine.export import (
     road,
 )
 from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
+from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
 from schemas.artifacts import OWN_CAR_FOLDER, PICTURES_FOLDER
 
-NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
+NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
 
 
-def write_scene(
-    scene: Scene, out: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes] = NO_PICTURES
-) -> None:
+def write_scene(scene: Scene, out: Path, report: Mapping[str, Any], pictures: PictureFiles = NO_PICTURES) -> None:
     """Write all files of a scene into the folder `out`.
 
     They are written into a temporary folder, read back and compared with the scene, and only then moved: an interrupted
@@ -56,7 +55,7 @@ def write_scene(
     report
         What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths.
     pictures
-        PNG files of `pictures/` by name; those of an earlier scene there are removed.
+        Files of `pictures/` by name, large ones on the disk of `out`; those of an earlier scene there are removed.
 
     Raises
     ------
@@ -89,7 +88,7 @@ def summary(scene: Scene) -> dict[str, Any]:
     return figures
 
 
-def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes]) -> None:
+def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: PictureFiles) -> None:
     read_back = ReadBack(work)
     figures = write_common(scene, work, pictures, read_back)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
@@ -107,7 +106,7 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: Mappin
     read_back.require_all()
 
 
-def write_common(scene: Scene, work: Path, pictures: Mapping[str, bytes], read_back: ReadBack) -> dict[str, Any]:
+def write_common(scene: Scene, work: Path, pictures: PictureFiles, read_back: ReadBack) -> dict[str, Any]:
     """Write what scenes and maps have alike: pictures, model and points; the figures of `report.json`'s `summary`."""
     picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
     model, figures = work / "model", summary(scene)
@@ -123,7 +122,7 @@ def write_common(scene: Scene, work: Path, pictures: Mapping[str, bytes], read_b
     return figures
 
 
-def _checks(scene: Scene, pictures: Mapping[str, bytes]) -> list[Check]:
+def _checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
     road_check = Check(ROAD_FILE, readers.json_object, partial(comparisons.road, scene))
     registered = np.flatnonzero(scene.unit_registered)
     return [

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry.parabola import vertex
 from mrasfm_engine.types import Floats, Floats32
-from mrasfm_engine.visualization.mosaic import GIVEN, REFINED, Grid, Mosaic
+from mrasfm_engine.visualization.mosaic import Grid, Mosaic
+from mrasfm_engine.visualization.views import GIVEN, REFINED
 
 FINE_CELL_M = 0.05  # with larger cells, displacements of a few centimetres are not seen
 PLOT_SIDE_M = 9.6  # the roadside on both sides of the trajectory, and where it is searched
@@ -25,6 +26,10 @@ MAX_BLOCKS = 600  # those of most contrast
 SMOOTHING_M = 0.03  # against noise, and so that a sharper and a softer image compare
 MIN_PEAK = 0.6  # correlation at which a displacement counts as found
 MIN_BLOCKS = 12
+BOOTSTRAPS = 400
+SIGMAS = 2.0  # of a difference of correlations, below which it is none
+MANY = 0.25  # of the pieces
+HIGH = 0.9  # correlation, above which markings are in one place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,20 +38,27 @@ class Agreement:
 
     Attributes
     ----------
-    blocks
-        How many pieces of ground were compared.
-    correlation
-        Median normalised cross-correlation of the two views where they lie, -1 to 1.
+    correlations
+        (blocks,) normalised cross-correlation of the two views where they lie, -1 to 1.
     displaced_blocks
         Pieces whose displacement could be found.
     displacement_m
         Their median displacement between the two views.
     """
 
-    blocks: int
-    correlation: float
+    correlations: Floats
     displaced_blocks: int
     displacement_m: float
+
+    @property
+    def blocks(self) -> int:
+        """Number of pieces that were compared."""
+        return len(self.correlations)
+
+    @property
+    def correlation(self) -> float:
+        """Median of their correlations."""
+        return float(np.median(self.correlations))
 
 
 def plots_along(trajectory_m: Floats) -> list[Grid]:
@@ -150,8 +162,43 @@ def _compare(blocks: Sequence[_Block], which: int, margin: int, cell_m: float) -
             dj = vertex(score[i, j - 1], score[i, j], score[i, j + 1])
             displacements.append(cell_m * float(np.hypot(i + di - margin, j + dj - margin)))
     return Agreement(
-        blocks=len(blocks),
-        correlation=float(np.median(correlations)),
+        correlations=np.array(correlations),
         displaced_blocks=len(displacements),
         displacement_m=float(np.median(displacements)) if displacements else float("nan"),
     )
+
+
+def why_not_better(given: Agreement, refined: Agreement, *, changed: bool) -> str | None:
+    """Say why the views do not agree better with the refined calibration; None where they do.
+
+    Parameters
+    ----------
+    changed
+        Whether the calibrations differ at all.
+    """
+    if not changed:
+        return "the calibration was held"
+    gain = refined.correlation - given.correlation
+    sigma = _sigma_of_gain(given.correlations, refined.correlations)
+    if gain > SIGMAS * sigma:
+        return None
+    if abs(gain) <= SIGMAS * sigma:
+        return f"the difference of {gain:+.3f} is within {SIGMAS:g} of its standard errors of {sigma:.3f}"
+    found = f"the views agree less by {-gain:.3f}, with a standard error of {sigma:.3f}"
+    without = float((np.maximum(given.correlations, refined.correlations) < MIN_PEAK).mean())
+    if without > MANY:
+        return (
+            f"{found}; {without:.0%} of the pieces agree with neither calibration: they show what moves or stands there"
+        )
+    if given.correlation > HIGH and refined.correlation > HIGH:
+        return (
+            f"{found}; they agree well with both calibrations, and the refined one fits the whole scene, the height of "
+            "the ground not included"
+        )
+    return f"{found}; the refined calibration fits the points of the scene better than the ground as it was estimated"
+
+
+def _sigma_of_gain(given: Floats, refined: Floats) -> float:
+    """Standard error of the difference of two medians over the same pieces, by bootstrap."""
+    drawn = np.random.default_rng(0).integers(0, len(given), (BOOTSTRAPS, len(given)))
+    return float(np.std(np.median(refined[drawn], axis=1) - np.median(given[drawn], axis=1)))

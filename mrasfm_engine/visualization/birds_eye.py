@@ -7,23 +7,27 @@ not. The poses of the vehicle are the final ones in both.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import pack_camera
+from mrasfm_engine.export.picture_files import LargeFile
 from mrasfm_engine.io.images import mask_of_png, read_image_rgb, read_mask
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import class_codes, usable_pixels
-from mrasfm_engine.types import Bools, Bytes, CountProgress, Floats, Ints
-from mrasfm_engine.visualization.agreement import FINE_CELL_M, Agreement, measure_agreement, plots_along
+from mrasfm_engine.types import Bools, Bytes, CountProgress, Floats
+from mrasfm_engine.visualization.agreement import FINE_CELL_M, Agreement, measure_agreement, plots_along, why_not_better
 from mrasfm_engine.visualization.drawing import Framed, framed
-from mrasfm_engine.visualization.exposure import camera_gains, exposure_gains
-from mrasfm_engine.visualization.ground import GroundHeights, estimate_ground
-from mrasfm_engine.visualization.mosaic import GIVEN, REFINED, Grid, Mosaic, View, make_mosaics
+from mrasfm_engine.visualization.exposure import camera_gains
+from mrasfm_engine.visualization.ground import GroundTiles
+from mrasfm_engine.visualization.mosaic import Grid, Mosaic, MosaicPainter
+from mrasfm_engine.visualization.plan import Plan, plan_of
+from mrasfm_engine.visualization.road_picture import OptionalPainter, RoadPicture, finish_road, painting_road
+from mrasfm_engine.visualization.views import GIVEN, REFINED, Painter, paint_views
 from schemas import LabelMap, SemanticClass
 
 BEFORE, AFTER = "birds_eye_before.png", "birds_eye_after.png"
@@ -33,7 +37,6 @@ MASK_MARGIN_SHARE = 0.004  # of an image's width, around what is masked
 OWN_CAR_MARGIN_M = 0.4  # around the cameras
 SMALL_CAR_M = np.array([4.4, 1.9])  # length and width
 EMPTY = (190, 190, 190)  # ground that no camera sees
-MIN_WAY_M = 3.0  # a shorter one has no direction of its own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,107 +44,57 @@ class BirdsEye:
     """Pictures by file name (none where there is nothing to show) and what the report says of them."""
 
     pictures: dict[str, Bytes] = field(default_factory=dict)
+    files: dict[str, bytes | LargeFile] = field(default_factory=dict)  # what is no picture in memory
     report: dict[str, Any] = field(default_factory=dict)
+    road_report: dict[str, Any] = field(default_factory=dict)
 
 
-def birds_eye(scene: Scene, *, seed: int = 0, progress: CountProgress | None = None) -> BirdsEye:
-    """Draw a scene's road from above, before and after recalibration.
+def birds_eye(
+    scene: Scene, *, seed: int = 0, progress: CountProgress | None = None, scratch: Path | None = None
+) -> BirdsEye:
+    """Draw a scene's road from above, before and after recalibration, and as one picture.
 
     Parameters
     ----------
     progress
         Called as progress(images done, images); may raise to stop.
+    scratch
+        An empty folder for the picture of the whole road, which lies on disk; without it there is none.
 
     Returns
     -------
     BirdsEye
         Without pictures where no ground was found or no camera sees it; `report["not_drawn"]` then says why.
     """
-    if not scene.unit_registered.any():
-        return BirdsEye(report={"not_drawn": "no unit is registered"})
-    plan_from_world = _plan_from_world(scene)
-    plan_from_rig = plan_from_world @ scene.world_from_rig[scene.unit_registered]
-    cameras = np.stack([c.rig_from_cam[:3, 3] for c in scene.calibration])
-    ground = estimate_ground(
-        se3.apply(plan_from_world, scene.points_m), plan_from_rig, cameras, rng=np.random.default_rng(seed)
-    )
-    if ground is None:
-        return BirdsEye(report={"not_drawn": "too few points of the scene lie on the ground along the trajectory"})
-    trajectory_m = plan_from_rig[:, :2, 3]
-    mosaic, *plots = _mosaics_of(scene, plan_from_world, ground, trajectory_m, progress)
-    if not mosaic.images_used:
-        return BirdsEye(report={"not_drawn": "no camera sees the road"})
-    agreement = measure_agreement(plots or [mosaic], trajectory_m)
-    before, after = (_picture(scene, mosaic, which, agreement, plan_from_world) for which in (GIVEN, REFINED))
-    level_m = float(np.median(ground.height_m(trajectory_m)))
-    report = _report(scene, mosaic, agreement)
-    report["world_from_pixel"] = _world_from_pixel(mosaic, se3.inverse(plan_from_world), after.top_px, level_m).tolist()
-    return BirdsEye(pictures={BEFORE: before.picture, AFTER: after.picture}, report=report)
-
-
-def _plan_from_world(scene: Scene) -> Floats:
-    """The plan frame: z is up, x the direction in which the trajectory extends most.
-
-    Where the scene's frame does not know what is up, it is the vehicle's mean up axis.
-    """
-    poses = scene.world_from_rig[scene.unit_registered]
-    upright = scene.georeference is not None or scene.rough_world_from_local is not None
-    up = np.array([0.0, 0.0, 1.0]) if upright else poses[:, :3, 2].mean(0)
-    up /= np.linalg.norm(up)
-    position = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
-    flat = position - np.outer(position @ up, up)
-    _, _, axes = np.linalg.svd(flat, full_matrices=False)
-    along, trajectory = axes[0], flat[-1] - flat[0]
-    if np.ptp(flat @ along) < MIN_WAY_M:
-        along = trajectory = poses[:, :3, 0].mean(0)
-    along = along - (along @ up) * up
-    along *= (1.0 if along @ trajectory >= 0 else -1.0) / np.linalg.norm(along)
-    rotation = np.stack([along, np.cross(up, along), up])
-    return se3.transform(rotation, -rotation @ poses[:, :3, 3].mean(0))
-
-
-def _mosaics_of(
-    scene: Scene,
-    plan_from_world: Floats,
-    ground: GroundHeights,
-    trajectory_m: Floats,
-    progress: CountProgress | None,
-) -> list[Mosaic]:
-    """Mosaic of the picture; where its cells are too coarse to compare cameras, those of fine plots along the path."""
-    images = _nearest_first(scene)
-    refined = scene.world_from_cam
-    gains = exposure_gains(scene)
-    given = scene.drive.rig_from_cam
-    views = []
-    for i in images:
-        image = scene.drive.images[i]
-        camera, calibration = scene.drive.cameras[image.camera], scene.calibration[image.camera]
-        rig = refined[i] @ se3.inverse(calibration.rig_from_cam)  # of the image's own time
-        packed = [pack_camera(camera.model, p) for p in (camera.params, calibration.params)]
-        views.append(
-            View(
-                camera=image.camera,
-                plan_from_cam=plan_from_world @ np.stack([rig @ given[image.camera], refined[i]]),
-                params=np.stack([p for _, p in packed]),
-                kind=packed[0][0],
-                size_px=(camera.width, camera.height),
-                plan_from_rig=plan_from_world @ rig,
-                gain=gains[i],
-            )
+    plan = plan_of(scene, seed=seed)
+    if isinstance(plan, str):
+        return BirdsEye(report={"not_drawn": plan})
+    heights, own_car_m = GroundTiles(plan.ground), _own_car_m(scene)
+    painter = MosaicPainter(grids_along(plan.trajectory_m), heights, own_car_m=own_car_m)
+    with ExitStack() as stack:
+        painters: list[Painter] = [painter]
+        if scratch is not None:
+            road = stack.enter_context(painting_road(plan, heights, scratch, own_car_m))
+            optional = OptionalPainter(road)
+            painters.append(optional)
+        paint_views(
+            plan.views,
+            lambda index: read_view(scene, int(plan.images[index])),
+            painters,
+            step=lambda done: None if progress is None else progress(done, len(plan.views)),
         )
-
-    def step(done: int) -> None:
-        if progress is not None:
-            progress(done, len(views))
-
-    return make_mosaics(
-        views,
-        grids_along(trajectory_m),
-        ground,
-        lambda index: read_view(scene, int(images[index])),
-        own_car_m=_own_car_m(scene),
-        step=step,
-    )
+        mosaic, *plots = painter.mosaics()
+        if not mosaic.images_used:
+            return BirdsEye(report={"not_drawn": "no camera sees the road"})
+        drawn = RoadPicture()
+        if scratch is not None:
+            drawn = finish_road(scene, plan, road, scratch, optional.error)
+    agreement = measure_agreement(plots or [mosaic], plan.trajectory_m)
+    before, after = (_picture(scene, mosaic, which, agreement, plan.plan_from_world) for which in (GIVEN, REFINED))
+    report = _report(scene, mosaic, agreement)
+    report["world_from_pixel"] = _world_from_pixel(mosaic, plan, after.top_px).tolist()
+    pictures = {BEFORE: before.picture, AFTER: after.picture, **drawn.pictures}
+    return BirdsEye(pictures=pictures, files=drawn.files, report=report, road_report=drawn.report)
 
 
 def grids_along(trajectory_m: Floats) -> list[Grid]:
@@ -162,15 +115,6 @@ def _own_car_m(scene: Scene) -> Floats | None:
     low, high = cameras.min(0), cameras.max(0)
     half = np.maximum((high - low) / 2 + OWN_CAR_MARGIN_M, SMALL_CAR_M / 2)
     return np.stack([(low + high) / 2 - half, (low + high) / 2 + half])
-
-
-def _nearest_first(scene: Scene) -> Ints:
-    """Registered images in an order in which most ground is seen from near first, so that little is painted twice:
-    cameras that look forward approach it, so their last images come first."""
-    images = np.flatnonzero(scene.image_registered)
-    unit = np.array([scene.drive.images[i].unit for i in images])
-    forward = np.array([scene.calibration[scene.drive.images[i].camera].rig_from_cam[0, 2] > 0 for i in images])
-    return images[np.argsort(np.where(forward, -unit, unit), kind="stable")]
 
 
 def read_view(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
@@ -235,22 +179,11 @@ def chequerboard(mosaic: Mosaic, which: int) -> Bytes:
     return cut
 
 
-def _world_from_pixel(mosaic: Mosaic, world_from_plan: Floats, top_px: int, level_m: float) -> Floats:
-    """The affine map (2, 3) from (u right, v down, 1) in the pictures, pixels, to x and y of the scene's local frame.
-
-    The centre of the top left pixel is at (0.5, 0.5).
-    """
+def _world_from_pixel(mosaic: Mosaic, plan: Plan, top_px: int) -> Floats:
+    """The affine map (2, 3) from (u right, v down, 1) in the pictures to x and y of the scene; see `Plan`."""
     grid, (rows, columns) = mosaic.grid, mosaic.seen()
-    plan_from_pixel = np.array(
-        [
-            [grid.cell_m, 0.0, grid.left_m + columns.start * grid.cell_m],
-            [0.0, -grid.cell_m, grid.top_m - (rows.start - top_px) * grid.cell_m],
-            [0.0, 0.0, level_m],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    result: Floats = (world_from_plan @ plan_from_pixel)[:2]
-    return result
+    left_m = grid.left_m + columns.start * grid.cell_m
+    return plan.world_from_pixel(left_m, grid.top_m - (rows.start - top_px) * grid.cell_m, grid.cell_m)
 
 
 def calibration_changed(scene: Scene) -> bool:
@@ -277,4 +210,7 @@ def _report(scene: Scene, mosaic: Mosaic, agreement: tuple[Agreement, Agreement]
         result[name] = {"blocks": of.blocks, "correlation": of.correlation, "displaced_blocks": of.displaced_blocks}
         if np.isfinite(of.displacement_m):
             result[name]["displacement_m"] = of.displacement_m
+    reason = why_not_better(*agreement, changed=result["calibration_changed"])
+    if reason is not None:
+        result["not_better"] = reason
     return result

@@ -6,7 +6,8 @@ import numpy as np
 
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats
-from mrasfm_engine.visualization.mosaic import REFINED, Mosaic
+from mrasfm_engine.visualization.mosaic import Mosaic
+from mrasfm_engine.visualization.views import REFINED
 
 ROUNDS = 6
 SHRINKAGE = 20.0  # observations that the guess "as bright as all others" counts for

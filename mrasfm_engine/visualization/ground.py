@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -18,7 +19,12 @@ BELOW_CAMERAS_M = (0.3, 6.0)  # the ground is that far below the lowest camera
 MAX_SLOPE = 0.12  # of the ground against the rig
 INLIER_M = 0.08
 MIN_POINTS = 40
-MIN_SHARE = 0.15  # of the points below the cameras, that must lie in one plane
+MIN_SHARE = 0.1  # of the points below the cameras, that must lie in one plane: between cars few do
+# Bonnets and window sills of cars that stand in line make a plane too, with the road's points below it. Below the road
+# are only wrong points and reflections.
+BELOW_M = 0.25
+SIMILAR_M = 0.4  # two points of one level 7 m apart on a slope of 0.06: the road's, seldom those of a car beside it
+MAX_SHARE_BELOW = 0.1  # of the plane's own points
 SAMPLED_POINTS = 4000
 HYPOTHESES = 400
 STATION_M = 2.0  # between the patches
@@ -129,27 +135,42 @@ def estimate_ground(
 
 
 def _best_plane(points: Floats, weight: Floats, rng: np.random.Generator) -> Floats | None:
-    """The plane z = p0 + p1 x + p2 y (3,) that most points (n, 3) lie on, nearly level; None where few do."""
+    """The plane z = p0 + p1 x + p2 y (3,) that most points (n, 3) lie on and few below, nearly level; None where there
+    is none."""
     chosen = rng.permutation(np.flatnonzero(weight > SMALLEST_WEIGHT))[:SAMPLED_POINTS]
     if len(chosen) < MIN_POINTS:
         return None
+    chosen = chosen[np.argsort(points[chosen, 2], kind="stable")]
     sample, weight = points[chosen], weight[chosen]
     rows = np.column_stack([np.ones(len(sample)), sample[:, :2]])
     best, plane = 0.0, None
-    for _ in range(HYPOTHESES):
-        three = rng.choice(len(sample), 3, replace=False, p=weight / weight.sum())
+    for three in _similar_heights(sample[:, 2], weight, rng):
         try:
             candidate = np.linalg.solve(rows[three], sample[three, 2])
         except np.linalg.LinAlgError:
             continue
         if np.hypot(candidate[1], candidate[2]) > MAX_SLOPE:
             continue
-        score = float(weight[np.abs(rows @ candidate - sample[:, 2]) < INLIER_M].sum())
-        if score > best:
+        above = sample[:, 2] - rows @ candidate
+        score = float(weight[np.abs(above) < INLIER_M].sum())
+        if score > best and weight[above < -BELOW_M].sum() < MAX_SHARE_BELOW * score:
             best, plane = score, candidate
     if plane is None or best < MIN_SHARE * weight.sum():
         return None
     return _fitted(rows, sample[:, 2], weight, start=plane)
+
+
+def _similar_heights(height_m: Floats, weight: Floats, rng: np.random.Generator) -> Iterator[Ints]:
+    """Triples of points, of ascending heights (n,), as their weights have it: a first one and two of about its height.
+
+    Where few points are the ground's, hardly any three that have nothing to do with each other are all three.
+    """
+    total = np.concatenate([[0.0], np.cumsum(weight)])
+    for _ in range(HYPOTHESES):
+        first = height_m[min(int(np.searchsorted(total, rng.uniform(0.0, total[-1]), side="right")), len(weight)) - 1]
+        low, high = np.searchsorted(height_m, [first - SIMILAR_M, first + SIMILAR_M])
+        chosen = np.searchsorted(total, rng.uniform(total[low], total[high], 3), side="right") - 1
+        yield np.minimum(chosen, len(weight) - 1)
 
 
 def _fitted(rows: Floats, height_m: Floats, weight: Floats, *, start: Floats, sigma: Floats | None = None) -> Floats:

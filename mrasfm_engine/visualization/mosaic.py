@@ -8,30 +8,33 @@ that the pictures differ by nothing but the calibration.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import project, unproject_pixels
+from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
-from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundHeights, GroundTiles
+from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
+from mrasfm_engine.visualization.views import (
+    MIN_RESOLUTION_PX,
+    OWN_CAR_LEVEL,
+    VIEW_M,
+    Read,
+    View,
+    height_at,
+    inside_car,
+    paint_views,
+    place_view,
+    sample,
+)
 
-GIVEN, REFINED = 0, 1
 RADIUS_M = 12.0  # beside the trajectory
-VIEW_M = 15.0  # how far from a camera its image is used
 MIN_CELL_M = 0.025
 MAX_CELLS = 12_000_000  # bounds the picture, and what a mosaic holds to 22 bytes times that
 MAX_SIDE_CELLS = 16_000  # with its frame it stays below 16384 pixels: browsers and graphics cards show no more
-MIN_RESOLUTION_PX = 5.0  # of an image on the ground, pixels a metre along the line of sight
-OWN_CAR_LEVEL = 0.5  # of the cameras' height: up to there the car's body hides the ground
-FOOTPRINT_MARGIN_M = 1.0  # around where the corners of an image meet the ground: it is not level
-PREFETCHED = 3  # images that wait decoded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,19 +76,6 @@ class Grid:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
-    """One image that may see the ground; poses are `plan_from_cam` (2, 4, 4) as given and as refined."""
-
-    camera: int
-    plan_from_cam: Floats
-    params: Floats  # (2, 8) as given and as refined
-    kind: int
-    size_px: tuple[int, int]  # width, height
-    plan_from_rig: Floats  # (4, 4)
-    gain: Floats  # (3,)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Mosaic:
     """Views of every cell by the two best cameras.
 
@@ -111,33 +101,70 @@ class Mosaic:
         return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
+class MosaicPainter:
+    """Paints the ground of every grid; see `views.Painter`.
+
+    Parameters
+    ----------
+    own_car_m
+        Rectangle (2, 2) of the rig's x and y, lowest first, that the car itself covers; None where masks know the car.
+    """
+
+    def __init__(self, grids: Sequence[Grid], ground: GroundTiles, *, own_car_m: Floats | None) -> None:
+        self._mosaics = [_empty(grid) for grid in grids]
+        self._ground, self._own_car_m = ground, own_car_m
+        self._used = np.zeros(len(grids), dtype=np.int64)
+
+    def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
+        """Paint one view; see `views.Painter`."""
+        coarsest_m = max((mosaic.grid.cell_m for mosaic in self._mosaics), default=0.0)
+        placed = place_view(view, self._ground, margin_m=coarsest_m)
+        if placed is None:
+            return
+        for k, mosaic in enumerate(self._mosaics):
+            grid, bounds = mosaic.grid, mosaic.grid.within(placed.low_m, placed.high_m)
+            if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
+                continue
+            painted = _paint(
+                rgb,
+                np.ones((1, 1), np.bool_) if usable is None else usable,
+                usable is not None,
+                placed.cam_from_plan,
+                placed.centre_m,
+                placed.rig_from_plan,
+                np.zeros((2, 2)) if self._own_car_m is None else self._own_car_m,
+                view.kind,
+                view.params,
+                placed.widest,
+                view.gain,
+                view.camera + 1,
+                placed.heights_m,
+                np.array([grid.left_m, grid.top_m, grid.cell_m, *placed.first_m]),
+                bounds,
+                mosaic.owner,
+                mosaic.score,
+                mosaic.color,
+            )
+            self._used[k] += painted > 0
+
+    def mosaics(self) -> list[Mosaic]:
+        """The mosaics of all grids, of what has been painted."""
+        return [replace(mosaic, images_used=int(n)) for mosaic, n in zip(self._mosaics, self._used, strict=True)]
+
+
 def make_mosaics(
     views: Sequence[View],
     grids: Sequence[Grid],
     ground: GroundHeights,
-    read: Callable[[int], tuple[Bytes, Bools | None]],
+    read: Read,
     *,
     own_car_m: Floats | None,
     step: Callable[[int], None] = lambda done: None,
 ) -> list[Mosaic]:
-    """Paint the ground of every grid with all views; every image is read once.
-
-    Parameters
-    ----------
-    read
-        Image (h, w, 3) and usable pixels (h, w), or None where all are, of a view by its position in `views`.
-    own_car_m
-        Rectangle (2, 2) of the rig's x and y, lowest first, that the car itself covers; None where masks know the car.
-    step
-        Called after every view with how many are done; may raise.
-    """
-    mosaics = [_empty(grid) for grid in grids]
-    heights = GroundTiles(ground)
-    used = np.zeros(len(grids), dtype=np.int64)
-    for done, (index, rgb, usable) in enumerate(_read_ahead(len(views), read), 1):
-        used += _paint_view(mosaics, views[index], rgb, usable, heights, own_car_m)
-        step(done)
-    return [replace(mosaic, images_used=int(n)) for mosaic, n in zip(mosaics, used, strict=True)]
+    """Paint the ground of every grid with all views; see `MosaicPainter` and `views.paint_views`."""
+    painter = MosaicPainter(grids, GroundTiles(ground), own_car_m=own_car_m)
+    paint_views(views, read, [painter], step=step)
+    return painter.mosaics()
 
 
 def _empty(grid: Grid) -> Mosaic:
@@ -151,113 +178,6 @@ def _empty(grid: Grid) -> Mosaic:
     )
 
 
-def _read_ahead(
-    count: int, read: Callable[[int], tuple[Bytes, Bools | None]]
-) -> Iterator[tuple[int, Bytes, Bools | None]]:
-    """Images in order, decoded while others are painted, never more than a few at a time."""
-    with ThreadPoolExecutor(1) as pool:
-        todo = iter(range(count))
-        waiting = [(i, pool.submit(read, i)) for i in islice(todo, PREFETCHED)]
-        try:
-            while waiting:
-                index, image = waiting.pop(0)
-                rgb, usable = image.result()
-                waiting += [(i, pool.submit(read, i)) for i in islice(todo, 1)]
-                yield index, rgb, usable
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def widest_angle(kind: int, params: Floats, size_px: tuple[int, int]) -> float:
-    """Tangent of the largest angle between the axis and a pixel of the image's border.
-
-    Beyond it distortion polynomials fold back, and points far outside the view seem to lie inside.
-    """
-    width, height = size_px
-    u, v = np.linspace(0, width, 17), np.linspace(0, height, 17)
-    border = np.concatenate(
-        [np.column_stack([u, np.full(17, e)]) for e in (0, height)]
-        + [np.column_stack([np.full(17, e), v]) for e in (0, width)]
-    )
-    rays = unproject_pixels(kind, params, border)
-    return float((np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(rays[:, 2], 1e-3)).max())
-
-
-def _paint_view(
-    mosaics: Sequence[Mosaic],
-    view: View,
-    rgb: Bytes,
-    usable: Bools | None,
-    ground: GroundTiles,
-    own_car_m: Floats | None,
-) -> Ints:
-    """Paint one view; for every mosaic 1 where it sees any of its ground, else 0."""
-    centre = view.plan_from_cam[REFINED][:3, 3]
-    coarsest_m = max((mosaic.grid.cell_m for mosaic in mosaics), default=0.0)
-    heights, first = ground.around(centre[:2], VIEW_M + FOOTPRINT_MARGIN_M + coarsest_m)
-    used = np.zeros(len(mosaics), dtype=np.int64)
-    footprint = _footprint(view, float(heights.min()))
-    if footprint is None:
-        return used
-    cam_from_plan = np.ascontiguousarray(se3.inverse(view.plan_from_cam)[:, :3])
-    rig_from_plan = np.ascontiguousarray(se3.inverse(view.plan_from_rig)[:2])
-    widest = widest_angle(view.kind, view.params[REFINED], view.size_px)
-    for k, mosaic in enumerate(mosaics):
-        grid, bounds = mosaic.grid, mosaic.grid.within(*footprint)
-        if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
-            continue
-        painted = _paint(
-            rgb,
-            np.ones((1, 1), np.bool_) if usable is None else usable,
-            usable is not None,
-            cam_from_plan,
-            centre,
-            rig_from_plan,
-            np.zeros((2, 2)) if own_car_m is None else own_car_m,
-            view.kind,
-            view.params,
-            widest,
-            view.gain,
-            view.camera + 1,
-            heights,
-            np.array([grid.left_m, grid.top_m, grid.cell_m, *first]),
-            bounds,
-            mosaic.owner,
-            mosaic.score,
-            mosaic.color,
-        )
-        used[k] = painted > 0
-    return used
-
-
-def _footprint(view: View, lowest_m: float) -> tuple[Floats, Floats] | None:
-    """Corners (2,) of the rectangle of ground, nowhere below `lowest_m`, that the image may show; None for none."""
-    width, height = view.size_px
-    u, v = np.meshgrid(np.linspace(0, width, 25), np.linspace(0, height, 17))
-    rays = unproject_pixels(view.kind, view.params[REFINED], np.column_stack([u.ravel(), v.ravel()]))
-    pose = view.plan_from_cam[REFINED]
-    rays = rays @ pose[:3, :3].T
-    rays = rays[rays[:, 2] < 0]
-    if not len(rays):
-        return None
-    above = max(float(pose[2, 3]) - lowest_m, 0.1)
-    flat = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
-    reach = np.minimum(above * flat / -rays[:, 2], VIEW_M)
-    at = pose[:2, 3] + rays[:, :2] * (reach / flat)[:, None]
-    return at.min(0) - FOOTPRINT_MARGIN_M, at.max(0) + FOOTPRINT_MARGIN_M
-
-
-@njit(cache=True, inline="always")
-def _height_at(heights: Any, right_m: float, up_m: float) -> float:
-    """Bilinear between the corners of the height grid."""
-    a, b = up_m / HEIGHT_STEP_M, right_m / HEIGHT_STEP_M
-    i, j = int(a), int(b)
-    a, b = a - i, b - j
-    here = heights[i, j] * (1 - b) + heights[i, j + 1] * b
-    next_up = heights[i + 1, j] * (1 - b) + heights[i + 1, j + 1] * b
-    return float(here * (1 - a) + next_up * a)
-
-
 @njit(cache=True, inline="always")
 def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: float) -> int:
     """Layer that a camera's view of this score belongs to, -1 if to none; the best is moved down where it must."""
@@ -266,30 +186,6 @@ def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: fl
     if s > score[0, row, column]:
         return 2  # becomes the best, and what was best becomes second
     return 1 if s > score[1, row, column] else -1
-
-
-@njit(cache=True, inline="always")
-def _inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -> bool:
-    for i in range(2):
-        m = rig_from_plan[i]
-        if not own_car[0, i] < m[0] * x + m[1] * y + m[2] * z + m[3] < own_car[1, i]:
-            return False
-    return True
-
-
-@njit(cache=True, inline="always")
-def _sample(rgb: Any, u: float, v: float, gain: Any, out: Any) -> None:
-    """Bilinear colour at a pixel position whose top left pixel has its centre at (0.5, 0.5)."""
-    height, width = rgb.shape[0], rgb.shape[1]
-    x = min(max(u - 0.5, 0.0), width - 1.001)
-    y = min(max(v - 0.5, 0.0), height - 1.001)
-    i, j = int(y), int(x)
-    a, b = y - i, x - j
-    for k in range(3):
-        top = rgb[i, j, k] * (1 - b) + rgb[i, j + 1, k] * b
-        bottom = rgb[i + 1, j, k] * (1 - b) + rgb[i + 1, j + 1, k] * b
-        value = gain[k] * (top * (1 - a) + bottom * a) + 0.5
-        out[k] = int(min(max(value, 1.0), 255.0))
 
 
 @njit(cache=True, nogil=True)
@@ -308,7 +204,7 @@ def _paint(
         y = top - (row + 0.5) * cell
         for column in range(bounds[2], bounds[3]):
             x = left + (column + 0.5) * cell
-            z = _height_at(heights, x - first_x, y - first_y)
+            z = height_at(heights, x - first_x, y - first_y)
             dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
             d2 = dx * dx + dy * dy + above * above
             if d2 > VIEW_M * VIEW_M:
@@ -330,7 +226,7 @@ def _paint(
                 continue
             if has_mask and not usable[int(v), int(u)]:
                 continue
-            if _inside_car(rig_from_plan, own_car, x, y, z) or _inside_car(
+            if inside_car(rig_from_plan, own_car, x, y, z) or inside_car(
                 rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above
             ):
                 continue
@@ -341,12 +237,12 @@ def _paint(
                         color[c, 1, row, column, k] = color[c, 0, row, column, k]
                 layer = 0
             owner[layer, row, column], score[layer, row, column] = camera, s
-            _sample(rgb, u, v, gain, color[1, layer, row, column])
+            sample(rgb, u, v, gain, color[1, layer, row, column])
             m = cam_from_plan[0]
             for i in range(3):
                 cam[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
             if cam[2] > 1e-3:
                 project(kind, params[0], cam[0], cam[1], cam[2], work, pixel)
-                _sample(rgb, pixel[0], pixel[1], gain, color[0, layer, row, column])
+                sample(rgb, pixel[0], pixel[1], gain, color[0, layer, row, column])
             painted += 1
     return painted

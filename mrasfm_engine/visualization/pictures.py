@@ -6,48 +6,52 @@ They never cost the scene: what cannot be drawn is left out, and the report says
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.errors import CancelledError, MrasfmError
-from mrasfm_engine.export.picture_files import png_of
+from mrasfm_engine.export.picture_files import LargeFile, png_of
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bytes, CountProgress
 from mrasfm_engine.visualization.birds_eye import birds_eye
 from mrasfm_engine.visualization.road_points import road_points
 
-Pictures = Mapping[str, Bytes]
+Drawn = tuple[Mapping[str, Bytes], Mapping[str, bytes | LargeFile], dict[str, Any]]  # pictures, other files, report
 
 
 def draw_pictures(
-    scene: Scene, *, seed: int = 0, progress: CountProgress | None = None
-) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """PNG files by name, and what the report says of them.
+    scene: Scene, *, scratch: Path | None = None, seed: int = 0, progress: CountProgress | None = None
+) -> tuple[dict[str, bytes | LargeFile], dict[str, Any]]:
+    """Files by name, and what the report says of them.
 
-    The road from above before and after recalibration, and its points before and after those off it were dropped.
+    The road from above before and after recalibration and as one picture of the best views, and its points before and
+    after those off it were dropped.
 
     Parameters
     ----------
+    scratch
+        An empty folder on the disk of the result; without one there is no picture of the best views.
     progress
         Called as progress(images done, images); may raise `CancelledError` to stop.
     """
+    road: dict[str, Any] = {}
 
-    def from_above() -> tuple[Pictures, dict[str, Any]]:
-        drawn = birds_eye(scene, seed=seed, progress=progress)
-        return drawn.pictures, drawn.report
+    def from_above() -> Drawn:
+        drawn = birds_eye(scene, seed=seed, progress=progress, scratch=scratch)
+        road.update(drawn.road_report)
+        return drawn.pictures, drawn.files, drawn.report
 
     above, above_report = _files(from_above)
-    points, points_report = _files(lambda: (road_points(scene), {}))
-    report = {"birds_eye": above_report}
-    if points_report:
-        report["road_points"] = points_report
-    return {**above, **points}, report
+    points, points_report = _files(lambda: (road_points(scene), {}, {}))
+    report = {"birds_eye": above_report, "road": road, "road_points": points_report}
+    return {**above, **points}, {name: part for name, part in report.items() if part or name == "birds_eye"}
 
 
-def _files(draw: Callable[[], tuple[Pictures, dict[str, Any]]]) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """All of what is drawn as PNG files, or none of it where anything fails."""
+def _files(draw: Callable[[], Drawn]) -> tuple[dict[str, bytes | LargeFile], dict[str, Any]]:
+    """All of what is drawn as files, or none of it where anything fails."""
     try:
-        pictures, report = draw()
-        return {name: png_of(picture) for name, picture in pictures.items()}, report
+        pictures, files, report = draw()
+        return {**{name: png_of(picture) for name, picture in pictures.items()}, **files}, report
     except CancelledError:
         raise
     except MrasfmError as error:

@@ -19,6 +19,8 @@ _MEDIA_TYPES = {
     ".txt": "text/plain; charset=utf-8",
     ".tum": "text/plain; charset=utf-8",
     ".png": "image/png",
+    ".pgw": "text/plain; charset=utf-8",
+    ".tif": "image/tiff",
     ".db": "application/vnd.sqlite3",
 }
 

@@ -27,6 +27,7 @@
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
 | 24 | which of many seams is wrong, by loops of simulated scenes |
 | 25 | the own car in images without masks, rendered and real; a bar with the time over a fifth of all images |
+| 27 | the road's picture of the best views: markings against the painted ones |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -65,6 +66,7 @@ from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
+from tests.benchmarks.road_picture import real_pictures, rendered_markings
 from tests.benchmarks.road_shapes import road_shapes
 from tests.benchmarks.seam_graphs import seam_graphs
 from tests.benchmarks.semantics import real_road, shadowed_road
@@ -116,6 +118,7 @@ LINES = {
     "23": Line(untimed=(simulated_routes,)),
     "24": Line(timed=(seam_graphs,)),
     "25": Line(untimed=(real_own_car,), by_seed=(rendered_own_car, bar_with_time)),
+    "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
 }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera, unproject_pixels
-from mrasfm_engine.visualization.mosaic import View
+from mrasfm_engine.visualization.views import View
 
 SIZE_PX = (320, 240)
 PARAMS = {

@@ -101,6 +101,7 @@ def test_pictures_can_be_turned_off_and_leave_with_the_scene_they_show(variant: 
     config.write_text("[output]\npictures = true\n", encoding="utf-8")
     assert mrasfm("reconstruct", variant.root, "--out", variant.scene, "--no-gnss", "--config", config).code == 0
     drawn = {f"{what}_{when}.png" for what in ("birds_eye", "road") for when in ("before", "after")}
+    drawn |= {"road.png", "road.pgw", "road.tif"}
     assert {p.name for p in (variant.scene / "pictures").iterdir()} == drawn
     poses = (variant.scene / "poses.tum").read_bytes()
     config.write_text("[output]\npictures = false\n", encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mrasfm_engine.visualization.agreement import Agreement, why_not_better
 from mrasfm_engine.visualization.birds_eye import birds_eye
 from mrasfm_engine.visualization.drawing import framed
 from tests.helpers.export_example import make_scene
@@ -28,3 +29,24 @@ def test_the_frame_keeps_the_picture_and_draws_a_scale_of_the_right_length() -> 
     below = out.picture[out.top_px + 400 :]
     longest = max((row.min(axis=1) < 60).sum() for row in below[:, :500])
     assert 198 <= longest <= 206  # 5 m: the longest round length within a quarter of the width
+
+
+def agreement_of(correlations: np.ndarray) -> Agreement:
+    return Agreement(correlations=correlations, displaced_blocks=0, displacement_m=float("nan"))
+
+
+def test_the_report_says_why_the_views_do_not_agree_better() -> None:
+    rng = np.random.default_rng(1)
+    poor, good = rng.normal(0.7, 0.05, 200), rng.normal(0.95, 0.02, 200)
+
+    def reason(given: np.ndarray, refined: np.ndarray, *, changed: bool = True) -> str | None:
+        return why_not_better(agreement_of(given), agreement_of(refined), changed=changed)
+
+    assert reason(poor, poor + 0.2) is None
+    assert reason(good, good + 0.01) is None  # pieces of ground are paired: a small difference is seen
+    assert reason(poor, poor, changed=False) == "the calibration was held"
+    assert "standard errors" in str(reason(poor, rng.permutation(poor)))
+    assert "fits the points of the scene" in str(reason(good, poor))
+    assert "agree well with both" in str(reason(good, good - 0.02))
+    moving = np.where(np.arange(200) % 2 == 0, 0.1, poor)
+    assert "moves or stands" in str(reason(moving, moving - 0.2))

@@ -98,3 +98,16 @@ def test_tiles_cover_what_is_asked_for() -> None:
         assert (last >= np.array(centre) + 17).all()
         x, y = (first[k] + HEIGHT_STEP_M * np.arange(heights.shape[1 - k]) for k in (0, 1))
         np.testing.assert_allclose(heights, 0.01 * x[None] ** 2 - 0.3 * y[:, None], atol=1e-9)
+
+
+def test_bonnets_of_cars_in_a_line_are_not_the_ground() -> None:
+    rng = np.random.default_rng(4)
+    road = street(rng, on_road=400)
+    cars = np.column_stack([rng.uniform(-10, 45, 2500), rng.choice([-2.5, 2.5], 2500) + rng.normal(0, 0.4, 2500)])
+    bonnets = np.column_stack([cars, hill(cars) + 0.9 + rng.normal(0, 0.03, 2500)])
+    points = np.concatenate([road, bonnets])
+    for seed in range(3):
+        ground = estimate_ground(points, drive_over(0.0, 0.0), CAMERAS, rng=np.random.default_rng(seed))
+        assert ground is not None
+        xy = np.column_stack([np.linspace(1, 28, 60), np.zeros(60)])
+        assert np.median(np.abs(ground.height_m(xy) - hill(xy))) < 0.05

@@ -10,7 +10,8 @@ from mrasfm_engine.visualization.agreement import MAX_PLOTS, PLOT_SIDE_M, measur
 from mrasfm_engine.visualization.birds_eye import grids_along
 from mrasfm_engine.visualization.drawing import framed
 from mrasfm_engine.visualization.exposure import camera_gains
-from mrasfm_engine.visualization.mosaic import GIVEN, REFINED, Grid, Mosaic, View, make_mosaics
+from mrasfm_engine.visualization.mosaic import Grid, Mosaic, make_mosaics
+from mrasfm_engine.visualization.views import GIVEN, REFINED, View
 from tests.helpers.painted_ground import SIZE_PX, Level, Slope, looking, pattern, photographed, view_of
 
 MAX_TEXTURE_PX = 16_384  # of browsers and graphics cards

@@ -1,0 +1,115 @@
+"""Paints the road, block by block along the path, in time by its length and in bounded memory.
+
+Views come in the order of the path, those of a second visit with those of the first. A block is under way while views
+may still reach it, then decided, written and forgotten.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mrasfm_engine.types import Bools, Bytes, Floats
+from mrasfm_engine.visualization.ground import GroundTiles
+from mrasfm_engine.visualization.mosaic import MIN_CELL_M, RADIUS_M
+from mrasfm_engine.visualization.road_blocks import APRON_CELLS, Block, BlockPlan, BlockStore
+from mrasfm_engine.visualization.road_candidates import Candidates, Shot, add_view, log_ratios
+from mrasfm_engine.visualization.road_consensus import find_consensus
+from mrasfm_engine.visualization.running_gains import RunningGains
+from mrasfm_engine.visualization.standing_points import StandingPoints
+from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile, TileIndex
+from mrasfm_engine.visualization.views import REFINED, VIEW_M, PlacedView, View, place_view
+
+
+@dataclass
+class Cells:
+    """Counts of cells of the road: seen by any view, left out of them, and shown from one place only."""
+
+    seen: int = 0
+    left_out: int = 0
+    single: int = 0
+
+
+@dataclass(kw_only=True)
+class RoadPainter:
+    """See `views.Painter`.
+
+    Parameters
+    ----------
+    trajectory_m
+        Positions (n, 2) of the vehicle.
+    folder
+        An empty one, for blocks that do not fit into memory.
+    tiles
+        Takes the finished blocks.
+    own_car_m
+        See `MosaicPainter`.
+    """
+
+    views: Sequence[View]
+    ground: GroundTiles
+    standing: StandingPoints
+    trajectory_m: Floats
+    folder: Path
+    tiles: TileFile
+    own_car_m: Floats | None
+    radius_m: float = RADIUS_M  # beside the trajectory
+    cells: Cells = field(default_factory=Cells)
+    images_used: int = 0
+
+    def __post_init__(self) -> None:
+        """Count the views that may reach every block."""
+        self._cameras = 1 + max((view.camera for view in self.views), default=0)
+        self._plan = BlockPlan(self.trajectory_m, cell_m=MIN_CELL_M, radius_m=self.radius_m)
+        self._store = BlockStore(self.folder)
+        self._gains = RunningGains(self._cameras)
+        self._left = Counter(block for view in self.views for block in self._reached(view))
+
+    def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
+        """Paint one view; see `views.Painter`."""
+        reached = self._reached(view)
+        placed = place_view(view, self.ground, margin_m=APRON_CELLS * MIN_CELL_M)
+        if placed is not None:
+            hidden = self.standing.hidden_from(index, placed)
+            shot = Shot(view=view, placed=placed, rgb=rgb, usable=usable, hidden=hidden, own_car_m=self.own_car_m)
+            self._add(shot, self._store.get([b for b in reached if _overlaps(b, placed)]))
+        for block in reached:
+            self._left[block] -= 1
+            if not self._left[block]:
+                del self._left[block]
+                self._finish(block)
+
+    def _reached(self, view: View) -> list[Block]:
+        return self._plan.reached(view.plan_from_cam[REFINED][:2, 3], VIEW_M)
+
+    def _add(self, shot: Shot, blocks: Sequence[Candidates]) -> None:
+        view = shot.view
+        ratios = [log_ratios(block, shot, view.gain, MIN_CELL_M, APRON_CELLS) for block in blocks]
+        gain = view.gain * self._gains.factor(view.camera, np.concatenate([np.zeros(0), *ratios]))
+        added = sum(add_view(block, shot, gain, MIN_CELL_M) for block in blocks)
+        self.images_used += added > 0
+
+    def _finish(self, block: Block) -> None:
+        candidates = self._store.pop(block)
+        if candidates is None or not candidates.count.any():
+            return
+        found = find_consensus(candidates, cameras=self._cameras)
+        inside = slice(APRON_CELLS, -APRON_CELLS), slice(APRON_CELLS, -APRON_CELLS)
+        agreed = found.agreed[inside]
+        self.cells.seen += int(found.seen[inside].sum())
+        self.cells.left_out += int((found.seen & ~found.agreed)[inside].sum())
+        self.cells.single += int((found.single & found.agreed)[inside].sum())
+        opacity = np.where(agreed, 255, 0).astype(np.uint8)
+        self.tiles.add(TileIndex(0, *block), np.dstack([found.color[inside] * agreed[..., None], opacity]))
+
+
+def _overlaps(block: Block, placed: PlacedView) -> bool:
+    """Return whether a view's footprint meets a block."""
+    side_m, apron_m = TILE_CELLS * MIN_CELL_M, APRON_CELLS * MIN_CELL_M
+    low, high = placed.low_m - apron_m, placed.high_m + apron_m
+    rows = -(block[0] + 1) * side_m < high[1] and -block[0] * side_m > low[1]
+    return bool(rows and block[1] * side_m < high[0] and (block[1] + 1) * side_m > low[0])

@@ -1,0 +1,81 @@
+"""Ground that things hide from a view, by the scene's points that stand above it.
+
+A camera that looks at a car sees the car where the ground behind it would be. A point above the ground tells how far
+that goes: from below the point, on which the thing stands, to where the ray through the point meets the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.types import Bools, Floats, Ints
+from mrasfm_engine.visualization.ground import GroundHeights
+from mrasfm_engine.visualization.views import VIEW_M, PlacedView
+
+STANDING_M = 0.3  # above the ground: kerbs and the error of the ground's height stay below
+OVERHEAD = 0.9  # of the camera's height: what is higher hides no ground, and may be a wire or a branch
+TALL = 0.6  # of the camera's height: what reaches that is taken to go on upwards, as walls and cars do
+STEP_M = 0.1  # of the raster
+SIDE = 2 * round(VIEW_M / STEP_M) + 1
+HALF_WIDTH_M = 0.15  # of the strip that a point hides, where it stands: about the distance of points on one thing
+MIN_POINTS = 1  # that hide a place: a single one may be wrong
+
+
+class StandingPoints:
+    """Points above the ground, by the views that see them.
+
+    A view is hidden from by what it sees itself: a car that moves slowly enough to have points is elsewhere for others.
+
+    Parameters
+    ----------
+    points_m
+        Points (n, 3) of the plan frame.
+    seen_by
+        For every view the points that it sees, in its camera or in another one at the same time.
+    """
+
+    def __init__(self, points_m: Floats, seen_by: Sequence[Ints], ground: GroundHeights) -> None:
+        self._points_m, self._seen_by, self._ground = points_m, seen_by, ground
+
+    def hidden_from(self, view: int, placed: PlacedView) -> Bools:
+        """Raster (301, 301) of `STEP_M` around a view's camera, y growing with the rows: whether things hide the
+        ground."""
+        count = np.zeros((SIDE, SIDE), np.uint8)
+        points = self._points_m[self._seen_by[view]]
+        points = points[np.hypot(*(points[:, :2] - placed.centre_m[:2]).T) < VIEW_M]
+        if len(points):
+            above_m = points[:, 2] - self._ground.height_m(points[:, :2])
+            share = above_m / placed.above_ground_m
+            stands = (above_m > STANDING_M) & (share < OVERHEAD)
+            # By similar triangles, the ray over the point meets the ground that many times as far away.
+            times = np.where(share < TALL, 1 / (1 - np.minimum(share, TALL)), np.inf)
+            _hide(points[stands, :2] - placed.centre_m[:2], times[stands], count)
+        return count >= MIN_POINTS
+
+
+@njit(cache=True, nogil=True)
+def _hide(foot: Any, times: Any, count: Any) -> None:
+    """Count the points that hide every place of the raster; each once."""
+    middle = count.shape[0] // 2
+    last = np.full(count.shape, -1, np.int32)
+    for p in range(len(foot)):
+        distance = np.hypot(foot[p, 0], foot[p, 1])
+        if distance < STEP_M:
+            continue
+        along_x, along_y = foot[p, 0] / distance, foot[p, 1] / distance
+        reach = min(distance * times[p], VIEW_M)
+        r = distance
+        while r <= reach:
+            half = int(HALF_WIDTH_M * r / distance / STEP_M + 0.5)
+            i, j = round(middle + along_y * r / STEP_M), round(middle + along_x * r / STEP_M)
+            for a in range(max(i - half, 0), min(i + half + 1, count.shape[0])):
+                for b in range(max(j - half, 0), min(j + half + 1, count.shape[1])):
+                    if last[a, b] != p:
+                        last[a, b] = p
+                        if count[a, b] < 255:
+                            count[a, b] += 1
+            r += STEP_M

@@ -1,0 +1,205 @@
+"""Images that may see the ground: their geometry, and how they are painted one after the other.
+
+Every image is read once, whatever is painted of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Protocol
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import unproject_pixels
+from mrasfm_engine.types import Bools, Bytes, Floats
+from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundTiles
+
+GIVEN, REFINED = 0, 1
+VIEW_M = 15.0  # how far from a camera its image is used
+MIN_RESOLUTION_PX = 5.0  # of an image on the ground, pixels a metre along the line of sight
+OWN_CAR_LEVEL = 0.5  # of the cameras' height: up to there the car's body hides the ground
+FOOTPRINT_MARGIN_M = 1.0  # around where the corners of an image meet the ground: it is not level
+PREFETCHED = 3  # images that wait decoded
+
+Read = Callable[[int], tuple[Bytes, Bools | None]]  # image (h, w, 3) and usable pixels (h, w), None where all are
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One image that may see the ground; poses are `plan_from_cam` (2, 4, 4) as given and as refined."""
+
+    camera: int
+    plan_from_cam: Floats
+    params: Floats  # (2, 8) as given and as refined
+    kind: int
+    size_px: tuple[int, int]  # width, height
+    plan_from_rig: Floats  # (4, 4)
+    gain: Floats  # (3,)
+    place: int = 0  # number of the camera and of the part of the path that it is taken from, see `place_numbers`
+
+
+class Painter(Protocol):
+    """Something that takes images one after the other."""
+
+    def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
+        """Take a view, by its position in the sequence, with its image (h, w, 3) and usable pixels (h, w)."""
+        ...
+
+
+def paint_views(
+    views: Sequence[View], read: Read, painters: Sequence[Painter], *, step: Callable[[int], None] = lambda done: None
+) -> None:
+    """Hand every view to all painters, in order, each in a thread of its own; every image is read once.
+
+    Parameters
+    ----------
+    read
+        Image and usable pixels of a view by its position in `views`.
+    step
+        Called after every view with how many are done; may raise.
+    """
+    with ThreadPoolExecutor(len(painters)) as pool:
+        for done, (index, rgb, usable) in enumerate(_read_ahead(len(views), read), 1):
+            painted = [pool.submit(painter.paint, index, views[index], rgb, usable) for painter in painters]
+            for each in painted:
+                each.result()
+            step(done)
+
+
+def _read_ahead(count: int, read: Read) -> Iterator[tuple[int, Bytes, Bools | None]]:
+    """Images in order, decoded while others are painted, never more than a few at a time."""
+    with ThreadPoolExecutor(1) as pool:
+        todo = iter(range(count))
+        waiting = [(i, pool.submit(read, i)) for i in islice(todo, PREFETCHED)]
+        try:
+            while waiting:
+                index, image = waiting.pop(0)
+                rgb, usable = image.result()
+                waiting += [(i, pool.submit(read, i)) for i in islice(todo, 1)]
+                yield index, rgb, usable
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def widest_angle(kind: int, params: Floats, size_px: tuple[int, int]) -> float:
+    """Tangent of the largest angle between the axis and a pixel of the image's border.
+
+    Beyond it distortion polynomials fold back, and points far outside the view seem to lie inside.
+    """
+    width, height = size_px
+    u, v = np.linspace(0, width, 17), np.linspace(0, height, 17)
+    border = np.concatenate(
+        [np.column_stack([u, np.full(17, e)]) for e in (0, height)]
+        + [np.column_stack([np.full(17, e), v]) for e in (0, width)]
+    )
+    rays = unproject_pixels(kind, params, border)
+    return float((np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(rays[:, 2], 1e-3)).max())
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedView:
+    """A view above the ground that it may see.
+
+    Attributes
+    ----------
+    cam_from_plan
+        (2, 3, 4) as given and as refined.
+    rig_from_plan
+        (2, 4): x and y only.
+    widest
+        See `widest_angle`.
+    heights_m, first_m
+        Heights of the ground around the camera, and x and y (2,) of the first one; see `GroundTiles.around`.
+    above_ground_m
+        How far the camera is above the ground.
+    low_m, high_m
+        Corners (2,) of the rectangle of ground that the image may show.
+    """
+
+    cam_from_plan: Floats
+    rig_from_plan: Floats
+    centre_m: Floats
+    widest: float
+    heights_m: Floats
+    first_m: Floats
+    above_ground_m: float
+    low_m: Floats
+    high_m: Floats
+
+
+def place_view(view: View, ground: GroundTiles, *, margin_m: float = 0.0) -> PlacedView | None:
+    """Place a view above the ground, known `margin_m` farther than the view reaches; None where it sees no ground."""
+    centre = view.plan_from_cam[REFINED][:3, 3]
+    heights, first = ground.around(centre[:2], VIEW_M + FOOTPRINT_MARGIN_M + margin_m)
+    corners = _footprint(view, float(heights.min()))
+    if corners is None:
+        return None
+    return PlacedView(
+        cam_from_plan=np.ascontiguousarray(se3.inverse(view.plan_from_cam)[:, :3]),
+        rig_from_plan=np.ascontiguousarray(se3.inverse(view.plan_from_rig)[:2]),
+        centre_m=centre,
+        widest=widest_angle(view.kind, view.params[REFINED], view.size_px),
+        heights_m=heights,
+        first_m=first,
+        above_ground_m=float(centre[2] - height_at(heights, *(centre[:2] - first))),
+        low_m=corners[0],
+        high_m=corners[1],
+    )
+
+
+def _footprint(view: View, lowest_m: float) -> tuple[Floats, Floats] | None:
+    """Corners (2,) of the rectangle of ground, nowhere below `lowest_m`, that the image may show; None for none."""
+    width, height = view.size_px
+    u, v = np.meshgrid(np.linspace(0, width, 25), np.linspace(0, height, 17))
+    rays = unproject_pixels(view.kind, view.params[REFINED], np.column_stack([u.ravel(), v.ravel()]))
+    pose = view.plan_from_cam[REFINED]
+    rays = rays @ pose[:3, :3].T
+    rays = rays[rays[:, 2] < 0]
+    if not len(rays):
+        return None
+    above = max(float(pose[2, 3]) - lowest_m, 0.1)
+    flat = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
+    reach = np.minimum(above * flat / -rays[:, 2], VIEW_M)
+    at = pose[:2, 3] + rays[:, :2] * (reach / flat)[:, None]
+    return at.min(0) - FOOTPRINT_MARGIN_M, at.max(0) + FOOTPRINT_MARGIN_M
+
+
+@njit(cache=True, inline="always")
+def height_at(heights: Any, right_m: float, up_m: float) -> float:
+    """Bilinear between the corners of the height grid."""
+    a, b = up_m / HEIGHT_STEP_M, right_m / HEIGHT_STEP_M
+    i, j = int(a), int(b)
+    a, b = a - i, b - j
+    here = heights[i, j] * (1 - b) + heights[i, j + 1] * b
+    next_up = heights[i + 1, j] * (1 - b) + heights[i + 1, j + 1] * b
+    return float(here * (1 - a) + next_up * a)
+
+
+@njit(cache=True, inline="always")
+def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -> bool:
+    """Return whether a place of the plan frame lies in a rectangle (2, 2) of the rig's x and y, lowest first."""
+    for i in range(2):
+        m = rig_from_plan[i]
+        if not own_car[0, i] < m[0] * x + m[1] * y + m[2] * z + m[3] < own_car[1, i]:
+            return False
+    return True
+
+
+@njit(cache=True, inline="always")
+def sample(rgb: Any, u: float, v: float, gain: Any, out: Any) -> None:
+    """Bilinear colour at a pixel position whose top left pixel has its centre at (0.5, 0.5)."""
+    height, width = rgb.shape[0], rgb.shape[1]
+    x = min(max(u - 0.5, 0.0), width - 1.001)
+    y = min(max(v - 0.5, 0.0), height - 1.001)
+    i, j = int(y), int(x)
+    a, b = y - i, x - j
+    for k in range(3):
+        top = rgb[i, j, k] * (1 - b) + rgb[i, j + 1, k] * b
+        bottom = rgb[i + 1, j, k] * (1 - b) + rgb[i + 1, j + 1, k] * b
+        value = gain[k] * (top * (1 - a) + bottom * a) + 0.5
+        out[k] = int(min(max(value, 1.0), 255.0))

@@ -1,0 +1,36 @@
+"""The order in which views are painted, and the numbers of the places that they are taken from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.visualization.plan import in_order_of_the_path, place_numbers
+from mrasfm_engine.visualization.road_candidates import PLACE_M
+from tests.helpers.export_example import make_scene
+
+
+def scene_along(x_m: np.ndarray) -> Scene:
+    """The example's units at other places, all of them registered."""
+    scene = make_scene()
+    scene.unit_registered[:] = scene.image_registered[:] = True
+    scene.world_from_rig[:] = np.eye(4)
+    scene.world_from_rig[:, 0, 3] = x_m[: len(scene.world_from_rig)]
+    return scene
+
+
+def test_images_of_one_camera_from_one_piece_of_the_path_share_a_number() -> None:
+    scene = scene_along(np.array([0.0, 0.4 * PLACE_M, 1.2 * PLACE_M, 2.5 * PLACE_M, 9.0, 12.0]))
+    cameras, number = len(scene.drive.cameras), place_numbers(scene)
+    for k, image in enumerate(scene.drive.images):
+        piece = int((scene.world_from_rig[image.unit, 0, 3] - scene.world_from_rig[0, 0, 3]) // PLACE_M)
+        assert number[k] == piece * cameras + image.camera
+
+
+def test_later_visits_come_with_the_first_one() -> None:
+    there_and_back = np.array([0.0, 50.0, 1.0, 51.0, 2.0, 52.0])
+    scene = scene_along(there_and_back)
+    order = in_order_of_the_path(scene)
+    assert sorted(order) == list(range(len(scene.drive.images)))
+    far = there_and_back[[scene.drive.images[i].unit for i in order]] > 25.0
+    assert np.abs(np.diff(far.astype(int))).sum() == 1  # all of one place, then all of the other

@@ -1,0 +1,220 @@
+"""The picture of the best views of a ground whose pattern is known."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.visualization import road_blocks
+from mrasfm_engine.visualization.ground import GroundTiles
+from mrasfm_engine.visualization.mosaic import MIN_CELL_M
+from mrasfm_engine.visualization.road_painter import RoadPainter
+from mrasfm_engine.visualization.road_picture import OptionalPainter
+from mrasfm_engine.visualization.standing_points import SIDE, STEP_M, StandingPoints
+from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile
+from mrasfm_engine.visualization.tile_pyramid import build_pyramid
+from mrasfm_engine.visualization.views import View, paint_views, place_view
+from tests.helpers.painted_ground import HEIGHT_M, Level, looking, pattern, photographed, view_of
+
+WAY_M = np.arange(0.0, 10.0)
+NOTHING = np.zeros((0, 3))
+
+
+def shots(
+    places_m: np.ndarray = WAY_M, *, gains: tuple[float, float] = (1.0, 1.0)
+) -> tuple[list[View], list[np.ndarray]]:
+    """Two cameras go along, and see much of the same ground."""
+    views, images = [], []
+    for x in places_m:
+        for camera, (yaw, gain) in enumerate(zip((0.0, 40.0), gains, strict=True)):
+            pose = looking(yaw, float(x))
+            view = view_of("PINHOLE", camera, pose)
+            views.append(View(**{**view.__dict__, "place": 2 * int(x // 2) + camera}))
+            images.append((gain * photographed("PINHOLE", pose)).clip(0, 255).astype(np.uint8))
+    return views, images
+
+
+def road_of(
+    folder: Path,
+    views: list[View],
+    images: list[np.ndarray],
+    *,
+    standing_m: np.ndarray = NOTHING,
+    radius_m: float = 12.0,
+    masks: dict[int, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, RoadPainter]:
+    """The finest level (h, w, 4), the places (h, w, 2) that it shows, and the painter."""
+    folder.mkdir()
+    trajectory = np.array([view.plan_from_cam[1][:2, 3] for view in views])
+    with TileFile(folder.parent / f"{folder.name} tiles") as tiles:
+        seen_by = [np.arange(len(standing_m))] * len(views)
+        painter = RoadPainter(
+            views=views,
+            ground=GroundTiles(Level()),
+            standing=StandingPoints(standing_m, seen_by, Level()),
+            trajectory_m=trajectory,
+            folder=folder,
+            tiles=tiles,
+            own_car_m=None,
+            radius_m=radius_m,
+        )
+        paint_views(views, lambda i: (images[i], (masks or {}).get(i)), [painter])
+        pyramid = build_pyramid(tiles)
+        assert pyramid is not None
+        picture = pyramid.picture(0)
+    rows, columns = np.arange(picture.shape[0]) + 0.5, np.arange(picture.shape[1]) + 0.5
+    x = (pyramid.first_column * TILE_CELLS + columns) * MIN_CELL_M
+    y = -(pyramid.first_row * TILE_CELLS + rows) * MIN_CELL_M
+    return picture, np.stack(np.meshgrid(x, y), -1), painter
+
+
+def error_of(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Difference (h, w) from the pattern; NaN where the picture is transparent."""
+    return np.where(picture[..., 3] == 255, np.abs(picture[..., 0].astype(float) - pattern(places)), np.nan)
+
+
+def beside_the_way(places: np.ndarray) -> np.ndarray:
+    """Cells (h, w) that many views see from near."""
+    return (np.abs(places[..., 1]) < 2.0) & (places[..., 0] > 4.0) & (places[..., 0] < 10.0)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.ndarray, RoadPainter]:
+    return road_of(tmp_path_factory.mktemp("road") / "blocks", *shots())
+
+
+def test_every_cell_shows_its_own_place_also_at_the_borders_of_tiles(
+    plain: tuple[np.ndarray, np.ndarray, RoadPainter],
+) -> None:
+    picture, places, painter = plain
+    error, near = error_of(picture, places), beside_the_way(places)
+    assert np.isfinite(error[near]).all()
+    assert 0.1 < np.median(error[near]) < 3.0
+    border = near & ((np.arange(picture.shape[1]) % TILE_CELLS)[None] < 1) | near & (
+        (np.arange(picture.shape[0]) % TILE_CELLS)[:, None] < 1
+    )
+    assert border.sum() > 300
+    assert np.median(error[border]) == pytest.approx(np.median(error[near]), rel=0.3)
+    step = np.abs(np.diff(picture[..., 0].astype(float), axis=1))
+    across = np.arange(1, picture.shape[1]) % TILE_CELLS == 0
+    both = near[:, 1:] & near[:, :-1]
+    assert step[:, across][both[:, across]].mean() == pytest.approx(step[both].mean(), rel=0.4)
+    assert painter.images_used == len(painter.views)
+    assert painter.cells.seen > near.sum()
+
+
+def test_a_car_that_moved_on_is_outvoted(tmp_path: Path, plain: tuple[np.ndarray, np.ndarray, RoadPainter]) -> None:
+    views, images = shots()
+    for i in (4, 5):  # both cameras see a white car everywhere, at one place of the path
+        images[i][:] = 255
+    picture, places, _ = road_of(tmp_path / "blocks", views, images)
+    error, near = error_of(picture, places), beside_the_way(places)
+    assert np.nanmedian(error[near]) < 3.0
+    assert (error[near] > 30).mean() < 0.02
+
+
+def test_what_no_two_views_agree_on_is_left_out(tmp_path: Path) -> None:
+    views, images = shots()
+    rng = np.random.default_rng(1)
+    for image in images:
+        image[:] = rng.integers(20, 235, 3)
+    picture, places, painter = road_of(tmp_path / "blocks", views, images)
+    near = beside_the_way(places)
+    assert (picture[..., 3][near] == 0).mean() > 0.6
+    assert painter.cells.left_out > 0.3 * painter.cells.seen
+
+
+def test_masked_pixels_are_not_shown(tmp_path: Path) -> None:
+    views, images = shots(np.array([0.0]))
+    nothing = np.zeros(images[0].shape[:2], dtype=np.bool_)
+    left = nothing.copy()
+    left[:, : left.shape[1] // 2] = True
+    picture, places, _ = road_of(tmp_path / "blocks", views, images, masks={0: left, 1: nothing})
+    shown = picture[..., 3] > 0
+    assert shown.sum() > 1000
+    assert (places[shown][:, 1] > -0.3).all()  # the left half of the image is the left of the road
+
+
+def test_cameras_of_different_exposure_are_evened(tmp_path: Path) -> None:
+    picture, places, _ = road_of(tmp_path / "blocks", *shots(gains=(1.0, 0.75)))
+    truth, near = pattern(places), beside_the_way(places) & (picture[..., 3] == 255)
+    ratio = (picture[..., 0] / truth)[near]
+    assert np.quantile(ratio, 0.9) / np.quantile(ratio, 0.1) < 1.12  # of 1.33
+
+
+def test_things_that_stand_hide_the_ground_behind_them(tmp_path: Path) -> None:
+    height = 0.5 * HEIGHT_M
+    post = np.array([[6.0, y, height] for y in np.linspace(-0.3, 0.3, 5)])
+    view, ground = view_of("PINHOLE", 0, looking(0.0, 0.0)), GroundTiles(Level())
+    placed = place_view(view, ground)
+    assert placed is not None
+    assert placed.above_ground_m == pytest.approx(HEIGHT_M)
+    hidden = StandingPoints(post, [np.arange(5)], Level()).hidden_from(0, placed)
+    ahead = hidden[SIDE // 2, SIDE // 2 :]
+    at_m = np.flatnonzero(ahead) * STEP_M
+    # The ray over a thing half as high as the camera meets the ground at twice its distance.
+    assert (at_m.min(), at_m.max()) == pytest.approx((6.0, 12.0), abs=0.4)
+    assert not hidden[:, : SIDE // 2].any()
+    picture, places, _ = road_of(tmp_path / "blocks", *shots(), standing_m=post)
+    under = (np.abs(places[..., 0] - 6.0) < 0.1) & (np.abs(places[..., 1]) < 0.2)
+    assert (picture[..., 3][under] == 0).all()
+
+
+def test_blocks_on_disk_make_the_same_picture(
+    tmp_path: Path, plain: tuple[np.ndarray, np.ndarray, RoadPainter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = []
+    keep = road_blocks.BlockStore._save
+    monkeypatch.setattr(road_blocks, "MAX_BLOCKS", 2)
+    monkeypatch.setattr(road_blocks.BlockStore, "_save", lambda *a: saved.append(a[1]) or keep(*a))
+    picture, _, _ = road_of(tmp_path / "blocks", *shots())
+    assert saved
+    np.testing.assert_array_equal(picture, plain[0])
+    assert not list((tmp_path / "blocks").iterdir())
+
+
+def test_an_error_of_the_road_leaves_only_the_road_out() -> None:
+    painted = []
+
+    class FullDisk:
+        def paint(self, index: int, *_: object) -> None:
+            painted.append(index)
+            raise OSError(28, "No space left on device")
+
+    optional = OptionalPainter(FullDisk())
+    views, images = shots(np.array([0.0, 1.0]))
+    paint_views(views, lambda i: (images[i], None), [optional])
+    assert painted == [0]
+    assert "No space" in str(optional.error)
+
+
+def test_memory_does_not_grow_with_the_way(tmp_path: Path) -> None:
+    image = photographed("PINHOLE", looking(0.0, 0.0))
+    peak = []
+    for length_m in (40.0, 100.0):
+        views, _ = shots(np.arange(0.0, length_m + 1, 5.0))
+        tracemalloc.start()
+        road = tmp_path / f"{length_m}"
+        road.mkdir()
+        with TileFile(tmp_path / f"{length_m} tiles") as tiles:
+            painter = RoadPainter(
+                views=views,
+                ground=GroundTiles(Level()),
+                standing=StandingPoints(NOTHING, [np.arange(0)] * len(views), Level()),
+                trajectory_m=np.array([view.plan_from_cam[1][:2, 3] for view in views]),
+                folder=road,
+                tiles=tiles,
+                own_car_m=None,
+                radius_m=1.0,
+            )
+            paint_views(views, lambda _: (image, None), [painter])
+            pyramid = build_pyramid(tiles)
+        peak.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert pyramid is not None
+        assert pyramid.shape(0)[1] * MIN_CELL_M > length_m
+    assert peak[0] > 20e6
+    assert peak[1] < 1.15 * peak[0]
