@@ -22,13 +22,13 @@ from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.types import Floats, Ints
 
 NEIGHBOURS = 12
-REACH_M = 2.0  # to neighbours, at a track's distance: half of a car
+REACH_M = 1.2  # to neighbours, at a track's distance: half of a car
 MOST_EVIDENCE = 8.0  # that a track has for itself: more is a matter of wrong matches, not of motion
-PRIOR = 1.0  # log odds for standing, beside a track that may move
+PRIOR = 0.5  # log odds for standing, beside a track that may move
 BOND = 1.0  # log odds that a neighbour adds that moves,
-BOND_TO_STANDING = 0.7  # and takes that stands: a thing's outline has both on its sides
+BOND_TO_STANDING = 0.5  # and takes that stands: a thing's outline has both on its sides
 SLACK_M_S = 0.5  # by which velocities of one thing differ
-MIXED = 10.0  # cost of an observation, if matches are mixed: as a residual of five standard deviations has it
+MIXED = 8.0  # cost of an observation, if matches are mixed: as a residual of five standard deviations has it
 ROUNDS = 10
 ALONE, SHARED, MIXTURE = 1, 2, 3  # why a track is taken to move
 
@@ -59,7 +59,7 @@ def group(
     weigh
         Completes `motion` for tracks.
     """
-    suspects = np.flatnonzero(motion.log_evidence > 0.0)
+    suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
     beside = _neighbours(suspects, motion, keypoints, tracks, focal_px)
     others = np.setdiff1d(beside[beside >= 0], suspects)
     weigh(others[np.isnan(motion.log_evidence[others])])
@@ -72,7 +72,7 @@ def group(
     evidence = np.nan_to_num(motion.log_evidence[nodes], nan=-MOST_EVIDENCE)
     score, reason = np.empty(len(nodes)), np.empty(len(nodes), dtype=np.int64)
     _mean_field(
-        linked, evidence, motion.velocity_m_s[nodes], motion.covariance[nodes],
+        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], motion.covariance[nodes],
         motion.observations[nodes] * (motion.misfit[nodes] - MIXED), score, reason,
     )  # fmt: skip
     order = np.argsort(nodes)
@@ -115,7 +115,7 @@ def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_key
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mean_field(
-    linked: Any, evidence: Any, velocity: Any, covariance: Any, mixed: Any, score: Any, reason: Any
+    linked: Any, evidence: Any, prior: Any, velocity: Any, covariance: Any, mixed: Any, score: Any, reason: Any
 ) -> None:  # fmt: skip
     """Log odds and reasons of all nodes; `linked` (n, k) are their neighbours: -1 for one that stands, -2 for none."""
     count, size = linked.shape
@@ -124,7 +124,7 @@ def _mean_field(
     slack2, speed2 = SLACK_M_S**2, SPEED_M_S**2
     for n in range(count):
         own = min(max(evidence[n], -MOST_EVIDENCE), MOST_EVIDENCE)
-        belief[n] = math.tanh(0.5 * (own - PRIOR))
+        belief[n] = math.tanh(0.5 * (own + prior[n] - PRIOR))
         xx, xy, yy = covariance[n, 0] + slack2, covariance[n, 1], covariance[n, 2] + slack2
         det = xx * yy - xy * xy
         if not det > 0.0:
@@ -166,7 +166,7 @@ def _mean_field(
                     best, why = shared, SHARED
                 if 0.5 * mixed[n] > best:
                     best, why = 0.5 * mixed[n], MIXTURE
-            score[n] = min(max(best, -MOST_EVIDENCE), MOST_EVIDENCE) - PRIOR + bonds
+            score[n] = min(max(best, -MOST_EVIDENCE), MOST_EVIDENCE) + prior[n] - PRIOR + bonds
             reason[n] = why
             following[n] = 0.5 * belief[n] + 0.5 * math.tanh(0.5 * score[n])
         belief[:] = following

@@ -17,6 +17,7 @@ from mrasfm_engine.types import Floats, Ints
 from schemas import SemanticClass
 
 SIGMA_PX_RANGE = (0.1, 3.0)
+QUANTILE = 0.85  # of residuals, from which the noise is
 MIN_OBSERVATIONS = 3  # of a point, whose residuals tell the noise
 REASONS = {
     ALONE: "its observations show a motion",
@@ -82,18 +83,23 @@ def views_of(mapper: Mapper) -> Views:
 
 
 def _sigmas_px(mapper: Mapper) -> Floats:
-    """Standard deviations (c,) of image coordinates of every camera, from the median of residuals."""
+    """Standard deviations (c,) of image coordinates of every camera, from a high quantile of its residuals.
+
+    Keypoints on edges, of large blobs and of leaves are several times worse than most. A median would take what they do
+    for motion.
+    """
     rows = np.flatnonzero(mapper.is_inlier)
     tracks = mapper.tracks.of_keypoint[rows]
     errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, tracks)
     size = np.bincount(tracks, minlength=len(mapper.tracks))[tracks]
     telling = size >= MIN_OBSERVATIONS
-    # The squared length of a 2D normal error has the median 2 ln 2 sigma^2; a point uses up three of its numbers.
-    squared = errors[telling] ** 2 / (2 * np.log(2) * (1.0 - 1.5 / size[telling]))
+    # The squared length of a 2D normal error exceeds 2 ln(1 / p) sigma^2 with probability p; a point uses up three
+    # numbers of its observations.
+    squared = errors[telling] ** 2 / (-2 * np.log(1 - QUANTILE) * (1.0 - 1.5 / size[telling]))
     camera = mapper.keypoints.camera[rows[telling]]
-    result = np.full(len(mapper.camera_kind), np.sqrt(np.median(squared)) if len(squared) else 1.0)
+    result = np.full(len(mapper.camera_kind), np.sqrt(np.quantile(squared, QUANTILE)) if len(squared) else 1.0)
     for c in np.unique(camera):
-        result[c] = np.sqrt(np.median(squared[camera == c]))
+        result[c] = np.sqrt(np.quantile(squared[camera == c], QUANTILE))
     clipped: Floats = np.clip(result, *SIGMA_PX_RANGE)
     return clipped
 

@@ -21,7 +21,7 @@ STANDS, MOVES = 3, 5  # number of unknowns
 ITERATIONS = 4
 ROUGH_ITERATIONS = 3  # before them, from a start that may be far off
 LOSS_SIGMAS = 2.5  # of the Cauchy loss: as likely as not, an error beyond it is a wrong match
-BEHIND = 40.0  # cost of an observation that would be behind its camera, and the most that one costs
+BEHIND = 20.0  # cost of an observation that would be behind its camera, and the most that one costs
 SMALL_GAIN = 0.01  # of cost, below which a fit is at its end
 REGULAR = 1e-6  # information of a shift, in sigmas per radian: nothing beside any pixel's
 

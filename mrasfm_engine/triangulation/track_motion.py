@@ -36,11 +36,14 @@ WINDOW_S = 1.5  # for which a velocity is taken to be constant: a car that brake
 MAX_OBSERVATIONS = 48  # of a track that are looked at, evenly spread
 NEAREST_M = 0.5
 SIGMA_INVERSE_M = 0.15  # of the inverse distance of standing points: most are beyond 5 m
-SPEED_M_S = 10.0  # standard deviation of each axis of the velocity of what moves: traffic in towns
+SPEED_M_S = 8.0  # standard deviation of each axis of the velocity of what moves: traffic in towns
+DRIFT_M_S = 0.5  # the same of what stands: two centimetres of error from unit to unit at 25 Hz, and slower than people
 BODY_M, BODY_SHARE = 0.7, 0.6  # height of what moves over the ground, and the sigma of its distance as a share of it
 FAR_M = 20.0  # distance of what moves, where its ray does not meet the ground
 FARTHEST_M = 80.0  # where a car is as large as a keypoint
 HIGHEST_M = 4.0  # of what moves, over the ground: lorries and buses
+CAR_M = 2.0  # height of cars; what moves higher above the ground is on lorries and buses:
+TALL = 3.0  # one in seven of what moves, as log odds
 HORIZON = 0.02  # sine of a ray's fall, below which the ground says nothing of its distance
 GRADE = 0.1  # by which the ground may fall away from the path
 VERGE_M, STEEP = 4.0, 0.5  # distance from the path beyond which it may fall by so much more
@@ -65,6 +68,7 @@ class TrackMotion:
     """Evidence and motion of tracks. All arrays are by track."""
 
     log_evidence: Floats  # (n,) natural logarithm of how much more likely they are if it moves; NaN if not weighed
+    log_prior: Floats  # (n,) what its height says, if it moves: of things that move, few are tall
     velocity_m_s: Floats  # (n, 2) along and across the own direction of motion
     covariance: Floats  # (n, 3) of the velocity: xx, xy, yy
     distance_m: Floats  # (n,) from the reference camera, if it moves
@@ -77,6 +81,7 @@ class TrackMotion:
         """Nothing is known of any track."""
         return TrackMotion(
             log_evidence=np.full(count, np.nan),
+            log_prior=np.zeros(count),
             velocity_m_s=np.zeros((count, 2)),
             covariance=np.zeros((count, 3)),
             distance_m=np.full(count, np.inf),
@@ -114,8 +119,8 @@ def weigh_tracks(
         len(which),
         lambda lo, hi: _weigh(
             which[lo:hi], tracks.first, tracks.keypoints, k.band, k.camera, k.xy_px, k.rays, points_m, triangulated,
-            views, path, only_unsure, into.log_evidence, into.velocity_m_s, into.covariance, into.distance_m,
-            into.misfit, into.observations, into.reference,
+            views, path, only_unsure, into.log_evidence, into.log_prior, into.velocity_m_s, into.covariance,
+            into.distance_m, into.misfit, into.observations, into.reference,
         ),
     )  # fmt: skip
 
@@ -236,7 +241,7 @@ def _velocity_covariance(factor: Any, p: Any, gradient: Any, column: Any, out: A
 @njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(
     which: Any, first: Any, members: Any, band: Any, camera: Any, xy: Any, rays: Any, points: Any, triangulated: Any,
-    views: Any, path: Any, only_unsure: bool, evidence: Any, velocity: Any, covariance: Any, distance: Any,
+    views: Any, path: Any, only_unsure: bool, evidence: Any, prior: Any, velocity: Any, covariance: Any, distance: Any,
     misfit: Any, observations: Any, reference: Any,
 ) -> None:  # fmt: skip
     most_seen = MAX_OBSERVATIONS
@@ -275,16 +280,21 @@ def _weigh(
         distance[t] = 1.0 / max(p[2], 1.0 / FARTHEST_M)
         if not is_sound or (only_unsure and stands < UNSURE + UNSURE_PER_NUMBER * (2 * n - STANDS)):
             continue
-        log_stands = -0.5 * (stands + log_determinant(scratch.factor, STANDS) - math.log(weight[2]))
+        # Errors of poses and of the calibration look like a small velocity: what stands may have one as well.
+        p[3] = p[4] = mean[3] = mean[4] = 0.0
+        weight[3] = weight[4] = 1.0 / (max(p[2], 1.0 / FARTHEST_M) * DRIFT_M_S) ** 2
+        stands, _, is_sound = fit(n, MOVES, True, p, mean, weight, least, nearest, sight, views, scratch)
+        if not is_sound:
+            continue
+        log_priors = math.log(weight[2]) + math.log(weight[3]) + math.log(weight[4])
+        log_stands = -0.5 * (stands + log_determinant(scratch.factor, MOVES) - log_priors)
         lowest = max(least, 1.0 / FARTHEST_M, -fall / max(HIGHEST_M - path.camera_height_m, 0.5))
         expected = fall / max(path.camera_height_m - BODY_M, 0.3) if fall > HORIZON else 1.0 / FAR_M
         expected = max(expected, lowest)
         mean[2], weight[2] = expected, 1.0 / (BODY_SHARE * expected) ** 2
-        mean[3] = mean[4] = 0.0
         weight[3] = weight[4] = 1.0 / (expected * SPEED_M_S) ** 2
         log_priors = math.log(weight[2]) + math.log(weight[3]) + math.log(weight[4])
         start[:] = p
-        start[3] = start[4] = 0.0
         moves = np.inf
         for from_standing in (False, True):
             if from_standing:
@@ -298,6 +308,7 @@ def _weigh(
             if is_sound and total < moves:
                 moves = total
                 evidence[t] = -0.5 * (total + log_determinant(scratch.factor, MOVES) - log_priors) - log_stands
+                prior[t] = -TALL if path.camera_height_m - fall / p[2] > CAR_M else 0.0
                 velocity[t, 0], velocity[t, 1] = p[3] / p[2], p[4] / p[2]
                 distance[t] = 1.0 / p[2]
                 _velocity_covariance(scratch.factor, p, scratch.gradient, scratch.step, covariance[t])
