@@ -149,18 +149,23 @@ def free_distance_m(c: Any, d: Any, station: int, path: Any) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _begin_of_window(members: Any, band: Any, views: Any) -> Any:
-    """Begin of the time in which most of a track's observations are, and how many these are."""
-    most, begin_s = 0, 0.0
+    """Begin of the time in which most of a track's observations are, and how many these are.
+
+    Keypoints are in the order of their units, so that one pass is enough.
+    """
+    most, begin_s, seen, first = 0, 0.0, 0, 0
     for i in range(len(members)):
         if not views.is_posed[band[members[i]]]:
             continue
-        start, seen = views.time_s[band[members[i]]], 0
-        for j in range(len(members)):
-            later = views.time_s[band[members[j]]] - start
-            if views.is_posed[band[members[j]]] and 0.0 <= later <= WINDOW_S:
-                seen += 1
+        now = views.time_s[band[members[i]]]
+        seen += 1
+        while now - views.time_s[band[members[first]]] > WINDOW_S:
+            seen -= views.is_posed[band[members[first]]]
+            first += 1
         if seen > most:
-            most, begin_s = seen, start
+            most, begin_s = seen, views.time_s[band[members[first]]]
+            for j in range(first, i):
+                begin_s = min(begin_s, views.time_s[band[members[j]]])
     return begin_s, most
 
 

@@ -26,6 +26,7 @@
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
 | 24 | which of many seams is wrong, by loops of simulated scenes |
+| 26 | traffic without masks: tracks on vehicles that move, and those of the street |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -58,6 +59,7 @@ from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
+from tests.benchmarks.moving_objects import moving_objects
 from tests.benchmarks.occlusion import occlusion
 from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
@@ -112,6 +114,7 @@ LINES = {
     "22": Line(timed=(surround_peers,)),
     "23": Line(untimed=(simulated_routes,)),
     "24": Line(timed=(seam_graphs,)),
+    "26": Line(by_seed=(moving_objects,)),
 }
 
 

