@@ -1,8 +1,8 @@
 """Line 26: traffic without masks. Tracks on vehicles that move give no points, and those of the street stay.
 
 Rendered drives with vehicles ahead, beside and oncoming, at 10 and 30 Hz, small and large. Each is reconstructed three
-times: with the masks of the renderer, and without masks with and without the motion test. A track is on a vehicle if most
-of its keypoints are, by the renderer's exact masks of what moves; it is static if none is.
+times: with the masks of the renderer, and without masks with and without the motion test. A track is on a vehicle if
+most of its keypoints are, by the renderer's exact masks of what moves; it is static if none is.
 """
 
 from __future__ import annotations
@@ -73,9 +73,7 @@ def _traffic(rendered: Path, work: Path, title: str) -> Iterator[Figure]:
     tracks, before, after = VerifiedTracks.read(with_it, rendered), observed(without), observed(with_it)
     moving, static = tracks.moving, tracks.static
     yield Figure(line="26", what=f"{title}: tracks on vehicles", value=moving.sum())
-    yield Figure(
-        line="26", what=f"{title}: of them with a point, without the test", value=tracks.share(moving, before)
-    )
+    yield Figure(line="26", what=f"{title}: of them with a point, without the test", value=tracks.share(moving, before))
     yield Figure(
         line="26", what=f"{title}: the same with it", value=tracks.share(moving, after), above=-1e-9, most=MOST_LEFT
     )
