@@ -72,7 +72,7 @@ def _traffic(rendered: Path, work: Path, title: str) -> Iterator[Figure]:
     settings.unlink()
     tracks, before, after = VerifiedTracks.read(with_it, rendered), observed(without), observed(with_it)
     moving, static = tracks.moving, tracks.static
-    yield Figure(line="26", what=f"{title}: tracks on vehicles", value=moving.sum())
+    yield Figure(line="26", what=f"{title}: tracks on vehicles", value=int(moving.sum()))
     yield Figure(line="26", what=f"{title}: of them with a point, without the test", value=tracks.share(moving, before))
     yield Figure(
         line="26", what=f"{title}: the same with it", value=tracks.share(moving, after), above=-1e-9, most=MOST_LEFT

@@ -149,5 +149,5 @@ def test_time_grows_with_the_observations() -> None:
         return min(times), len(mapper.tracks.keypoints)
 
     seconds_and_observations(6)  # compiles
-    few, many = seconds_and_observations(24), seconds_and_observations(48)
+    few, many = seconds_and_observations(16), seconds_and_observations(32)
     assert many[0] / few[0] < 2.3 / 2.0 * many[1] / few[1]
