@@ -94,6 +94,8 @@ def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_key
     distance = np.empty(out.shape[1])
     for n in range(len(reference)):
         k, count = reference[n], 0
+        if k < 0:
+            continue
         limit = reach[n] * reach[n]
         for other in range(first[image[k]], first[image[k] + 1]):
             if of_keypoint[other] < 0 or other == k:

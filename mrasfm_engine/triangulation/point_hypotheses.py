@@ -132,6 +132,26 @@ def _linearise(count: int, unknowns: int, p: Any, sight: Any, views: Any, loss: 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views: Any, scratch: Any) -> float:
+    """Cost of the observations of a point that stands at x, y, z from the reference camera."""
+    r, offset, out, total = views.rotation, sight.offset_m, scratch.projected, 0.0
+    loss2 = LOSS_SIGMAS * LOSS_SIGMAS
+    for m in range(count):
+        k, c = sight.band[m], sight.camera[m]
+        dx, dy, dz = x - offset[m, 0], y - offset[m, 1], z - offset[m, 2]
+        ahead = r[k, 2, 0] * dx + r[k, 2, 1] * dy + r[k, 2, 2] * dz
+        if ahead < 1e-3:
+            return np.inf
+        project(
+            views.kind[c], views.params[c], r[k, 0, 0] * dx + r[k, 0, 1] * dy + r[k, 0, 2] * dz,
+            r[k, 1, 0] * dx + r[k, 1, 1] * dy + r[k, 1, 2] * dz, ahead, scratch.work, out,
+        )  # fmt: skip
+        squared = ((out[0] - sight.xy_px[m, 0]) ** 2 + (out[1] - sight.xy_px[m, 1]) ** 2) / views.sigma_px[c] ** 2
+        total += loss2 * math.log(1.0 + squared / loss2)
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def factorise(a: Any, unknowns: int, factor: Any) -> bool:
     """Cholesky factor of an information matrix; False where it is not positive."""
     for i in range(unknowns):

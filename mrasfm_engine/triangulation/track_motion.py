@@ -24,6 +24,7 @@ from mrasfm_engine.triangulation.point_hypotheses import (
     STANDS,
     Sight,
     Views,
+    cost_of_standing,
     fit,
     log_determinant,
     new_scratch,
@@ -270,7 +271,7 @@ def _weigh(
         least = 1.0 / free_distance_m(c, d, station, path) if fall > 0.0 else 0.0
         p[:] = 0.0
         p[2] = max(1.0 / FAR_M, least)
-        is_near = False
+        is_near, x0, x1, x2 = False, 0.0, 0.0, 0.0
         if triangulated[t]:
             x0, x1, x2 = points[t, 0] - c[0], points[t, 1] - c[1], points[t, 2] - c[2]
             depth = d[0] * x0 + d[1] * x1 + d[2] * x2
@@ -280,10 +281,16 @@ def _weigh(
                 p[1] = (e[1, 0] * x0 + e[1, 1] * x1 + e[1, 2] * x2) / depth
                 p[2] = 1.0 / depth
         mean[2], weight[2] = 0.0, 1.0 / SIGMA_INVERSE_M**2
+        too_little = UNSURE + UNSURE_PER_NUMBER * (2 * n - STANDS)
+        if only_unsure and is_near and p[2] >= least:
+            # Its point explains it so well that the best one need not be found.
+            at_point = cost_of_standing(n, x0, x1, x2, sight, views, scratch)
+            if at_point + weight[2] * p[2] ** 2 < too_little:
+                continue
         stands, data, is_sound = fit(n, STANDS, is_near, p, mean, weight, least, nearest, sight, views, scratch)
         reference[t], observations[t], misfit[t] = sight.keypoint[ref], n, data / n
         distance[t] = 1.0 / max(p[2], 1.0 / FARTHEST_M)
-        if not is_sound or (only_unsure and stands < UNSURE + UNSURE_PER_NUMBER * (2 * n - STANDS)):
+        if not is_sound or (only_unsure and stands < too_little):
             continue
         # Errors of poses and of the calibration look like a small velocity: what stands may have one as well.
         p[3] = p[4] = mean[3] = mean[4] = 0.0
