@@ -137,6 +137,9 @@ class MappingConfig(_Section):
     pose_observations: Annotated[int, Field(ge=0)] = Field(
         250, description="observations of an image that its pose uses while the scene grows; 0 uses all"
     )
+    drop_moving: bool = Field(
+        True, description="tracks whose motion, or that of their neighbours, shows something that moves give no points"
+    )
     semantic_triangulation: bool = Field(True, description="points of the road that are off its surface are dropped")
     road_patch_m: Positive = Field(8.0, description="radius of a plane patch of the road's surface")
     road_sigmas: Positive = Field(

@@ -33,7 +33,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         parser.add_argument(flag, choices=choices, default=value, help=f"{text} (default: {value})")
 
     add("--cameras", int, "cameras of the vehicle, 1 to 8")
-    add("--units", int, "frames in which all cameras take an image, 10 per second")
+    add("--units", int, "frames in which all cameras take an image")
     add("--drives", int, "drives of the same world, an hour apart")
     add("--seed", int, "everything random follows from it")
     choose("--world", [world.value for world in World], "kind of street")
@@ -41,6 +41,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add("--ramp", float, "slope of a hill on the path, percent", to="ramp_percent", metavar="PERCENT")
     add("--parked-cars", int, "parked cars along each drive")
     add("--moving-cars", int, "other vehicles that drive")
+    add("--same-way-cars", int, "vehicles that drive along, in turns ahead and in the lane beside")
     add("--moving-shadows", int, "objects out of view whose shadows move over the road, besides the vehicle's own")
     add("--shadows", float, "darkness of shadows, 0 to 1", to="shadow_strength", metavar="STRENGTH")
 
@@ -53,8 +54,12 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add("--blur-px", float, "sigma of the point spread function")
     add("--jpeg-quality", int, "of the images")
     parser.add_argument("--no-masks", dest="masks", action="store_false", help="write no semantic masks")
+    parser.add_argument(
+        "--moving-masks", action="store_true", help="truth_moving/ says which pixels show something that moves"
+    )
     add("--texture-px", int, "side of the largest textures: 64, 128, 256, 512 or 1024")
 
+    add("--rate-hz", float, "units a second")
     add("--spacing-m", float, "mean distance between units")
     choose("--speed-profile", [profile.value for profile in SpeedProfile], "variation of the speed")
     add("--standing", int, "units in the middle during which the vehicle stands", to="standing_units", metavar="UNITS")

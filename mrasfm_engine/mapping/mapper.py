@@ -57,6 +57,8 @@ class Mapper:
         Where the rig is at the images' own times, and poses that images have apart from it.
     rejected
         (tracks,) which tracks were dropped for what they show: they get no point until all are tried again.
+    moves
+        (tracks,) which of them were dropped because they show something that moves.
     track_class
         (tracks,) the class of most keypoints of a track, as `semantics.CLASS_CODES` numbers them.
     """
@@ -82,6 +84,7 @@ class Mapper:
         self.is_inlier = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.missing = np.zeros(len(drive.images), dtype=np.bool_)
         self.rejected = np.zeros(len(tracks), dtype=np.bool_)
+        self.moves = np.zeros(len(tracks), dtype=np.bool_)
         self.track_class = tracks.classes(keypoints.classes)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)

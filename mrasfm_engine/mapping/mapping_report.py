@@ -14,6 +14,7 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import voted_out
+from mrasfm_engine.mapping.moving_objects import REASONS, MovingTracks
 from mrasfm_engine.mapping.placement import Placement
 from mrasfm_engine.mapping.refinement import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
@@ -105,6 +106,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             **_directions(mapper, refinement),
         },
         "georeferenced": refinement.georeferenced,
+        "moving_objects": _moving(refinement.moving),
         "road": _road(refinement.road),
         "motion_within_units": _motion(mapper),
     }
@@ -164,6 +166,16 @@ def _directions(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
             }
             for w in refinement.miscalibrations
         ],
+    }
+
+
+def _moving(moving: MovingTracks) -> dict[str, Any]:
+    """Tracks that show something that moves, and why each was taken out."""
+    return {
+        "tracks_judged": moving.judged,
+        "tracks_dropped": len(moving.tracks),
+        "points_dropped": moving.points,
+        "tracks_dropped_because": {text: int((moving.reason == code).sum()) for code, text in REASONS.items()},
     }
 
 

@@ -35,6 +35,7 @@ from mrasfm_engine.mapping.miscalibration import (
     find_miscalibrations,
     find_wrong_pair,
 )
+from mrasfm_engine.mapping.moving_objects import MovingTracks, drop_moving
 from mrasfm_engine.mapping.placement import Placement
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
@@ -89,6 +90,7 @@ class Refinement:
     miscalibrations: list[Miscalibration] = field(default_factory=list)
     late_cameras: list[Finding] = field(default_factory=list)
     wrong_pair: MiscalibratedPair | None = None  # of a rig of two cameras
+    moving: MovingTracks = field(default_factory=MovingTracks)
     road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
@@ -130,6 +132,7 @@ def refine(
             code="no-metric-scale",
         )
     free_units = _free_units(mapper, absolute)
+    result.moving = drop_moving(mapper)
     result.sigma_px = _observation_sigma(mapper)
     result.calibration = assess_calibration(
         mapper,
@@ -175,6 +178,10 @@ def refine(
         else:
             mapper.complete()
         observations, points = mapper.filter(mapper.config.mapping.filter_error_px)
+        if is_last:
+            result.moving = drop_moving(mapper)
+        else:
+            mapper.drop(result.moving.tracks)
         if mapper.config.mapping.semantic_triangulation:
             result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
         result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()

@@ -24,7 +24,7 @@ from mrasfm_engine.synthetic.calibration import given_cameras
 from mrasfm_engine.synthetic.light import along_street, daylight, dusk
 from mrasfm_engine.synthetic.motion import Motion, drive_motion
 from mrasfm_engine.synthetic.moving_shadows import street_heading
-from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.synthetic.own_car import OwnCar, own_car_before
 from mrasfm_engine.synthetic.render import Lens, View, develop, render
 from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
@@ -145,10 +145,10 @@ def _render_drive(
     folder: Path,
     report: Callable[[int], None],
 ) -> None:
-    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(8)]
+    rng = [np.random.default_rng([options.seed, 2, drive, topic]) for topic in range(9)]
     motion = drive_motion(options, world.layout, drive, rng[0])
     start_us = FIRST_EPOCH_US + drive * _BETWEEN_DRIVES_US
-    unit_s = np.arange(options.units) / RATE_HZ
+    unit_s = np.arange(options.units) / options.rate_hz
     unit_us = start_us + np.round(unit_s * 1e6).astype(np.int64)
     shots = _plan(options, motion, rig, unit_us, start_us, rng[1])
     light = daylight(rng[2])
@@ -161,7 +161,17 @@ def _render_drive(
     if options.moving_shadows:
         # In the shade of houses nothing casts a shadow: the sun stands along the street.
         light = along_street(light, street_heading(motion, options))
-    scene = build_scene(options, world, drive=drive, own=motion, rig=rig, light=light, rng=rng[3], shadow_rng=rng[6])
+    scene = build_scene(
+        options,
+        world,
+        drive=drive,
+        own=motion,
+        rig=rig,
+        light=light,
+        rng=rng[3],
+        shadow_rng=rng[6],
+        same_way_rng=rng[8],
+    )
     world_from_rig = motion.world_from_rig(unit_s)
     manifest = DriveManifest(
         name=f"synthetic {options.world} {drive}, seed {options.seed}",
@@ -176,6 +186,8 @@ def _render_drive(
         (folder / "images" / camera.name).mkdir(parents=True)
         if options.masks:
             (folder / "masks" / camera.name).mkdir(parents=True)
+        if options.moving_masks:
+            (folder / "truth_moving" / camera.name).mkdir(parents=True)
     (folder / "drive.json").write_text(manifest.model_dump_json(exclude_none=True, indent=1) + "\n")
     _write_truth(folder, options, rig, shots, world_from_rig, unit_us, world.layout.ground)
     own_cars = _own_cars(options, lenses)
@@ -340,6 +352,7 @@ def _rolling(options: SynthOptions, scene: SceneInTime, lens: Lens, middle_s: fl
     return View(
         intensity=np.concatenate([view.intensity for view in views]),
         labels=np.concatenate([view.labels for view in views]),
+        is_moving=np.concatenate([view.is_moving for view in views]),
         depth_m=np.concatenate([view.depth_m for view in views]),
     )
 
@@ -371,6 +384,9 @@ def _take(
     _write(folder / shot.file, image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, options.jpeg_quality])
     if shot.mask is not None:
         _write(folder / shot.mask, view.labels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if options.moving_masks:
+        path = folder / "truth_moving" / lens.camera.name / f"{shot.unit:06d}.png"
+        _write(path, view.is_moving.astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 3])
 
 
 def _write(path: Path, image: Bytes, parameters: list[int]) -> None:

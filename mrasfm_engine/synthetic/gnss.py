@@ -8,7 +8,7 @@ import numpy as np
 from pyproj import Transformer
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.types import Floats, Ints
 from schemas import Gnss, GnssSample
 
@@ -60,7 +60,7 @@ def receive(
     axes = np.array([1.0, 1.0, VERTICAL_FACTOR])
     error = options.gnss_noise_m * rng.normal(size=(n, 3)) + options.gnss_bias_m * rng.normal(size=3)
     # A Gauss-Markov process, started in its stationary state.
-    keep = np.exp(-1 / (RATE_HZ * _DRIFT_TIME_S))
+    keep = np.exp(-1 / (options.rate_hz * _DRIFT_TIME_S))
     drift = rng.normal(size=3)
     for k in range(n):
         error[k] += options.gnss_drift_m * drift

@@ -13,7 +13,7 @@ import numpy as np
 
 from mrasfm_engine.synthetic import objects
 from mrasfm_engine.synthetic.motion import Motion
-from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.synthetic.streets import Layout, Route
 from mrasfm_engine.types import Floats
 
@@ -68,7 +68,7 @@ def moving_shadows(
 
 def street_heading(own: Motion, options: SynthOptions) -> float:
     """The vehicle's mean heading over a drive, radians."""
-    ends = own.world_from_rig(np.array([0.0, (options.units - 1) / RATE_HZ]))
+    ends = own.world_from_rig(np.array([0.0, (options.units - 1) / options.rate_hz]))
     moved = ends[1, :2, 3] - ends[0, :2, 3]
     if np.linalg.norm(moved) < 1.0:
         moved = ends[0, :2, 0]
@@ -80,10 +80,10 @@ def _companion(
 ) -> ShadowCaster:
     """An open load that is near the vehicle at some instant of the drive."""
     route = layout.routes[drive]
-    duration_s = (options.units - 1) / RATE_HZ
+    duration_s = (options.units - 1) / options.rate_hz
     share = rng.uniform(*SPEED_SHARE[int(rng.random() < 0.6)])
-    speed = share * options.spacing_m * RATE_HZ
-    meets_s = rng.uniform(0.0, max(duration_s, 1.0 / RATE_HZ))
+    speed = share * options.spacing_m * options.rate_hz
+    meets_s = rng.uniform(0.0, max(duration_s, 1.0 / options.rate_hz))
     place_m = float(np.interp(meets_s, own.time_s, own.travelled_m)) + rng.uniform(*REACH_M)
     time_s = np.array([-2.0, duration_s + 2.0])
     motion = Motion(

@@ -9,7 +9,6 @@ from typing import Any
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.synthetic.rigs import MAX_SYNTHETIC_CAMERAS, mounts
 
-RATE_HZ = 10.0
 MIN_LOOP_M = 110.0
 LOOP_OVERLAP_M = 10.0
 
@@ -45,6 +44,7 @@ class SynthOptions:
     ramp_percent: float = 0.0  # slope of a hill that begins 10 m into the first drive
     parked_cars: int = 8
     moving_cars: int = 3
+    same_way_cars: int = 0  # that drive along with the vehicle, in turns ahead of it and in the other lane beside it
     moving_shadows: int = 0  # things out of view whose shadows travel along the road, beside the vehicle's own
     shadow_strength: float = 1.0  # 0: no shadows, 1: as dark as they are
 
@@ -56,9 +56,11 @@ class SynthOptions:
     blur_px: float = 0.45  # standard deviation of the point spread function
     jpeg_quality: int = 95
     masks: bool = True
+    moving_masks: bool = False  # what moves, pixel by pixel, as a part of the truth
     texture_px: int = 1024  # side of the largest textures; less for small images and fast tests
 
-    spacing_m: float = 1.1  # mean distance between units, at 10 Hz
+    rate_hz: float = 10.0  # units a second
+    spacing_m: float = 1.1  # mean distance between units
     speed_profile: SpeedProfile = SpeedProfile.GENTLE
     standing_units: int = 0  # the vehicle stands still for that many units in the middle of each drive
     time_skew_ms: float = 0.0  # the images of a unit are taken up to that long apart
@@ -103,6 +105,7 @@ class SynthOptions:
         for name in [
             "parked_cars",
             "moving_cars",
+            "same_way_cars",
             "moving_shadows",
             "exposure_jitter",
             "noise",
@@ -127,12 +130,15 @@ class SynthOptions:
             if not 0 <= getattr(self, name) <= 1:
                 flag = name.replace("_", "-")
                 refuse(f"--{flag} {getattr(self, name)} is not a fraction", "Give a number from 0 to 1.")
+        if not 1 <= self.rate_hz <= 100:
+            refuse(f"--rate-hz {self.rate_hz} is not a camera's", "Use 1 to 100.")
         if not 0.05 <= self.spacing_m <= 5:
-            refuse(f"--spacing-m {self.spacing_m} is not a car's", "Use 0.05 to 5 m, which is 0.5 to 50 m/s.")
-        if self.time_skew_ms >= 1000 / RATE_HZ:
-            refuse(f"--time-skew-ms {self.time_skew_ms} reaches the next unit", "Use less than 100 ms.")
-        if self.readout_ms >= 1000 / RATE_HZ:
-            refuse(f"--readout-ms {self.readout_ms} reaches the next unit", "Use less than 100 ms.")
+            refuse(f"--spacing-m {self.spacing_m} is not a car's", "Use 0.05 to 5 m, at 10 Hz 0.5 to 50 m/s.")
+        between_ms = 1000 / self.rate_hz
+        if self.time_skew_ms >= between_ms:
+            refuse(f"--time-skew-ms {self.time_skew_ms} reaches the next unit", f"Use less than {between_ms:g} ms.")
+        if self.readout_ms >= between_ms:
+            refuse(f"--readout-ms {self.readout_ms} reaches the next unit", f"Use less than {between_ms:g} ms.")
         if abs(self.ramp_percent) > 20:
             refuse(f"--ramp {self.ramp_percent} is steeper than streets are", "Use -20 to 20 percent.")
         if self.standing_units > self.units // 2:

@@ -17,9 +17,10 @@ from mrasfm_engine.synthetic.rasteriser import prepare_perspective, rasterise_li
 from mrasfm_engine.synthetic.rigs import TrueCamera
 from mrasfm_engine.synthetic.sensor import expose
 from mrasfm_engine.synthetic.shading import shade
-from mrasfm_engine.types import Bytes, Floats, Floats32
+from mrasfm_engine.types import Bools, Bytes, Floats, Floats32
 
 _SAMPLES = 2  # a side of each pixel's sample grid
+_MOVES = 0x80  # beside a label: what has it drives
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +29,7 @@ class View:
 
     intensity: Floats32  # (h, w, 3) red, green, blue; 1 is white
     labels: Bytes  # (h, w) Cityscapes train ids
+    is_moving: Bools  # (h, w) what is seen drives
     depth_m: Floats32  # (h, w) along the camera's z axis at pixel centres, inf for sky
 
 
@@ -153,6 +155,7 @@ def render(
     view = View(
         intensity=np.empty((h, w, 3), np.float32),
         labels=np.empty((h, w), np.uint8),
+        is_moving=np.zeros((h, w), np.bool_),
         depth_m=np.empty((h, w), np.float32),
     )
     shade(
@@ -166,7 +169,7 @@ def render(
         mesh.detail_uv,
         mesh.tint,
         mesh.normal,
-        mesh.label,
+        np.where(mesh.is_moving, mesh.label | _MOVES, mesh.label).astype(np.uint8),
         mesh.is_moving,
         *textures,
         atlas.levels,
@@ -180,6 +183,8 @@ def render(
         view.labels,
         view.depth_m,
     )
+    view.is_moving[:] = (view.labels & _MOVES) > 0
+    view.labels[:] &= _MOVES - 1
     view.depth_m[view.labels == Label.SKY] = np.inf
     return view
 

@@ -12,10 +12,10 @@ from mrasfm_engine.synthetic import objects
 from mrasfm_engine.synthetic.light import Light, ShadowMap, cast_shadows
 from mrasfm_engine.synthetic.materials import Materials
 from mrasfm_engine.synthetic.mesh import Mesh, concatenate
-from mrasfm_engine.synthetic.motion import Motion, traffic
+from mrasfm_engine.synthetic.motion import Motion, same_way_cars, traffic
 from mrasfm_engine.synthetic.moving_shadows import ShadowCaster, moving_shadows
 from mrasfm_engine.synthetic.occluder import place_truck
-from mrasfm_engine.synthetic.options import RATE_HZ, SynthOptions
+from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.synthetic.rigs import TrueCamera
 from mrasfm_engine.synthetic.streets import ROAD_HALF_M, Layout
 from mrasfm_engine.synthetic.world import StaticWorld
@@ -122,6 +122,16 @@ def _covers(lorry: Mover, world_from_car: Floats) -> bool:
     return _drives_through(lorry, lambda time_s: world_from_car)
 
 
+def _car(world: StaticWorld, motion: Motion, rng: np.random.Generator) -> Mover:
+    return Mover(
+        mesh=objects.car(world.materials, is_moving=True, rng=rng),
+        motion=motion,
+        motion_from_mover=np.eye(4),
+        size_m=objects.CAR_SIZE_M,
+        is_truck=False,
+    )
+
+
 def build_scene(
     options: SynthOptions,
     world: StaticWorld,
@@ -132,19 +142,12 @@ def build_scene(
     light: Light,
     rng: np.random.Generator,
     shadow_rng: np.random.Generator,
+    same_way_rng: np.random.Generator,
 ) -> SceneInTime:
     """The world with one drive's parked cars, traffic, moving shadows and light."""
     parked = parked_cars(options, world, drive, rng)
-    movers = [
-        Mover(
-            mesh=objects.car(world.materials, is_moving=True, rng=rng),
-            motion=motion,
-            motion_from_mover=np.eye(4),
-            size_m=objects.CAR_SIZE_M,
-            is_truck=False,
-        )
-        for motion in traffic(options, world.layout, drive, rng)
-    ]
+    movers = [_car(world, motion, rng) for motion in traffic(options, world.layout, drive, rng)]
+    movers += [_car(world, motion, same_way_rng) for motion in same_way_cars(options, world.layout, drive, own)]
     lorries = [
         Mover(
             mesh=objects.truck(world.materials, rng=rng),
@@ -152,8 +155,8 @@ def build_scene(
             motion_from_mover=place_truck(camera, rig),
             size_m=objects.TRUCK_SIZE_M,
             is_truck=True,
-            begin_s=0.25 * options.units / RATE_HZ - 0.05,
-            end_s=0.75 * options.units / RATE_HZ - 0.05,
+            begin_s=0.25 * options.units / options.rate_hz - 0.05,
+            end_s=0.75 * options.units / options.rate_hz - 0.05,
         )
         for camera in rig
         if camera.name in options.occluded_cameras

@@ -47,6 +47,14 @@ def points_below_trajectory(points_m: Floats, world_from_rig: Floats, lowest_cam
     return near
 
 
+def ground_level_m(points_m: Floats, world_from_rig: Floats, lowest_camera_m: float) -> float | None:
+    """Height of the ground in the rig, from points (n, 3) below the trajectory; None where no level stands out."""
+    below = points_below_trajectory(points_m, world_from_rig, lowest_camera_m)
+    if below is None:
+        return None
+    return float(np.median(_beside_trajectory(points_m[below], world_from_rig)[2]))
+
+
 def standing_is_impossible(points_m: Floats, distance_m: Floats, world_from_rig: Floats) -> Bools:
     """Return where (n,) nothing that stands can be: below the road, or above it in the lane that the vehicle drove.
 

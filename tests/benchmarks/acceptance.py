@@ -27,6 +27,7 @@
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
 | 24 | which of many seams is wrong, by loops of simulated scenes |
 | 25 | the own car in images without masks, rendered and real; a bar with the time over a fifth of all images |
+| 26 | traffic without masks: tracks on vehicles that move, and those of the street |
 | 27 | the road's picture of the best views: markings against the painted ones |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
@@ -60,6 +61,7 @@ from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
+from tests.benchmarks.moving_objects import moving_objects
 from tests.benchmarks.occlusion import occlusion
 from tests.benchmarks.own_car import bar_with_time, real_own_car, rendered_own_car
 from tests.benchmarks.real_drives import accuracy
@@ -118,6 +120,7 @@ LINES = {
     "23": Line(untimed=(simulated_routes,)),
     "24": Line(timed=(seam_graphs,)),
     "25": Line(untimed=(real_own_car,), by_seed=(rendered_own_car, bar_with_time)),
+    "26": Line(by_seed=(moving_objects,)),
     "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
 }
 

@@ -49,7 +49,7 @@ def occlusion(work: Path, seed: int) -> Iterator[Figure]:
         "--occlude", ",".join(cameras), "--out", rendered,
     )  # fmt: skip
     yield from _coverage(rendered, cameras, seed)
-    drive = _without_masks(rendered, work / "occluded, without masks")
+    drive = without_masks(rendered, work / "occluded, without masks")
     yield from with_the_set(drive, work / "occluded, scene", cameras, seed)
     yield from image_by_image(drive, work / "occluded, scene of single images", cameras, seed)
 
@@ -72,7 +72,7 @@ def _share(drive: Path, file: str) -> float:
     return float((mask == TRUCK).mean())
 
 
-def _without_masks(drive: Path, out: Path) -> Path:
+def without_masks(drive: Path, out: Path) -> Path:
     """The same images under a manifest that knows of no masks."""
     shutil.copytree(drive, out, copy_function=os.link)
     manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.moving_objects import VerifiedTracks, observed
 from tests.integration.conftest import CommandResult, Variant, read_report, synth
 
 Run = Callable[..., CommandResult]
@@ -44,6 +45,22 @@ def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None
     # 8 m of way with 0.3 m of noise say little about the scale, and the report says how little.
     sigma = read_report(tmp_path / "scene")["by_stage"]["refinement"]["scale"]["sigma_relative"]
     assert 0 < abs(errors["similarity"]["scale"] - 1) < 3 * sigma < 1
+
+
+@pytest.mark.slow
+def test_moving_cars_without_masks_give_no_points(tmp_path: Path, mrasfm: Run) -> None:
+    drive = synth(
+        tmp_path / "drive", "--cameras", 3, "--units", 8, "--moving-cars", 0, "--same-way-cars", 4, "--no-masks",
+        "--moving-masks", "--seed", 8,
+    )  # fmt: skip
+    errors = reconstructed(mrasfm, drive, tmp_path / "scene", "--no-gnss")
+    assert errors["registered_units"] == 8
+    assert 0 < errors["similarity"]["rmse_m"] < 0.03
+    report = read_report(tmp_path / "scene")["by_stage"]["refinement"]["moving_objects"]
+    assert report["tracks_dropped"] == sum(report["tracks_dropped_because"].values()) > 20
+    tracks, seen = VerifiedTracks.read(tmp_path / "scene", drive), observed(tmp_path / "scene")
+    assert tracks.moving.sum() > 20
+    assert tracks.share(tracks.moving, seen) <= 0.1
 
 
 @pytest.mark.slow

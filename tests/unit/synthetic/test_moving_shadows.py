@@ -5,7 +5,7 @@ import numpy as np
 from mrasfm_engine.synthetic.light import along_street, daylight
 from mrasfm_engine.synthetic.motion import drive_motion
 from mrasfm_engine.synthetic.moving_shadows import HEIGHT_M, SPEED_SHARE, moving_shadows, street_heading
-from mrasfm_engine.synthetic.options import RATE_HZ, small_options
+from mrasfm_engine.synthetic.options import small_options
 from mrasfm_engine.synthetic.streets import lay_out
 
 OPTIONS = small_options(units=20, moving_shadows=30, seed=4, ramp_percent=6.0)
@@ -16,14 +16,14 @@ def test_companions_move_along_the_road_at_other_speeds_and_near_the_vehicle() -
     own = drive_motion(OPTIONS, layout, 0, np.random.default_rng(1))
     casters = moving_shadows(OPTIONS, layout, 0, own, np.random.default_rng(2))
     assert len(casters) == 31
-    times = np.arange(OPTIONS.units) / RATE_HZ
+    times = np.arange(OPTIONS.units) / OPTIONS.rate_hz
     way = own.world_from_rig(times)
     np.testing.assert_allclose(casters[0].boxes(0.5)[:, 5], np.sin(street_angle(own.world_from_rig(0.5))), atol=1e-9)
-    speed = OPTIONS.spacing_m * RATE_HZ
+    speed = OPTIONS.spacing_m * OPTIONS.rate_hz
     for caster in casters[1:]:
         boxes = np.stack([caster.boxes(t) for t in times])
         centre = boxes[:, :, :2].mean(1)
-        moved = np.linalg.norm(np.diff(centre, axis=0), axis=1).mean() * RATE_HZ / speed
+        moved = np.linalg.norm(np.diff(centre, axis=0), axis=1).mean() * OPTIONS.rate_hz / speed
         assert min(abs(s) for pair in SPEED_SHARE for s in pair) * 0.8 < moved < 1.0
         assert np.linalg.norm(centre - way[:, :2, 3], axis=1).min() < 20.0
         above = boxes[:, :, 2] - layout.ground.height(boxes[:, :, :2])
@@ -51,7 +51,7 @@ def test_the_sun_stands_along_the_street_at_its_height() -> None:
 def test_heading_of_the_whole_drive() -> None:
     layout = lay_out(OPTIONS, np.random.default_rng(0))
     own = drive_motion(OPTIONS, layout, 0, np.random.default_rng(1))
-    middle = street_angle(own.world_from_rig(0.5 * OPTIONS.units / RATE_HZ))
+    middle = street_angle(own.world_from_rig(0.5 * OPTIONS.units / OPTIONS.rate_hz))
     assert 0 < abs(street_heading(own, OPTIONS) - middle) < np.radians(30)
 
 

@@ -146,7 +146,12 @@ def test_sensor_noise_has_the_size_it_promises() -> None:
     lens = Lens(camera("PINHOLE"))
     lens.vignetting[:] = 1.0
     flat = np.full((180, 320, 3), 0.5, np.float32)
-    view = View(intensity=flat, labels=np.zeros((180, 320), np.uint8), depth_m=np.ones((180, 320), np.float32))
+    view = View(
+        intensity=flat,
+        labels=np.zeros((180, 320), np.uint8),
+        is_moving=np.zeros((180, 320), np.bool_),
+        depth_m=np.ones((180, 320), np.float32),
+    )
     image = develop(view, lens, gain=1.0, noise=1.0, blur_px=0.0, rng=np.random.default_rng(0)).astype(float)
     expected = np.hypot(np.sqrt(0.022**2 * 0.25 + 0.004**2) / (2 * 0.5) * 255, np.sqrt(1 / 12))
     assert image.mean() == pytest.approx(127.5, abs=0.1)

@@ -1,0 +1,174 @@
+"""Groups of tracks that move together: neighbours in an image strengthen one another.
+
+A rigid object that moves has many keypoints side by side, and one velocity explains them all. Whether a track moves is
+decided for all tracks together [mean field of an Ising model]: by its own evidence, or by that for the velocity that
+its moving neighbours share, and by what its neighbours are. Given that velocity, a track pays no Occam factor for one
+of its own [Savage-Dickey]. So velocities along the own motion count as well, of which a track alone reveals nothing. A
+track among moving ones may also be a mixture of wrong matches, as objects that move and look alike make them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from mrasfm_engine.triangulation.track_motion import SPEED_M_S, TrackMotion
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
+from mrasfm_engine.types import Floats, Ints
+
+NEIGHBOURS = 12
+REACH_M = 1.2  # to neighbours, at a track's distance: half of a car
+MOST_EVIDENCE = 8.0  # that a track has for itself: more is a matter of wrong matches, not of motion
+PRIOR = 0.5  # log odds for standing, beside a track that may move
+BOND = 1.0  # log odds that a neighbour adds that moves,
+BOND_TO_STANDING = 0.5  # and takes that stands: a thing's outline has both on its sides
+SLACK_M_S = 0.5  # by which velocities of one thing differ
+MIXED = 8.0  # cost of an observation, if matches are mixed: as a residual of five standard deviations has it
+ROUNDS = 10
+ALONE, SHARED, MIXTURE = 1, 2, 3  # why a track is taken to move
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionGroups:
+    """Tracks that move."""
+
+    tracks: Ints  # (n,) ascending
+    reason: Ints  # (n,) ALONE: its own evidence; SHARED: its neighbours' velocity; MIXTURE: its matches contradict
+
+
+def group(
+    motion: TrackMotion,
+    keypoints: Keypoints,
+    tracks: Tracks,
+    focal_px: Floats,
+    weigh: Callable[[Ints], None],
+) -> MotionGroups:
+    """Decide which tracks move.
+
+    Parameters
+    ----------
+    motion
+        Of all tracks; those without evidence stand, but for those that `weigh` gives some.
+    focal_px
+        Of every camera (c,).
+    weigh
+        Completes `motion` for tracks.
+    """
+    suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
+    beside = _neighbours(suspects, motion, keypoints, tracks, focal_px)
+    others = np.setdiff1d(beside[beside >= 0], suspects)
+    weigh(others[np.isnan(motion.log_evidence[others])])
+    nodes = np.concatenate([suspects, others])
+    edges = np.concatenate([beside, _neighbours(others, motion, keypoints, tracks, focal_px)])
+    place = np.full(len(tracks), -1, dtype=np.int64)
+    place[nodes] = np.arange(len(nodes))
+    # A neighbour that is no node stands: it is beside no suspect.
+    linked = np.where(edges >= 0, place[edges], -2)
+    evidence = np.nan_to_num(motion.log_evidence[nodes], nan=-MOST_EVIDENCE)
+    score, reason = np.empty(len(nodes)), np.empty(len(nodes), dtype=np.int64)
+    _mean_field(
+        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], motion.covariance[nodes],
+        motion.observations[nodes] * (motion.misfit[nodes] - MIXED), score, reason,
+    )  # fmt: skip
+    order = np.argsort(nodes)
+    order = order[score[order] > 0.0]
+    return MotionGroups(tracks=nodes[order], reason=reason[order])
+
+
+def _neighbours(which: Ints, motion: TrackMotion, keypoints: Keypoints, tracks: Tracks, focal_px: Floats) -> Ints:
+    """The tracks (n, NEIGHBOURS) nearest to tracks in the image of their reference keypoints; -1 for none."""
+    result = np.full((len(which), NEIGHBOURS), -1, dtype=np.int64)
+    reference = motion.reference[which]
+    reach_px = REACH_M * focal_px[keypoints.camera[reference]] / motion.distance_m[which]
+    _nearest(reference, reach_px, keypoints.first, keypoints.image, keypoints.xy_px, tracks.of_keypoint, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_keypoint: Any, out: Any) -> None:
+    distance = np.empty(out.shape[1])
+    for n in range(len(reference)):
+        k, count = reference[n], 0
+        if k < 0:
+            continue
+        limit = reach[n] * reach[n]
+        for other in range(first[image[k]], first[image[k] + 1]):
+            if of_keypoint[other] < 0 or other == k:
+                continue
+            d2 = (xy[other, 0] - xy[k, 0]) ** 2 + (xy[other, 1] - xy[k, 1]) ** 2
+            if d2 >= limit:
+                continue
+            at = count
+            while at > 0 and distance[at - 1] > d2:
+                if at < len(distance):
+                    distance[at], out[n, at] = distance[at - 1], out[n, at - 1]
+                at -= 1
+            if at < len(distance):
+                distance[at], out[n, at] = d2, of_keypoint[other]
+                count = min(count + 1, len(distance))
+            if count == len(distance):
+                limit = distance[count - 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mean_field(
+    linked: Any, evidence: Any, prior: Any, velocity: Any, covariance: Any, mixed: Any, score: Any, reason: Any
+) -> None:  # fmt: skip
+    """Log odds and reasons of all nodes; `linked` (n, k) are their neighbours: -1 for one that stands, -2 for none."""
+    count, size = linked.shape
+    belief, following = np.empty(count), np.empty(count)
+    information, pulled = np.empty((count, 3)), np.empty((count, 2))
+    slack2, speed2 = SLACK_M_S**2, SPEED_M_S**2
+    for n in range(count):
+        own = min(max(evidence[n], -MOST_EVIDENCE), MOST_EVIDENCE)
+        belief[n] = math.tanh(0.5 * (own + prior[n] - PRIOR))
+        xx, xy, yy = covariance[n, 0] + slack2, covariance[n, 1], covariance[n, 2] + slack2
+        det = xx * yy - xy * xy
+        if not det > 0.0:
+            xx, xy, yy, det = speed2, 0.0, speed2, speed2 * speed2
+        information[n, 0], information[n, 1], information[n, 2] = yy / det, -xy / det, xx / det
+        pulled[n, 0] = information[n, 0] * velocity[n, 0] + information[n, 1] * velocity[n, 1]
+        pulled[n, 1] = information[n, 1] * velocity[n, 0] + information[n, 2] * velocity[n, 1]
+    for _ in range(ROUNDS):
+        for n in range(count):
+            i0 = i1 = i2 = v0 = v1 = moving = bonds = 0.0
+            for j in range(size):
+                m = linked[n, j]
+                if m == -2:
+                    continue
+                b = belief[m] if m >= 0 else -1.0
+                if b <= 0.0:
+                    bonds += BOND_TO_STANDING * b
+                    continue
+                bonds += BOND * b
+                moving += b
+                i0 += b * information[m, 0]
+                i1 += b * information[m, 1]
+                i2 += b * information[m, 2]
+                v0 += b * pulled[m, 0]
+                v1 += b * pulled[m, 1]
+            best, why = evidence[n], ALONE
+            det = i0 * i2 - i1 * i1
+            if moving > 0.5 and det > 0.0:
+                common0, common1 = (i2 * v0 - i1 * v1) / det, (i0 * v1 - i1 * v0) / det
+                xx = covariance[n, 0] + slack2 + i2 / det
+                xy = covariance[n, 1] - i1 / det
+                yy = covariance[n, 2] + slack2 + i0 / det
+                d0, d1 = common0 - velocity[n, 0], common1 - velocity[n, 1]
+                det = xx * yy - xy * xy
+                away = (yy * d0 * d0 - 2.0 * xy * d0 * d1 + xx * d1 * d1) / det
+                speed = (common0 * common0 + common1 * common1) / speed2
+                shared = evidence[n] + 0.5 * (speed - away - math.log(det / (speed2 * speed2)))
+                if shared > best:
+                    best, why = shared, SHARED
+                if 0.5 * mixed[n] > best:
+                    best, why = 0.5 * mixed[n], MIXTURE
+            score[n] = min(max(best, -MOST_EVIDENCE), MOST_EVIDENCE) + prior[n] - PRIOR + bonds
+            reason[n] = why
+            following[n] = 0.5 * belief[n] + 0.5 * math.tanh(0.5 * score[n])
+        belief[:] = following
