@@ -10,6 +10,10 @@ from mrasfm_engine.triangulation.road_surface import horizontal_axes, most_frequ
 from mrasfm_engine.types import Bools, Floats
 
 CORRIDOR_M = 3.0  # to both sides of the trajectory: a lane
+# Of the corridor, which tells the level where it has points: cars that are parked beside it, whose bonnets and window
+# sills make levels too, stand farther away than half a car's width and what passing them takes.
+FREE_M = 2.0
+FREE_POINTS = 20
 DRIVEN_M = 0.8  # to both sides of the trajectory: where the vehicle itself was
 VEHICLE_HEIGHT_M = 1.2  # above the road, in which nothing was where the vehicle drove
 AHEAD_M = 12.0  # how far beyond the ends of the trajectory the road is believed to go on
@@ -39,7 +43,8 @@ def points_below_trajectory(points_m: Floats, world_from_rig: Floats, lowest_cam
     lane = (np.abs(lateral) < CORRIDOR_M) & (height < lowest_camera_m - BELOW_CAMERAS_M)
     if lane.sum() < MIN_POINTS:
         return None
-    level = most_frequent(height[lane])
+    free = lane & (np.abs(lateral) < FREE_M)
+    level = most_frequent(height[free if free.sum() >= FREE_POINTS else lane])
     near = lane & (np.abs(height - level) < LEVEL_M + LEVEL_PER_M * away)
     on_level = lane & (np.abs(height - level) < 0.1 + LEVEL_PER_M * away)
     if on_level.sum() < max(MIN_POINTS, MIN_SHARE * lane.sum()):
