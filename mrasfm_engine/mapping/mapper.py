@@ -57,8 +57,6 @@ class Mapper:
         Where the rig is at the images' own times, and poses that images have apart from it.
     rejected
         (tracks,) which tracks were dropped for what they show: they get no point until all are tried again.
-    moves
-        (tracks,) which of them were dropped because they show something that moves.
     track_class
         (tracks,) the class of most keypoints of a track, as `semantics.CLASS_CODES` numbers them.
     """
@@ -84,7 +82,6 @@ class Mapper:
         self.is_inlier = np.zeros(len(keypoints.image), dtype=np.bool_)
         self.missing = np.zeros(len(drive.images), dtype=np.bool_)
         self.rejected = np.zeros(len(tracks), dtype=np.bool_)
-        self.moves = np.zeros(len(tracks), dtype=np.bool_)
         self.track_class = tracks.classes(keypoints.classes)
         self.image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         self.image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
@@ -316,7 +313,7 @@ class Mapper:
         rows = np.flatnonzero(self.is_inlier)
         tracks = self.tracks.of_keypoint[rows]
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, tracks)
-        bad = errors > max_error_px
+        bad = ~(errors <= max_error_px)  # no number is no small error
         self.is_inlier[rows[bad]] = False
         left = np.bincount(tracks[~bad], minlength=len(self.tracks))
         lost = self.triangulated & (left < 2)

@@ -30,7 +30,7 @@ BOND_TO_STANDING = 0.5  # and takes that stands: a thing's outline has both on i
 SLACK_M_S = 0.5  # by which velocities of one thing differ
 MIXED = 8.0  # cost of an observation, if matches are mixed: as a residual of five standard deviations has it
 ROUNDS = 10
-ALONE, SHARED, MIXTURE = 1, 2, 3  # why a track is taken to move
+ALONE, SHARED, MIXTURE, BESIDE = 1, 2, 3, 4  # why a track is taken to move
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,9 @@ class MotionGroups:
     """Tracks that move."""
 
     tracks: Ints  # (n,) ascending
-    reason: Ints  # (n,) ALONE: its own evidence; SHARED: its neighbours' velocity; MIXTURE: its matches contradict
+    # (n,) ALONE: its own evidence; SHARED: its neighbours' velocity; MIXTURE: its matches contradict; BESIDE: none of
+    # these, but most of its neighbours move.
+    reason: Ints
 
 
 def group(
@@ -76,7 +78,8 @@ def group(
         motion.observations[nodes] * (motion.misfit[nodes] - MIXED), score, reason,
     )  # fmt: skip
     order = np.argsort(nodes)
-    order = order[score[order] > 0.0]
+    # What was not weighed, with too few observations, is not known to move.
+    order = order[(score[order] > 0.0) & np.isfinite(motion.log_evidence[nodes[order]])]
     return MotionGroups(tracks=nodes[order], reason=reason[order])
 
 
@@ -125,7 +128,7 @@ def _mean_field(
     information, pulled = np.empty((count, 3)), np.empty((count, 2))
     slack2, speed2 = SLACK_M_S**2, SPEED_M_S**2
     for n in range(count):
-        own = min(max(evidence[n], -MOST_EVIDENCE), MOST_EVIDENCE)
+        own = min(evidence[n], MOST_EVIDENCE)
         belief[n] = math.tanh(0.5 * (own + prior[n] - PRIOR))
         xx, xy, yy = covariance[n, 0] + slack2, covariance[n, 1], covariance[n, 2] + slack2
         det = xx * yy - xy * xy
@@ -168,7 +171,8 @@ def _mean_field(
                     best, why = shared, SHARED
                 if 0.5 * mixed[n] > best:
                     best, why = 0.5 * mixed[n], MIXTURE
-            score[n] = min(max(best, -MOST_EVIDENCE), MOST_EVIDENCE) + prior[n] - PRIOR + bonds
-            reason[n] = why
+            # Evidence against is not bounded: no neighbours outweigh what is sure to stand.
+            score[n] = min(best, MOST_EVIDENCE) + prior[n] - PRIOR + bonds
+            reason[n] = why if best + prior[n] > PRIOR else BESIDE
             following[n] = 0.5 * belief[n] + 0.5 * math.tanh(0.5 * score[n])
         belief[:] = following

@@ -8,7 +8,7 @@ import numpy as np
 
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.motion_groups import ALONE, MIXTURE, SHARED, group
+from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MIXTURE, SHARED, group
 from mrasfm_engine.scene.semantics import UNKNOWN
 from mrasfm_engine.triangulation.point_hypotheses import Views
 from mrasfm_engine.triangulation.track_motion import TrackMotion, weigh_tracks
@@ -23,6 +23,7 @@ REASONS = {
     ALONE: "its observations show a motion",
     SHARED: "it fits the motion of its neighbours",
     MIXTURE: "its observations contradict one another, and its neighbours move",
+    BESIDE: "most of its neighbours move, and it hardly tells",
 }
 
 
@@ -61,9 +62,11 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
     tracks = found.tracks[moves]
     points = int(mapper.triangulated[tracks].sum())
     mapper.drop(tracks)
-    mapper.moves[:] = False
-    mapper.moves[tracks] = True
-    return MovingTracks(tracks=tracks, reason=found.reason[moves], points=points, judged=int(may_move.sum()))
+    posed = np.flatnonzero((mapper.registered[mapper.image_unit] & ~mapper.missing)[mapper.keypoints.image])
+    of_keypoint = mapper.tracks.of_keypoint[posed]
+    seen = np.bincount(of_keypoint[of_keypoint >= 0], minlength=len(mapper.tracks))
+    judged = int((may_move & (seen > 1)).sum())
+    return MovingTracks(tracks=tracks, reason=found.reason[moves], points=points, judged=judged)
 
 
 def views_of(mapper: Mapper) -> Views:

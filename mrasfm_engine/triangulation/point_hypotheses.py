@@ -207,6 +207,7 @@ def fit(
     )  # fmt: skip
     p[2] = min(max(p[2], least), most)
     lowest, lowest_data = np.inf, np.inf
+    best[:] = p
     for iteration in range(0 if is_near else -ROUGH_ITERATIONS, ITERATIONS + 1):
         data = _linearise(count, unknowns, p, sight, views, LOSS_SIGMAS * 4.0 ** max(-iteration, 0), scratch)
         total = data
@@ -246,4 +247,4 @@ def fit(
     _linearise(count, unknowns, p, sight, views, LOSS_SIGMAS, scratch)
     for i in range(2, unknowns):
         a[i, i] += weight[i]
-    return lowest, lowest_data, factorise(a, unknowns, factor)
+    return lowest, lowest_data, factorise(a, unknowns, factor) and lowest < np.inf

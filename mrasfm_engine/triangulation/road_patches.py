@@ -38,12 +38,17 @@ class RoadSample:
     xy: Floats
     height: Floats
     sigma: Floats  # of the height, from triangulation
+    weight: Floats  # points that each stands for
     tree: cKDTree
 
     @staticmethod
-    def from_points(xyz: Floats, sigma_m: Floats) -> RoadSample:
-        """The points (n, 3) with the standard deviations (n,) of their heights."""
-        return RoadSample(xy=xyz[:, :2], height=xyz[:, 2], sigma=sigma_m, tree=cKDTree(xyz[:, :2]))
+    def from_points(xyz: Floats, sigma_m: Floats, weight: Floats) -> RoadSample:
+        """The points (n, 3) with the standard deviations (n,) of their heights, and how much each counts (n,)."""
+        return RoadSample(xy=xyz[:, :2], height=xyz[:, 2], sigma=sigma_m, weight=weight, tree=cKDTree(xyz[:, :2]))
+
+    def around(self, at: Floats, radius_m: float) -> int:
+        """Count the points within a radius of a place (2,)."""
+        return int(self.tree.query_ball_point(at, radius_m, return_length=True))
 
 
 @dataclass(kw_only=True)
@@ -144,7 +149,7 @@ def add_patches(
             at = np.append(below[n, :2], known[0])
             final = _beside(points, at, known[1], patches.radius_m, roughness_m=roughness_m, rng=rng)
         if final is not None:
-            patches.append(below[n, :2], final.offset_m, final.slope, len(final.inliers))
+            patches.append(below[n, :2], final.offset_m, final.slope, points.around(below[n, :2], patches.radius_m))
     if patches.centre:
         _spread(points, patches, roughness_m=roughness_m, rng=rng)
 
@@ -162,7 +167,7 @@ def refit(points: RoadSample, patches: Patches, *, roughness_m: float) -> Patche
         if known is not None:
             slopes[n] = known[1]
     off = points.height[rows] - planes[owner, 0] - (local * planes[owner, 1:]).sum(1)
-    weight = patch_weight(np.hypot(*local.T), patches.radius_m) * (np.abs(off) < LEVEL_M)
+    weight = points.weight[rows] * patch_weight(np.hypot(*local.T), patches.radius_m) * (np.abs(off) < LEVEL_M)
     sigma = np.hypot(points.sigma[rows], roughness_m)
     fitted, support, count = refit_height_planes(
         planes, first, local, points.height[rows], sigma, weight, slopes, SIGMA_SLOPE_NEIGHBOURS
@@ -182,16 +187,22 @@ def points_around(tree: cKDTree, centre_m: Floats, radius_m: float) -> tuple[Int
     return first, np.concatenate([np.zeros(0, dtype=np.int64), *rows])
 
 
-def thinned(xyz: Floats, sigma_m: Floats, *, cell_m: float, most: int) -> Ints:
-    """Rows of the most precise points (n, 3), at most so many in every square of the plane, in ascending order."""
-    cell = np.floor(xyz[:, :2] / cell_m).astype(np.int64)
-    order = np.lexsort((sigma_m, cell[:, 1], cell[:, 0]))
+def thinned(xyz: Floats, sigma_m: Floats, *, cell_m: float, most: int) -> tuple[Ints, Floats]:
+    """The most precise points (n, 3), at most so many in every cube: ascending rows, and how many each stands for.
+
+    Cubes and not squares: roads may lie above one another.
+    """
+    cell = np.floor(xyz / cell_m).astype(np.int64)
+    order = np.lexsort((sigma_m, cell[:, 2], cell[:, 1], cell[:, 0]))
     new = np.ones(len(order), dtype=np.bool_)
     new[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
     begin = np.flatnonzero(new)
-    rank = np.arange(len(order)) - np.repeat(begin, np.diff(np.append(begin, len(order))))
-    result: Ints = np.sort(order[rank < most])
-    return result
+    count = np.diff(np.append(begin, len(order)))
+    rank = np.arange(len(order)) - np.repeat(begin, count)
+    share = np.repeat(count / np.minimum(count, most), count)
+    kept = order[rank < most]
+    ascending = np.argsort(kept)
+    return kept[ascending], share[rank < most][ascending]
 
 
 def _cover(xyz: Floats, spacing_m: float) -> Sequence[int]:
@@ -226,7 +237,7 @@ def _spread(points: RoadSample, patches: Patches, *, roughness_m: float, rng: np
         if plane is None:
             tried[points.tree.query_ball_point(at, 0.25 * radius_m)] = True
             continue
-        patches.append(at, plane.offset_m, plane.slope, len(plane.inliers))
+        patches.append(at, plane.offset_m, plane.slope, points.around(at, radius_m))
         near = np.array(points.tree.query_ball_point(at, 1.5 * radius_m), dtype=np.int64)
         away = np.hypot(*(points.xy[near] - at).T)
         nearer = away < reach[near]
@@ -279,7 +290,7 @@ def _fit(
         local,
         points.height[rows],
         np.hypot(points.sigma[rows], roughness_m),
-        patch_weight(np.hypot(*local.T), radius_m),
+        points.weight[rows] * patch_weight(np.hypot(*local.T), radius_m),
         expected_slope=slope,
         sigma_slope=sigma_slope,
         max_slope_change=max_slope_change,

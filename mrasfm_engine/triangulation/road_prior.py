@@ -13,11 +13,12 @@ CORRIDOR_M = 3.0  # to both sides of the trajectory: a lane
 # Of the corridor, which tells the level where it has points: cars that are parked beside it, whose bonnets and window
 # sills make levels too, stand farther away than half a car's width and what passing them takes.
 FREE_M = 2.0
-FREE_POINTS = 20
+FREE_POINTS, FREE_SHARE = 20, 0.02  # a few wrong points, of all in the corridor, tell no level
 DRIVEN_M = 0.8  # to both sides of the trajectory: where the vehicle itself was
 VEHICLE_HEIGHT_M = 1.2  # above the road, in which nothing was where the vehicle drove
 AHEAD_M = 12.0  # how far beyond the ends of the trajectory the road is believed to go on
 BELOW_CAMERAS_M = 0.3  # the road is at least that far below the lowest camera
+ON_LEVEL_M = 0.1  # half the thickness of the road itself, as triangulation has it
 LEVEL_M = 0.5  # half the thickness of the layer that holds the road and what is wrong about it
 LEVEL_PER_M = 0.08  # what slopes add to it a metre of distance from the vehicle
 MIN_SHARE = 0.2  # of the points below the cameras on the way that must be on one level
@@ -44,12 +45,15 @@ def points_below_trajectory(points_m: Floats, world_from_rig: Floats, lowest_cam
     if lane.sum() < MIN_POINTS:
         return None
     free = lane & (np.abs(lateral) < FREE_M)
-    level = most_frequent(height[free if free.sum() >= FREE_POINTS else lane])
-    near = lane & (np.abs(height - level) < LEVEL_M + LEVEL_PER_M * away)
-    on_level = lane & (np.abs(height - level) < 0.1 + LEVEL_PER_M * away)
-    if on_level.sum() < max(MIN_POINTS, MIN_SHARE * lane.sum()):
-        return None
-    return near
+    for told in (free, lane):
+        if told.sum() < max(FREE_POINTS, FREE_SHARE * lane.sum()) and told is free:
+            continue
+        level = most_frequent(height[told])
+        on_level = lane & (np.abs(height - level) < ON_LEVEL_M + LEVEL_PER_M * away)
+        if on_level.sum() >= max(MIN_POINTS, MIN_SHARE * lane.sum()):
+            near: Bools = lane & (np.abs(height - level) < LEVEL_M + LEVEL_PER_M * away)
+            return near
+    return None
 
 
 def ground_level_m(points_m: Floats, world_from_rig: Floats, lowest_camera_m: float) -> float | None:

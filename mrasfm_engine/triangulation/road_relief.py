@@ -14,7 +14,7 @@ from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.road_relief import NODE_M, Relief
 from mrasfm_engine.types import Floats, Ints
 
-LEVELS_M = 4.0  # of height that share a node: roads above one another are farther apart
+LEVELS_M = 1.0  # of height that share a node: roads above one another are farther apart
 NEAREST = 24  # points that a node's plane is fitted to: they leave a tenth of a point's noise in its two slopes
 REACH_M = 3.0
 # What the relief is where nothing tells: kerbs and bumps are 10 to 15 cm high, crowns slope by some per cent.

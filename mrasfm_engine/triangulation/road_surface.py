@@ -23,7 +23,7 @@ from mrasfm_engine.triangulation.road_patches import (
     refit,
     thinned,
 )
-from mrasfm_engine.triangulation.road_relief import fit_relief
+from mrasfm_engine.triangulation.road_relief import SIGMA_HEIGHT_M, fit_relief
 from mrasfm_engine.triangulation.road_support import find_supported
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -156,23 +156,22 @@ def fit_road(
         return None
     axes = horizontal_axes(world_from_rig)
     units = np.arange(len(world_from_rig)) if units is None else units
-    some = thinned(points_m @ axes.T, sigma_m, cell_m=radius_m / THINNED_CELLS, most=THINNED_POINTS)
+    some, share = thinned(points_m @ axes.T, sigma_m, cell_m=radius_m / THINNED_CELLS, most=THINNED_POINTS)
     points, sigma = points_m[some], sigma_m[some]
     rig_height = rig_height_above(points, world_from_rig, reach_m=2 * radius_m)
     if rig_height is None:
         return None
-    sample = RoadSample.from_points(points @ axes.T, sigma)
+    sample = RoadSample.from_points(points @ axes.T, sigma, share)
     below = (world_from_rig[:, :3, 3] - rig_height * world_from_rig[:, :3, 2]) @ axes.T
     slopes = _slopes(world_from_rig[:, :3, 2] @ axes.T)
     patches = Patches(radius_m=radius_m)
     if known is not None:
         patches = _placed(known, sample, world_from_rig, units, axes, radius_m)
     roughness, surface = FIRST_ROUGHNESS_M, None
-    for done in range(rounds):
+    for _ in range(rounds):
         if patches.centre:
             patches = refit(sample, patches, roughness_m=roughness)
-        if not done or not patches.centre:
-            add_patches(sample, below, slopes, patches, roughness_m=roughness, rng=rng)
+        add_patches(sample, below, slopes, patches, roughness_m=roughness, rng=rng)
         if not patches.centre:
             return None
         surface = _moved_by_residuals(sample, points, _surface(patches, axes), roughness_m=roughness)
@@ -238,7 +237,7 @@ def _with_relief(
         rig_height_m=rig_height_m,
         offset_m=offset - np.where(alone, 0.0, height),
         beyond_m=beyond,
-        sigma_m=np.where(np.isfinite(uncertain), uncertain, 0.0),
+        sigma_m=np.where(np.isfinite(uncertain), uncertain, SIGMA_HEIGHT_M),
         supported=supported,
         patch=patch,
         known=known,
@@ -323,7 +322,7 @@ def _moved_by_residuals(
     near = np.abs(distance) < gate
     # Tukey's weights, as in the fit: points near the gate are as likely wrong as right.
     share = np.where(near, (1.0 - (np.where(near, distance, 0.0) / gate) ** 2) ** 2, 0.0)
-    share /= sample.sigma**2 + roughness_m**2
+    share *= sample.weight / (sample.sigma**2 + roughness_m**2)
     centre = (surface.centre_m @ surface.axes.T)[:, :2]
     first, rows = points_around(sample.tree, centre, surface.radius_m)
     owner = np.repeat(np.arange(len(centre)), np.diff(first))

@@ -150,9 +150,10 @@ def free_distance_m(c: Any, d: Any, station: int, path: Any) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _begin_of_window(members: Any, band: Any, views: Any) -> Any:
-    """Begin of the time in which most of a track's observations are, and how many these are.
+    """Begin of the time in which most of a track's observations are, and about how many these are.
 
-    Keypoints are in the order of their units, so that one pass is enough.
+    Keypoints are in the order of their units, so that one pass is enough. Cameras of one unit may be in any order, so
+    that some more or fewer may be in that time.
     """
     most, begin_s, seen, first = 0, 0.0, 0, 0
     for i in range(len(members)):
@@ -164,9 +165,10 @@ def _begin_of_window(members: Any, band: Any, views: Any) -> Any:
             seen -= views.is_posed[band[members[first]]]
             first += 1
         if seen > most:
-            most, begin_s = seen, views.time_s[band[members[first]]]
+            most, begin_s = seen, now
             for j in range(first, i):
-                begin_s = min(begin_s, views.time_s[band[members[j]]])
+                if views.is_posed[band[members[j]]]:
+                    begin_s = min(begin_s, views.time_s[band[members[j]]])
     return begin_s, most
 
 
@@ -174,7 +176,12 @@ def _begin_of_window(members: Any, band: Any, views: Any) -> Any:
 def _look(members: Any, band: Any, camera: Any, xy: Any, rays: Any, views: Any, path: Any, sight: Any, c: Any) -> Any:
     """Take a track's observations into `sight` and the reference camera's centre into c; how many, and the reference's
     place among them."""
-    begin_s, inside = _begin_of_window(members, band, views)
+    begin_s, about = _begin_of_window(members, band, views)
+    if about < 2:
+        return 0, 0
+    inside = 0
+    for k in members:
+        inside += views.is_posed[band[k]] and 0.0 <= views.time_s[band[k]] - begin_s <= WINDOW_S
     if inside < 2:
         return 0, 0
     stride, at, n = (inside + MAX_OBSERVATIONS - 1) // MAX_OBSERVATIONS, 0, 0

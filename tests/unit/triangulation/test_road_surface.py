@@ -271,3 +271,40 @@ def test_most_frequent_value_among_far_outliers() -> None:
     rng = np.random.default_rng(6)
     values = np.concatenate([rng.normal(1.6, 0.02, 100), rng.uniform(-5, 5, 80), [1e7, -1e7]])
     assert 0 < abs(most_frequent(values) - 1.6) < 0.02
+
+
+def two_decks(rng: np.random.Generator, count: int) -> np.ndarray:
+    """A road above another one, 5 m higher."""
+    deck = np.column_stack([rng.uniform(0, LENGTH_M, count), rng.uniform(-5, 5, count), np.zeros(count)])
+    above = deck + [0.0, 0.0, 5.0]
+    return np.concatenate([deck, above]) + np.column_stack(
+        [np.zeros((2 * count, 2)), rng.normal(0, NOISE_M, 2 * count)]
+    )
+
+
+def test_roads_above_one_another_each_have_a_surface() -> None:
+    """Also where the points of one are the more precise ones, in every square."""
+    rng = np.random.default_rng(7)
+    points = two_decks(rng, 6000)
+    sigma = np.repeat([2 * NOISE_M, NOISE_M], 6000)
+    way = np.concatenate([poses(level, 1.5), poses(lambda x: 0 * x + 5.0, 1.5)])
+    road = fit_road(points, sigma, way, radius_m=8.0, rng=rng, max_offset_m=0.05)
+    assert road is not None
+    off = road.off(road.limits_m(sigma, sigmas=3.0, max_offset_m=0.05))
+    assert 0 <= off[:6000].mean() < 0.05
+    assert 0 <= off[6000:].mean() < 0.05
+
+
+def test_many_points_in_few_places_outvote_few_in_many() -> None:
+    """True points lie in a sixth of the squares; wrong ones, a quarter of all, in every square on one wrong level."""
+    rng = np.random.default_rng(8)
+    square = rng.choice(600, 100, replace=False)[rng.integers(0, 100, 3600)]
+    true = np.column_stack([square % 60, square // 60 - 5.0]) + rng.uniform(0, 1, (3600, 2))
+    wrong = np.column_stack([rng.uniform(0, 60, 1200), rng.uniform(-5, 5, 1200)])
+    points = np.column_stack([np.concatenate([true, wrong]), rng.normal(0, NOISE_M, 4800)])
+    points[3600:, 2] += 0.2
+    road = fit(points, poses(level, 1.5), max_offset_m=0.05)
+    assert road is not None
+    x = np.linspace(5, 55, 50)
+    assert 0 < np.median(np.abs(road.surface.locate_on_patches(np.column_stack([x, 0 * x, 0 * x]))[0])) < 0.03
+    assert 0.95 < is_on(road)[:3600].mean() <= 1.0
