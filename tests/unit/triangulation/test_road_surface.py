@@ -276,10 +276,10 @@ def test_most_frequent_value_among_far_outliers() -> None:
 def two_decks(rng: np.random.Generator, count: int) -> np.ndarray:
     """A road above another one, 5 m higher."""
     deck = np.column_stack([rng.uniform(0, LENGTH_M, count), rng.uniform(-5, 5, count), np.zeros(count)])
-    above = deck + [0.0, 0.0, 5.0]
-    return np.concatenate([deck, above]) + np.column_stack(
-        [np.zeros((2 * count, 2)), rng.normal(0, NOISE_M, 2 * count)]
-    )
+    points = np.concatenate([deck, deck])
+    points[count:, 2] += 5.0
+    points[:, 2] += rng.normal(0, NOISE_M, 2 * count)
+    return points
 
 
 def test_roads_above_one_another_each_have_a_surface() -> None:
