@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export.picture_files import LargeFile
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Bytes, Floats
@@ -96,7 +97,8 @@ def finish_road(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path, e
         except Exception as problem:  # as above
             error = problem
     discard_road(painter, scratch)
-    return RoadPicture(report={"not_drawn": f"{type(error).__name__}: {error}"})
+    reason = error.what if isinstance(error, MrasfmError) else f"{type(error).__name__}: {error}"
+    return RoadPicture(report={"not_drawn": reason})
 
 
 def _finished(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path) -> RoadPicture:

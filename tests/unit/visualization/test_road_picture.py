@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mrasfm_engine.errors import StorageError
 from mrasfm_engine.visualization import road_blocks, road_picture
 from mrasfm_engine.visualization.ground import GroundTiles
 from mrasfm_engine.visualization.mosaic import MIN_CELL_M
@@ -176,6 +178,16 @@ def test_blocks_on_disk_make_the_same_picture(
     assert saved
     np.testing.assert_array_equal(picture, plain[0])
     assert not list((tmp_path / "blocks").iterdir())
+
+
+def test_blocks_leave_space_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = road_blocks.BlockStore(tmp_path)
+    monkeypatch.setattr(road_blocks, "MAX_BLOCKS", 1)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=road_blocks.MIN_FREE_BYTES - 1))
+    store.get([(0, 0)])
+    with pytest.raises(StorageError, match="less than 4 GB free"):
+        store.get([(0, 1)])
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_error_of_the_road_leaves_only_the_road_out() -> None:
