@@ -42,6 +42,8 @@ def draw_pictures(
         return drawn.pictures, drawn.files, drawn.report
 
     above, above_report = _files(from_above)
+    if road and "not_drawn" in above_report and "not_drawn" not in road:
+        road = {"not_drawn": above_report["not_drawn"]}  # its files are left out with the others
     points, points_report = _files(lambda: (road_points(scene), {}, {}))
     report = {"birds_eye": above_report, "road": road, "road_points": points_report}
     return {**above, **points}, {name: part for name, part in report.items() if part or name == "birds_eye"}

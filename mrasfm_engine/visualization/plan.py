@@ -17,7 +17,8 @@ from mrasfm_engine.visualization.road_candidates import PLACE_M
 from mrasfm_engine.visualization.views import VIEW_M, View
 
 MIN_WAY_M = 3.0  # a shorter one has no direction of its own
-SAME_PLACE_M = 2 * VIEW_M  # positions closer than this see the same ground, whenever the vehicle was there
+# Positions closer than this see the same blocks of ground, whenever the vehicle was there: both views and a block.
+SAME_PLACE_M = 2.5 * VIEW_M
 VISIT_CELL_M = 2.0  # side of the cells of which one position each is compared, however long the vehicle stood there
 MAX_PLACES = 65_536  # of different number: a second visit after that many may count as the first
 

@@ -53,6 +53,13 @@ def test_a_picture_that_is_no_png_is_not_drawn(monkeypatch: pytest.MonkeyPatch) 
     assert "4 x 0 pixels cannot be made a PNG" in report["birds_eye"]["not_drawn"]
 
 
+def test_a_road_whose_files_are_left_out_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = BirdsEye(pictures={"a.png": PICTURE, "road.png": PICTURE[:0]}, road_report={"images": 3})
+    monkeypatch.setattr(pictures, "birds_eye", lambda *_, **__: drawn)
+    _, report = draw_pictures(make_scene())
+    assert report["road"] == {"not_drawn": report["birds_eye"]["not_drawn"]}
+
+
 @pytest.mark.parametrize("stop", [CancelledError(), KeyboardInterrupt()])
 def test_a_cancelled_run_is_no_missing_picture(stop: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     def cancel(*_: object, **__: object) -> None:
