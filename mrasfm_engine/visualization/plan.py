@@ -168,7 +168,7 @@ def in_order_of_the_path(scene: Scene) -> Ints:
 
 
 def first_visits(position_m: Floats) -> Ints:
-    """For every position (n, 3) the first one near it; see `SAME_PLACE_M`."""
+    """Numbers (n,) of the first position near each of those given (n, 3); see `SAME_PLACE_M`."""
     cells = np.floor(position_m / VISIT_CELL_M).astype(np.int64)
     _, first, cell = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     tree = cKDTree(position_m[first])
