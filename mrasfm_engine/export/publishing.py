@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import secrets
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from mrasfm_engine.errors import StorageError, storage_error
@@ -18,6 +19,7 @@ from schemas.artifacts import REPORT_FILE
 COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
 SCRATCH_PREFIX = ".scratch-"
+LOCK = "lock"  # in a scratch folder, held while its run lives
 
 
 @contextmanager
@@ -65,20 +67,56 @@ def scratch_folder(out: Path) -> Iterator[Path]:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(out, f"{SCRATCH_PREFIX}*")
+        _remove_scratch(out)
         scratch = Path(tempfile.mkdtemp(prefix=SCRATCH_PREFIX, dir=out))
     except OSError as error:
         raise storage_error(out, error) from error
     try:
-        yield scratch
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(_locked(scratch))
+                files = scratch / "files"
+                files.mkdir()
+            except OSError as error:
+                raise storage_error(out, error) from error
+            yield files
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+@contextmanager
+def _locked(scratch: Path) -> Iterator[None]:
+    """Hold the lock of a scratch folder; a killed process gives it up."""
+    new = scratch / f"new {LOCK}"
+    with new.open("wb") as lock:
+        with suppress(OSError):  # a file system without locks: nobody else gets this one there, either
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        new.rename(scratch / LOCK)  # it has its name only when it is held
+        yield
+
+
+def _remove_scratch(out: Path) -> None:
+    """Remove scratch folders whose run lives no more, and old ones that were killed before they had a lock."""
+    for scratch in out.glob(f"{SCRATCH_PREFIX}*"):
+        try:
+            with (scratch / LOCK).open("r+b") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(scratch, ignore_errors=True)
+        except FileNotFoundError:
+            _remove_if_old(scratch)
+        except OSError:  # a run that lives holds it
+            continue
+
+
 def _remove_leftovers(folder: Path, pattern: str) -> None:
     for leftover in folder.glob(pattern):
-        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
-            shutil.rmtree(leftover, ignore_errors=True)
+        _remove_if_old(leftover)
+
+
+def _remove_if_old(folder: Path) -> None:
+    with suppress(FileNotFoundError):  # another run may remove it meanwhile
+        if time.time() - folder.stat().st_mtime > LEFTOVER_AGE_S:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _prepare(needed: int, out: Path, home: Path) -> None:

@@ -32,6 +32,7 @@ from mrasfm_engine.types import Bools, Bytes, Cancel, Floats, Floats32, Ints
 from schemas.findings import Finding, warning
 
 WIDTH_PX = 480  # of the images looked at: an outline is then true to a thousandth of the width
+MAX_PIXELS = WIDTH_PX * 960  # of one of them: twice as high as wide
 MAX_IMAGES = 64  # of a camera that are read: more hardly sharpen a mean
 # Of a camera that differ. The mean of n gradients that have nothing in common keeps 1/n of their energy: of fewer
 # images that is as much as an edge keeps whose contrast varies.
@@ -121,7 +122,9 @@ def find_own_cars(drive: Drive, *, threads: int, cancel: Cancel | None = None) -
             raise CancelledError
         camera = drive.cameras[image.camera]
         try:
-            return read_image_small(drive.root / image.file, (camera.width, camera.height), WIDTH_PX)
+            return read_image_small(
+                drive.root / image.file, (camera.width, camera.height), small_width_px(camera.width, camera.height)
+            )
         except IncompleteImageError:
             return None
 
@@ -137,6 +140,11 @@ def find_own_cars(drive: Drive, *, threads: int, cancel: Cancel | None = None) -
             if _vehicle_moved(looks):
                 list(pool.map(lambda of_one: of_one[0].add(of_one[1]), looks))
         return list(pool.map(lambda camera: _judge(drive, camera, statistics[camera]), range(len(statistics))))
+
+
+def small_width_px(width: int, height: int) -> int:
+    """Width of the image looked at: `WIDTH_PX` at most, and less where it would have more than `MAX_PIXELS`."""
+    return max(1, min(WIDTH_PX, math.floor(math.sqrt(MAX_PIXELS * width / height))))
 
 
 def large_share_finding(camera: str, mask: Bools | None) -> list[Finding]:

@@ -65,6 +65,7 @@ class OwnCar:
             intensity=np.where(self.mask[..., None], paint, view.intensity).astype(np.float32),
             labels=np.where(self.mask, np.uint8(UNLABELLED), view.labels),
             depth_m=np.where(self.mask, self.depth_m, view.depth_m),
+            is_moving=view.is_moving & ~self.mask,
         )
 
 

@@ -26,7 +26,13 @@ from mrasfm_engine.visualization.exposure import camera_gains
 from mrasfm_engine.visualization.ground import GroundTiles
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic, MosaicPainter
 from mrasfm_engine.visualization.plan import Plan, plan_of
-from mrasfm_engine.visualization.road_picture import OptionalPainter, RoadPicture, finish_road, painting_road
+from mrasfm_engine.visualization.road_picture import (
+    OptionalPainter,
+    RoadPicture,
+    discard_road,
+    finish_road,
+    painting_road,
+)
 from mrasfm_engine.visualization.views import GIVEN, REFINED, Painter, paint_views
 from schemas import LabelMap, SemanticClass
 
@@ -75,7 +81,7 @@ def birds_eye(
         painters: list[Painter] = [painter]
         if scratch is not None:
             road = stack.enter_context(painting_road(plan, heights, scratch, own_car_m))
-            optional = OptionalPainter(road)
+            optional = OptionalPainter(road, on_error=lambda: discard_road(road, scratch))
             painters.append(optional)
         paint_views(
             plan.views,

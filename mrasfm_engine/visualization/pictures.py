@@ -14,6 +14,7 @@ from mrasfm_engine.export.picture_files import LargeFile, png_of
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bytes, CountProgress
 from mrasfm_engine.visualization.birds_eye import birds_eye
+from mrasfm_engine.visualization.road_picture import TIFF
 from mrasfm_engine.visualization.road_points import road_points
 
 Drawn = tuple[Mapping[str, Bytes], Mapping[str, bytes | LargeFile], dict[str, Any]]  # pictures, other files, report
@@ -42,6 +43,11 @@ def draw_pictures(
         return drawn.pictures, drawn.files, drawn.report
 
     above, above_report = _files(from_above)
+    if "not_drawn" in above_report:
+        if road and "not_drawn" not in road:
+            road = {"not_drawn": above_report["not_drawn"]}  # its files are left out with the others
+        if scratch is not None:
+            (scratch / TIFF).unlink(missing_ok=True)  # the scene may need its space
     points, points_report = _files(lambda: (road_points(scene), {}, {}))
     report = {"birds_eye": above_report, "road": road, "road_points": points_report}
     return {**above, **points}, {name: part for name, part in report.items() if part or name == "birds_eye"}

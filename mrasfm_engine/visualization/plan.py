@@ -14,10 +14,12 @@ from mrasfm_engine.types import Floats, Ints
 from mrasfm_engine.visualization.exposure import exposure_gains
 from mrasfm_engine.visualization.ground import GroundHeights, estimate_ground
 from mrasfm_engine.visualization.road_candidates import PLACE_M
-from mrasfm_engine.visualization.views import View
+from mrasfm_engine.visualization.views import VIEW_M, View
 
 MIN_WAY_M = 3.0  # a shorter one has no direction of its own
-SAME_PLACE_M = 6.0  # positions closer than this see the same ground, whenever the vehicle was there
+# Positions closer than this see the same blocks of ground, whenever the vehicle was there: both views and a block.
+SAME_PLACE_M = 2.5 * VIEW_M
+VISIT_CELL_M = 2.0  # side of the cells of which one position each is compared, however long the vehicle stood there
 MAX_PLACES = 65_536  # of different number: a second visit after that many may count as the first
 
 
@@ -124,9 +126,11 @@ def _views(scene: Scene, plan_from_world: Floats, images: Ints) -> list[View]:
 
 def _seen_by(scene: Scene, images: Ints) -> list[Ints]:
     unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)
-    pairs = np.unique(np.column_stack([unit[scene.observation_image], scene.observation_point]), axis=0)
-    bounds = np.searchsorted(pairs[:, 0], np.arange(len(scene.unit_registered) + 1))
-    return [pairs[bounds[u] : bounds[u + 1], 1] for u in unit[images]]
+    points = max(len(scene.points_m), 1)
+    # One number for both: rows of pairs take ten times as long to sort.
+    pairs = np.unique(unit[scene.observation_image] * points + scene.observation_point)
+    bounds = np.searchsorted(pairs, np.arange(len(scene.unit_registered) + 1) * points)
+    return [pairs[bounds[u] : bounds[u + 1]] % points for u in unit[images]]
 
 
 def place_numbers(scene: Scene) -> Ints:
@@ -153,7 +157,7 @@ def in_order_of_the_path(scene: Scene) -> Ints:
     units = np.flatnonzero(scene.unit_registered)
     position = scene.world_from_rig[units][:, :3, 3]
     first_visit = np.zeros(len(scene.unit_registered), dtype=np.int64)
-    first_visit[units] = [np.min(near) for near in cKDTree(position).query_ball_point(position, SAME_PLACE_M)]
+    first_visit[units] = first_visits(position)
     images = np.flatnonzero(scene.image_registered)
     unit, camera = (
         np.array([(scene.drive.images[i].unit, scene.drive.images[i].camera) for i in images]).reshape(-1, 2).T
@@ -161,3 +165,13 @@ def in_order_of_the_path(scene: Scene) -> Ints:
     forward = np.array([c.rig_from_cam[0, 2] > 0 for c in scene.calibration])[camera].mean() >= 0.5
     sign = -1 if forward else 1
     return images[np.lexsort((sign * unit, sign * first_visit[unit]))]
+
+
+def first_visits(position_m: Floats) -> Ints:
+    """Numbers (n,) of the first position near each of those given (n, 3); see `SAME_PLACE_M`."""
+    cells = np.floor(position_m / VISIT_CELL_M).astype(np.int64)
+    _, first, cell = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    tree = cKDTree(position_m[first])
+    earliest = [first[tree.query_ball_point(place, SAME_PLACE_M)].min() for place in position_m[first]]
+    result: Ints = np.array(earliest, dtype=np.int64)[cell.reshape(-1)]
+    return result

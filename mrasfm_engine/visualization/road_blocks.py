@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from mrasfm_engine.errors import StorageError
 from mrasfm_engine.types import Floats
 from mrasfm_engine.visualization.road_candidates import Candidates
 from mrasfm_engine.visualization.road_consensus import COHERENCE_CELLS
@@ -15,6 +17,8 @@ from mrasfm_engine.visualization.tile_file import TILE_CELLS
 
 APRON_CELLS = COHERENCE_CELLS  # around a block, so that its border is decided as its middle is
 MAX_BLOCKS = 48  # in memory, of 5 MB each: a view reaches 36 at most
+# Left free on the disk, for the scene and for the tiles and the GeoTIFF of the blocks.
+MIN_FREE_BYTES = 4_000_000_000
 
 Block = tuple[int, int]  # row, growing downwards, and column
 
@@ -85,6 +89,11 @@ class BlockStore:
         return self._folder / f"block {block[0]} {block[1]}.npz"
 
     def _save(self, block: Block, candidates: Candidates) -> None:
+        if shutil.disk_usage(self._folder).free < MIN_FREE_BYTES:
+            raise StorageError(
+                f"the disk has less than {MIN_FREE_BYTES / 1e9:.0f} GB free, which are left to the scene",
+                remedy="Free space on the disk of the scene.",
+            )
         np.savez(self._path(block), **{name: getattr(candidates, name) for name in _ARRAYS})
         self._on_disk.add(block)
 

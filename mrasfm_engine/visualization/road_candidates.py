@@ -270,7 +270,7 @@ def _ratios(
     """Compare the view with the best one of every few cells; of how many."""
     work, pixel = np.empty(6), np.empty(8)
     seen = np.empty(3, np.uint8)
-    filled = 0
+    filled, middle = 0, hidden.shape[0] // 2
     for row in range(bounds[0] + (-(first_row + bounds[0])) % COMPARED_CELLS, bounds[1], COMPARED_CELLS):
         y = -(first_row + row + 0.5) * cell
         for column in range(bounds[2] + (-(first_column + bounds[2])) % COMPARED_CELLS, bounds[3], COMPARED_CELLS):
@@ -281,6 +281,8 @@ def _ratios(
             z = height_at(heights, x - first[0], y - first[1])
             dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
             if dx * dx + dy * dy + above * above > VIEW_M * VIEW_M:
+                continue
+            if hidden[round(middle + dy / STEP_M), round(middle + dx / STEP_M)]:
                 continue
             if not _pixel(
                 rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, widest, x, y, z, dx, dy,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export.picture_files import LargeFile
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Bytes, Floats
@@ -24,6 +26,7 @@ from mrasfm_engine.visualization.tile_pyramid import TilePyramid, build_pyramid
 from mrasfm_engine.visualization.views import Painter, View
 
 PICTURE, WORLD_FILE, TIFF = "road.png", "road.pgw", "road.tif"
+BLOCKS, TILES = "blocks", "tiles"  # in the scratch folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +39,11 @@ class RoadPicture:
 
 
 class OptionalPainter:
-    """A painter whose first error ends its own work only; see `views.Painter`."""
+    """A painter whose first error ends its own work only, and calls `on_error` once; see `views.Painter`."""
 
-    def __init__(self, painter: Painter) -> None:
+    def __init__(self, painter: Painter, on_error: Callable[[], None] | None = None) -> None:
         self._painter = painter
+        self._on_error = on_error
         self.error: Exception | None = None
 
     def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
@@ -49,24 +53,39 @@ class OptionalPainter:
                 self._painter.paint(index, view, rgb, usable)
             except Exception as error:  # whatever it is: the chequerboard does not depend on it
                 self.error = error
+                if self._on_error is not None:
+                    self._on_error()
 
 
 @contextmanager
 def painting_road(plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Floats | None) -> Iterator[RoadPainter]:
     """A painter of the plan's road, whose tiles are in an empty folder until the context ends."""
-    blocks = scratch / "blocks"
-    blocks.mkdir()
-    with TileFile(scratch / "tiles") as tiles:
-        yield RoadPainter(
-            views=plan.views,
-            ground=ground,
-            standing=StandingPoints(plan.points_m, plan.seen_by, plan.ground),
-            trajectory_m=plan.trajectory_m,
-            folder=blocks,
-            tiles=tiles,
-            own_car_m=own_car_m,
-        )
-    (scratch / "tiles").unlink()
+    (scratch / BLOCKS).mkdir()
+    try:
+        with TileFile(scratch / TILES) as tiles:
+            yield RoadPainter(
+                views=plan.views,
+                ground=ground,
+                standing=StandingPoints(plan.points_m, plan.seen_by, plan.ground),
+                trajectory_m=plan.trajectory_m,
+                folder=scratch / BLOCKS,
+                tiles=tiles,
+                own_car_m=own_car_m,
+            )
+    finally:
+        _remove_work(scratch)
+
+
+def discard_road(painter: RoadPainter, scratch: Path) -> None:
+    """Give back the disk space of a road that failed: the scene, which is still to be written, may need it."""
+    painter.tiles.close()  # an open file would keep its space
+    _remove_work(scratch)
+    (scratch / TIFF).unlink(missing_ok=True)
+
+
+def _remove_work(scratch: Path) -> None:
+    shutil.rmtree(scratch / BLOCKS, ignore_errors=True)
+    (scratch / TILES).unlink(missing_ok=True)
 
 
 def finish_road(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path, error: Exception | None) -> RoadPicture:
@@ -77,11 +96,14 @@ def finish_road(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path, e
             return _finished(scene, plan, painter, scratch)
         except Exception as problem:  # as above
             error = problem
-    return RoadPicture(report={"not_drawn": f"{type(error).__name__}: {error}"})
+    discard_road(painter, scratch)
+    reason = error.what if isinstance(error, MrasfmError) else f"{type(error).__name__}: {error}"
+    return RoadPicture(report={"not_drawn": reason})
 
 
 def _finished(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path) -> RoadPicture:
     pyramid = build_pyramid(painter.tiles)
+    painter.tiles.flush()
     if pyramid is None:
         return RoadPicture(report={"not_drawn": "the views of the road agree nowhere"})
     side_m = TILE_CELLS * MIN_CELL_M

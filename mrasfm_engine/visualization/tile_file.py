@@ -6,6 +6,7 @@ Tiles come in any order and none is kept in memory; a coarser level is made of t
 from __future__ import annotations
 
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,7 +42,16 @@ class TileFile:
 
     def __exit__(self, *_: object) -> None:
         """Close the file."""
-        self._file.close()
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; what does not reach a full disk then is lost, see `flush`."""
+        with suppress(OSError):
+            self._file.close()
+
+    def flush(self) -> None:
+        """Write all that is held in memory, or raise."""
+        self._file.flush()
 
     def add(self, index: TileIndex, tile: Bytes) -> None:
         """Write a tile; one without any opaque cell is left out."""

@@ -194,12 +194,13 @@ def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -
 def sample(rgb: Any, u: float, v: float, gain: Any, out: Any) -> None:
     """Bilinear colour at a pixel position whose top left pixel has its centre at (0.5, 0.5)."""
     height, width = rgb.shape[0], rgb.shape[1]
-    x = min(max(u - 0.5, 0.0), width - 1.001)
-    y = min(max(v - 0.5, 0.0), height - 1.001)
+    x = max(min(u - 0.5, width - 1.0), 0.0)
+    y = max(min(v - 0.5, height - 1.0), 0.0)
     i, j = int(y), int(x)
+    below, right = min(i + 1, height - 1), min(j + 1, width - 1)
     a, b = y - i, x - j
     for k in range(3):
-        top = rgb[i, j, k] * (1 - b) + rgb[i, j + 1, k] * b
-        bottom = rgb[i + 1, j, k] * (1 - b) + rgb[i + 1, j + 1, k] * b
+        top = rgb[i, j, k] * (1 - b) + rgb[i, right, k] * b
+        bottom = rgb[below, j, k] * (1 - b) + rgb[below, right, k] * b
         value = gain[k] * (top * (1 - a) + bottom * a) + 0.5
         out[k] = int(min(max(value, 1.0), 255.0))

@@ -12,11 +12,14 @@ from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.features.own_car import (
     LARGE_SHARE,
+    MAX_PIXELS,
     MIN_IMAGES,
+    WIDTH_PX,
     NotFound,
     OwnCar,
     find_own_cars,
     large_share_finding,
+    small_width_px,
     with_margin,
 )
 from mrasfm_engine.features.sift import SiftExtractor
@@ -164,6 +167,12 @@ def test_a_mask_over_much_of_an_image_gives_a_warning() -> None:
     assert "44%" in finding.what
     assert large_share_finding("back", None) == []
     assert OwnCar(mask=mask, reason=None, images=20).share == pytest.approx(4 / 9)
+
+
+def test_images_looked_at_have_few_pixels() -> None:
+    assert small_width_px(1920, 1080) == small_width_px(1080, 1920) == WIDTH_PX
+    assert small_width_px(480, 5000) ** 2 * 5000 / 480 <= MAX_PIXELS
+    assert small_width_px(1, 60_000) >= 1
 
 
 def test_the_best_outline_is_that_of_all_outlines() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,15 @@ def test_a_picture_that_is_no_png_is_not_drawn(monkeypatch: pytest.MonkeyPatch) 
     files, report = draw_pictures(make_scene())
     assert "a.png" not in files  # one alone would have nothing to be compared with
     assert "4 x 0 pixels cannot be made a PNG" in report["birds_eye"]["not_drawn"]
+
+
+def test_a_road_whose_files_are_left_out_is_not_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "road.tif").touch()
+    drawn = BirdsEye(pictures={"a.png": PICTURE, "road.png": PICTURE[:0]}, road_report={"images": 3})
+    monkeypatch.setattr(pictures, "birds_eye", lambda *_, **__: drawn)
+    _, report = draw_pictures(make_scene(), scratch=tmp_path)
+    assert not list(tmp_path.iterdir())
+    assert report["road"] == {"not_drawn": report["birds_eye"]["not_drawn"]}
 
 
 @pytest.mark.parametrize("stop", [CancelledError(), KeyboardInterrupt()])

@@ -11,7 +11,7 @@ from mrasfm_engine.visualization.birds_eye import grids_along
 from mrasfm_engine.visualization.drawing import framed
 from mrasfm_engine.visualization.exposure import camera_gains
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic, make_mosaics
-from mrasfm_engine.visualization.views import GIVEN, REFINED, View
+from mrasfm_engine.visualization.views import GIVEN, REFINED, View, sample
 from tests.helpers.painted_ground import SIZE_PX, Level, Slope, looking, pattern, photographed, view_of
 
 MAX_TEXTURE_PX = 16_384  # of browsers and graphics cards
@@ -265,3 +265,14 @@ def test_every_image_is_read_once_and_an_error_ends_it() -> None:
     with pytest.raises(KeyboardInterrupt):
         make_mosaics(views, [grid], Level(), read, own_car_m=None, step=stop)
     assert 2 <= len(reads) <= 6
+
+
+@pytest.mark.parametrize("shape", [(1, 5, 3), (5, 1, 3), (1, 1, 3)])
+def test_an_image_of_one_row_or_column_is_read_inside(shape: tuple[int, ...]) -> None:
+    within = np.full((7, 7, 3), 200, np.uint8)  # around the image, in the same memory
+    image = within[: shape[0], : shape[1]]
+    image[:] = 50
+    seen = np.zeros(3, np.uint8)
+    for u, v in ((0.1, 0.1), (shape[1] - 0.01, shape[0] - 0.01)):
+        sample(image, u, v, np.ones(3), seen)
+        assert (seen == 50).all()

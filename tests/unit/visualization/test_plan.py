@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.visualization.plan import in_order_of_the_path, place_numbers
+from mrasfm_engine.visualization.plan import SAME_PLACE_M, first_visits, in_order_of_the_path, place_numbers
 from mrasfm_engine.visualization.road_candidates import PLACE_M
 from tests.helpers.export_example import make_scene
 
@@ -34,3 +34,16 @@ def test_later_visits_come_with_the_first_one() -> None:
     assert sorted(order) == list(range(len(scene.drive.images)))
     far = there_and_back[[scene.drive.images[i].unit for i in order]] > 25.0
     assert np.abs(np.diff(far.astype(int))).sum() == 1  # all of one place, then all of the other
+
+
+def test_passes_beside_one_another_are_visited_together() -> None:
+    x = np.arange(0.0, 300.0)
+    there = np.column_stack([x, 0 * x, 0 * x])
+    first = first_visits(np.concatenate([there, there[::-1] + np.array([0.0, 15.0, 0.0])]))
+    assert np.abs(first[:300] - first[300:][::-1]).max() < SAME_PLACE_M / 2
+    far = first_visits(np.concatenate([there, there[::-1] + np.array([0.0, SAME_PLACE_M + 1, 0.0])]))
+    assert far[300:].min() > 300 - SAME_PLACE_M
+
+
+def test_a_vehicle_that_stands_for_long_is_at_one_place() -> None:
+    assert (first_visits(np.full((50_000, 3), 1.0)) == 0).all()

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import shutil
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mrasfm_engine.visualization import road_blocks
+from mrasfm_engine.errors import StorageError
+from mrasfm_engine.visualization import road_blocks, road_picture
 from mrasfm_engine.visualization.ground import GroundTiles
 from mrasfm_engine.visualization.mosaic import MIN_CELL_M
 from mrasfm_engine.visualization.road_painter import RoadPainter
-from mrasfm_engine.visualization.road_picture import OptionalPainter
+from mrasfm_engine.visualization.road_picture import OptionalPainter, discard_road, finish_road
 from mrasfm_engine.visualization.standing_points import SIDE, STEP_M, StandingPoints
 from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile
 from mrasfm_engine.visualization.tile_pyramid import build_pyramid
 from mrasfm_engine.visualization.views import View, paint_views, place_view
+from tests.helpers.export_example import make_scene
 from tests.helpers.painted_ground import HEIGHT_M, Level, looking, pattern, photographed, view_of
 
 WAY_M = np.arange(0.0, 10.0)
@@ -176,6 +180,16 @@ def test_blocks_on_disk_make_the_same_picture(
     assert not list((tmp_path / "blocks").iterdir())
 
 
+def test_blocks_leave_space_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = road_blocks.BlockStore(tmp_path)
+    monkeypatch.setattr(road_blocks, "MAX_BLOCKS", 1)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=road_blocks.MIN_FREE_BYTES - 1))
+    store.get([(0, 0)])
+    with pytest.raises(StorageError, match="less than 4 GB free"):
+        store.get([(0, 1)])
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_error_of_the_road_leaves_only_the_road_out() -> None:
     painted = []
 
@@ -189,6 +203,32 @@ def test_an_error_of_the_road_leaves_only_the_road_out() -> None:
     paint_views(views, lambda i: (images[i], None), [optional])
     assert painted == [0]
     assert "No space" in str(optional.error)
+
+
+def test_a_road_that_fails_leaves_nothing_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        (tmp_path / "road.tif").write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(road_picture, "_finished", full)
+    for fail in (
+        lambda painter: finish_road(make_scene(), None, painter, tmp_path, None),
+        lambda painter: finish_road(make_scene(), None, painter, tmp_path, MemoryError()),
+        lambda painter: discard_road(painter, tmp_path),
+    ):
+        (tmp_path / "blocks").mkdir()
+        (tmp_path / "blocks" / "block 0 0.npz").write_bytes(b"block")
+        tiles = TileFile(tmp_path / "tiles")
+        fail(SimpleNamespace(tiles=tiles))
+        assert tiles._file.closed
+        assert not list(tmp_path.iterdir())
+
+
+def test_tiles_close_on_a_full_disk() -> None:
+    with TileFile(Path("/dev/full")) as tiles:
+        tiles._file.write(b"tile")
+        with pytest.raises(OSError, match="No space"):
+            tiles.flush()
 
 
 def test_memory_does_not_grow_with_the_way(tmp_path: Path) -> None:
