@@ -45,9 +45,8 @@ def points_below_trajectory(points_m: Floats, world_from_rig: Floats, lowest_cam
     if lane.sum() < MIN_POINTS:
         return None
     free = lane & (np.abs(lateral) < FREE_M)
-    for told in (free, lane):
-        if told.sum() < max(FREE_POINTS, FREE_SHARE * lane.sum()) and told is free:
-            continue
+    tells = free.sum() >= max(FREE_POINTS, FREE_SHARE * lane.sum())
+    for told in (free, lane) if tells else (lane,):
         level = most_frequent(height[told])
         on_level = lane & (np.abs(height - level) < ON_LEVEL_M + LEVEL_PER_M * away)
         if on_level.sum() >= max(MIN_POINTS, MIN_SHARE * lane.sum()):

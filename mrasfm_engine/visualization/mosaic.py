@@ -20,12 +20,11 @@ from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
 from mrasfm_engine.visualization.views import (
     MIN_RESOLUTION_PX,
-    OWN_CAR_LEVEL,
     VIEW_M,
     Read,
     View,
+    find_pixel,
     height_at,
-    inside_car,
     paint_views,
     place_view,
     sample,
@@ -196,7 +195,6 @@ def _paint(
 ) -> int:  # fmt: skip
     """Colour the cells that the image sees better than what is there; how many."""
     left, top, cell, first_x, first_y = place[0], place[1], place[2], place[3], place[4]
-    height, width = rgb.shape[0], rgb.shape[1]
     focal = math.sqrt(params[1, 0] * params[1, 1])
     work, pixel, cam = np.empty(6), np.empty(8), np.empty(3)
     painted = 0
@@ -215,21 +213,12 @@ def _paint(
             layer = _layer_for(owner, score, row, column, camera, s)
             if layer < 0:
                 continue
-            m = cam_from_plan[1]
-            for i in range(3):
-                cam[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
-            if cam[2] < 1e-3 or cam[0] * cam[0] + cam[1] * cam[1] > (widest * cam[2]) ** 2:
+            if not find_pixel(
+                rgb, usable, has_mask, cam_from_plan[1], rig_from_plan, own_car, kind, params[1], widest, x, y, z, dx,
+                dy, above, work, pixel,
+            ):  # fmt: skip
                 continue
-            project(kind, params[1], cam[0], cam[1], cam[2], work, pixel)
             u, v = pixel[0], pixel[1]
-            if not (0.0 <= u < width and 0.0 <= v < height):
-                continue
-            if has_mask and not usable[int(v), int(u)]:
-                continue
-            if inside_car(rig_from_plan, own_car, x, y, z) or inside_car(
-                rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above
-            ):
-                continue
             if layer == 2:
                 owner[1, row, column], score[1, row, column] = owner[0, row, column], score[0, row, column]
                 for c in range(2):

@@ -14,18 +14,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 from mrasfm_engine.visualization.standing_points import STEP_M
 from mrasfm_engine.visualization.views import (
     MIN_RESOLUTION_PX,
-    OWN_CAR_LEVEL,
     REFINED,
     VIEW_M,
     PlacedView,
     View,
+    find_pixel,
     height_at,
-    inside_car,
     sample,
 )
 
@@ -168,30 +166,6 @@ def log_ratios(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float, 
     return found[:count]
 
 
-@njit(cache=True, inline="always")
-def _pixel(
-    rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, rig_from_plan: Any, own_car: Any, kind: int,
-    params: Any, widest: float, x: float, y: float, z: float, dx: float, dy: float, above: float, work: Any,
-    pixel: Any,
-) -> bool:  # fmt: skip
-    """Find the pixel that shows a place; False where none does."""
-    m = cam_from_plan
-    a = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-    b = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-    c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    if c < 1e-3 or a * a + b * b > (widest * c) ** 2:
-        return False
-    project(kind, params, a, b, c, work, pixel)
-    if not (0.0 <= pixel[0] < rgb.shape[1] and 0.0 <= pixel[1] < rgb.shape[0]):
-        return False
-    if has_mask and not usable[int(pixel[1]), int(pixel[0])]:
-        return False
-    return not (
-        inside_car(rig_from_plan, own_car, x, y, z)
-        or inside_car(rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above)
-    )
-
-
 @njit(cache=True, nogil=True)
 def _add(
     rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
@@ -230,7 +204,7 @@ def _add(
             beaten = 0.0 if at == n else quality[row, column, at] / QUALITY_UNIT
             if s <= beaten:
                 continue
-            if not _pixel(
+            if not find_pixel(
                 rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, widest, x, y, z, dx, dy,
                 above, work, pixel,
             ):  # fmt: skip
@@ -284,7 +258,7 @@ def _ratios(
                 continue
             if hidden[round(middle + dy / STEP_M), round(middle + dx / STEP_M)]:
                 continue
-            if not _pixel(
+            if not find_pixel(
                 rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, widest, x, y, z, dx, dy,
                 above, work, pixel,
             ):  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import unproject_pixels
+from mrasfm_engine.geometry.camera_model import project, unproject_pixels
 from mrasfm_engine.types import Bools, Bytes, Floats
 from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundTiles
 
@@ -188,6 +188,30 @@ def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -
         if not own_car[0, i] < m[0] * x + m[1] * y + m[2] * z + m[3] < own_car[1, i]:
             return False
     return True
+
+
+@njit(cache=True, inline="always")
+def find_pixel(
+    rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, rig_from_plan: Any, own_car: Any, kind: int,
+    params: Any, widest: float, x: float, y: float, z: float, dx: float, dy: float, above: float, work: Any,
+    pixel: Any,
+) -> bool:  # fmt: skip
+    """Find the pixel that shows a place; False where none does."""
+    m = cam_from_plan
+    a = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+    b = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+    c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    if c < 1e-3 or a * a + b * b > (widest * c) ** 2:
+        return False
+    project(kind, params, a, b, c, work, pixel)
+    if not (0.0 <= pixel[0] < rgb.shape[1] and 0.0 <= pixel[1] < rgb.shape[0]):
+        return False
+    if has_mask and not usable[int(pixel[1]), int(pixel[0])]:
+        return False
+    return not (
+        inside_car(rig_from_plan, own_car, x, y, z)
+        or inside_car(rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above)
+    )
 
 
 @njit(cache=True, inline="always")
