@@ -59,21 +59,24 @@ class Motion:
         return float(self.matches[camera, unit] * np.exp(-self.lost_per_m[camera, unit] * max(beyond_m, 0.0)))
 
 
-def following_units(travelled_m: Floats, *, spacing_m: float, count: int) -> list[Ints]:
+def following_units(travelled_m: Floats, *, spacing_m: float, count: int, usable: Bools | None = None) -> list[Ints]:
     """The units after each one that it is paired with: the next, and others at least `spacing_m` apart.
 
-    `travelled_m` (units,) never gets less.
+    `travelled_m` (units,) never gets less. Units that are not `usable` (units,) are passed over, as if they had never
+    been recorded: a few dark or grey ones do not cut the drive.
     """
-    result = []
     spacing_m *= 1.0 - 1e-6  # equal steps are rounded
+    candidates = np.arange(len(travelled_m)) if usable is None else np.flatnonzero(usable)
+    way_m, result = travelled_m[candidates], []
     for unit in range(len(travelled_m)):
-        chosen = list(range(unit + 1, min(unit + 1 + min(NEXT_UNITS, count), len(travelled_m))))
+        first = int(np.searchsorted(candidates, unit, side="right"))
+        chosen = list(range(first, min(first + min(NEXT_UNITS, count), len(candidates))))
         while chosen and len(chosen) < count:
-            ahead = int(np.searchsorted(travelled_m, travelled_m[chosen[-1]] + spacing_m))
-            if ahead == len(travelled_m):
+            ahead = int(np.searchsorted(way_m, way_m[chosen[-1]] + spacing_m))
+            if ahead == len(candidates):
                 break
             chosen.append(ahead)
-        result.append(np.array(chosen, dtype=np.int64))
+        result.append(candidates[chosen])
     return result
 
 

@@ -19,6 +19,7 @@ from mrasfm_engine.matching.pair_selection import (
     pairs_from_window,
     pairs_without_selection,
     units_ahead,
+    usable_units,
 )
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.retrieval import revisit_pairs
@@ -63,8 +64,13 @@ class PairChoice:
 
     @cached_property
     def _usable(self) -> Bools:
-        """Images (i,) that were not left out: the others count as never recorded."""
-        return np.array([found.left_out is None for found in self.features], dtype=np.bool_)
+        """Images (i,) with keypoints enough for a match: the others count as never recorded.
+
+        If there were none at all, that is said where pairs are matched.
+        """
+        enough = np.array([len(found.xy_px) >= self.config.matching.min_matches for found in self.features])
+        usable = enough & np.array([found.left_out is None for found in self.features], dtype=np.bool_)
+        return usable if usable.any() else np.ones_like(usable)
 
     @property
     def further(self) -> Further | None:
@@ -76,7 +82,9 @@ class PairChoice:
     def _by_motion(self, found: Sequence[PairMatches], rays_of: Callable[[PairMatches], tuple[Floats, Floats]]) -> Ints:
         pairs = self.config.pairs
         self.motion = motion_from_images(self.drive, found, rays_of, max_depth_m=pairs.max_depth_m)
-        window = pairs_from_window(self.drive, pairs, self.motion, min_matches=self.config.matching.min_matches)
+        window = pairs_from_window(
+            self.drive, pairs, self.motion, usable=self._usable, min_matches=self.config.matching.min_matches
+        )
         revisits = revisit_pairs(self.drive, self.features, pairs, self.motion)
         every = np.unique(np.concatenate([window, revisits]), axis=0)
         done = set(map(tuple, self._next.tolist()))
@@ -90,7 +98,9 @@ class PairChoice:
         ends = np.array([(pair.image_a, pair.image_b) for pair in pairs], dtype=np.int64).reshape(-1, 2)
         travelled_m = self.motion.travelled_m[unit[ends]]
         far = np.abs(travelled_m[:, 0] - travelled_m[:, 1]) > REVISIT_PATH_M
-        far &= ~are_following(units_ahead(self.motion, self.config.pairs), *unit[ends].T)
+        far &= ~are_following(
+            units_ahead(self.motion, self.config.pairs, usable_units(self.drive, self._usable)), *unit[ends].T
+        )
         at_once = set(map(tuple, self._next.tolist()))
         return [
             replace(pair, is_revisit=bool(is_far) and (pair.image_a, pair.image_b) not in at_once)

@@ -56,20 +56,34 @@ def _axis_angle_ok(pairs: Ints, world_from_cam: Floats, max_angle_deg: float) ->
     return result
 
 
-def units_ahead(motion: Motion, config: PairConfig) -> list[Ints]:
-    """The units after each one that it is paired with, unless views say otherwise."""
-    return following_units(motion.travelled_m, spacing_m=spacing_m(config.max_depth_m), count=config.window_units)
+def units_ahead(motion: Motion, config: PairConfig, usable: Bools | None = None) -> list[Ints]:
+    """The units after each one that it is paired with, unless views say otherwise; of usable ones (units,), if given."""
+    return following_units(
+        motion.travelled_m, spacing_m=spacing_m(config.max_depth_m), count=config.window_units, usable=usable
+    )
 
 
-def pairs_from_window(drive: Drive, config: PairConfig, motion: Motion, *, min_matches: int = 0) -> Ints:
+def usable_units(drive: Drive, usable: Bools) -> Bools:
+    """Units (units,) that have an image that is usable (images,)."""
+    result = np.zeros(len(drive.timestamps_us), dtype=np.bool_)
+    result[[image.unit for image, good in zip(drive.images, usable, strict=True) if good]] = True
+    return result
+
+
+def pairs_from_window(
+    drive: Drive, config: PairConfig, motion: Motion, *, usable: Bools | None = None, min_matches: int = 0
+) -> Ints:
     """Pairs (n, 2) of units and those that follow them, without any prior: the same camera, as long as so many matches
     are expected, and cameras that can see the same things if the car goes forward or back by the distance between them.
+    Images that are not usable (i,) are in none.
     """
     views = _Views.from_drive(drive)
     index = {(int(u), int(c)): i for i, (u, c) in enumerate(zip(views.unit, views.camera, strict=True))}
     linked = _CommonViews(drive, views, config)
     pairs = set()
-    for unit, ahead in enumerate(units_ahead(motion, config)):
+    if usable is not None:
+        index = {place: image for place, image in index.items() if usable[image]}
+    for unit, ahead in enumerate(units_ahead(motion, config, None if usable is None else usable_units(drive, usable))):
         for place, other in enumerate([unit, *ahead.tolist()]):
             near = place <= config.cross_window_units
             common = linked.after(motion.travelled_m[other] - motion.travelled_m[unit]) if near else None
@@ -157,7 +171,8 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig, u
     motion = motion_from_poses(drive, world_from_rig)
     travelled_m = motion.travelled_m
     unit_a, unit_b = views.unit[pairs].T
-    near = are_following(units_ahead(motion, config), unit_a, unit_b)
+    ahead = units_ahead(motion, config, None if usable is None else usable_units(drive, usable))
+    near = are_following(ahead, unit_a, unit_b)
     between_m = np.abs(travelled_m[unit_a] - travelled_m[unit_b])
     position = world_from_rig[views.unit, :3, 3]
     apart = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
@@ -189,7 +204,7 @@ def _pairs_where_known(
     units = np.flatnonzero(known)
     nearest = units[np.abs(np.arange(len(known))[:, None] - units[None]).argmin(1)]
     by_overlap = pairs_from_poses(drive, world_from_rig[nearest], config, usable)
-    by_window = pairs_from_window(drive, config, motion_unknown(drive, config))
+    by_window = pairs_from_window(drive, config, motion_unknown(drive, config), usable=usable)
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     both = known[unit[by_overlap]].all(axis=1)
     one = ~known[unit[by_window]].all(axis=1)
