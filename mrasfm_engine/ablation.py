@@ -17,7 +17,7 @@ from mrasfm_engine.evaluation.pose_errors import TOLERANCE_US, PoseErrors, compa
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, match_timestamps
 from mrasfm_engine.io.stage_store import Arrays, StageStore
 from mrasfm_engine.io.trajectory_file import Trajectory
-from mrasfm_engine.mapping import incremental_mapping
+from mrasfm_engine.mapping import components
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
@@ -212,7 +212,7 @@ def _row(
     matches = stages.matches(run, features, prior)
     if name == FULL:
         warm_up(run, features, matches, prior)
-    model = stages.mapping(run, features, matches, prior)
+    model = stages.mapping(run, features, matches, prior)[0]
     scene = stages.scene(run, model, features, matches, prior)
     done = {stage["stage"]: stage for stage in run.report["stages"]}
     took = {stage: seconds.get(stage) if report["reused"] else report["seconds"] for stage, report in done.items()}
@@ -245,7 +245,7 @@ def warm_up(
     poses = None if prior.world_from_rig is None else prior.world_from_rig[:WARM_UP_UNITS]
     pairs = [p for p in matches if p.image_b < images]
     try:
-        incremental_mapping.map_units(
+        components.map_drive(
             few, Keypoints.from_features(few, features[:images]), pairs, poses, run.config, cancel=run.cancel
         )
     except CancelledError:

@@ -74,14 +74,15 @@ def reconstruct(
         stages.probe(run)
         features = stages.features(run)
         matches = stages.matches(run, features, prior)
-        model = stages.mapping(run, features, matches, prior)
+        model, *others = stages.mapping(run, features, matches, prior)
         scene = stages.scene(run, model, features, matches, prior)
+        components = stages.components(run, model, scene, others, prior)
         with scratch_folder(out) as scratch:
             pictures = stages.pictures(run, scene, scratch)
             if cancel():
                 raise CancelledError
             run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
             run.begin(Stage.EXPORT)
-            write_scene(scene, out, run.report, pictures)
+            write_scene(scene, out, run.report, pictures, components)
     run.progress(Stage.EXPORT, 1, 1)
     return run.report

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,9 @@ from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_fi
 from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.images import mask_of_png, mask_png
 from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
-from mrasfm_engine.mapping import incremental_mapping, mapping_report, miscalibration
+from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
@@ -51,7 +52,7 @@ PROBE_UNITS = 5
 FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 3, Stage.MATCHES: 4, Stage.MAPPING: 8}
+VERSIONS = {Stage.FEATURES: 3, Stage.MATCHES: 5, Stage.MAPPING: 9}
 
 
 @dataclass
@@ -363,13 +364,15 @@ def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
     ]
 
 
-def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory) -> Mapper:
-    """Units registered one by one, points triangulated, everything adjusted."""
+def mapping(
+    run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
+) -> list[Mapper]:
+    """Units registered one by one, points triangulated, everything adjusted; of every component, the largest first."""
     bands = RowBands.from_drive(run.drive, compensate=run.config.mapping.motion_compensation)
     keypoints = Keypoints.from_features(run.drive, found, bands)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        mapper, log = incremental_mapping.map_units(
+        parts = map_drive(
             run.drive,
             keypoints,
             pairs,
@@ -379,13 +382,34 @@ def mapping(run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatche
             progress=run.step(Stage.MAPPING),
             cancel=run.cancel,
         )
-        mapper.missing |= np.array([f.left_out is not None for f in found])
-        return mapper.to_arrays(), mapping_report.describe(mapper, log)
+        for part in parts:
+            part.mapper.missing |= np.array([f.left_out is not None for f in found])
+        arrays = {
+            f"{number}.{name}": array
+            for number, part in enumerate(parts)
+            for name, array in part.mapper.to_arrays().items()
+        }
+        return arrays, {
+            **mapping_report.describe(parts[0].mapper, parts[0].log),
+            **gaps.describe(parts),
+            "findings": [as_json(finding) for finding in gaps.findings(parts)],
+        }
 
     sections = (run.config.mapping, run.config.bundle_adjustment, run.config.gnss)
     settings = [*(section.model_dump() for section in sections), run.config.seed, run.config.use_gnss]
-    arrays, _ = run.stage(Stage.MAPPING, settings, work)
-    return Mapper.from_arrays(run.drive, keypoints, run.config, known.world_from_rig, arrays)
+    arrays, report = run.stage(Stage.MAPPING, settings, work)
+    run.report["findings"] += report["findings"]
+    count = len(report["components"])
+    return [
+        Mapper.from_arrays(
+            run.drive,
+            keypoints,
+            run.config,
+            known.world_from_rig,
+            {name.partition(".")[2]: array for name, array in arrays.items() if name.startswith(f"{number}.")},
+        )
+        for number in range(count)
+    ]
 
 
 def absolute_priors(known: PriorTrajectory) -> AbsolutePriors:
@@ -401,41 +425,90 @@ def scene(
     run: Run, mapper: Mapper, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
 ) -> Scene:
     """Georeferencing, the final adjustment with all priors, and how certain the result is."""
-    started = time.perf_counter()
     run.begin(Stage.REFINEMENT)
+    result, findings, report = _refined(run, mapper, found, pairs, known)
+    run.report["findings"] += findings
+    run.report["stages"].append(report)
+    run.progress(Stage.REFINEMENT, 1, 1)
+    return result
+
+
+def components(
+    run: Run,
+    largest: Mapper,
+    whole: Scene,
+    others: Sequence[Mapper],
+    known: PriorTrajectory,
+) -> list[tuple[Scene, dict[str, Any]]]:
+    """Scenes of the components besides the largest, each with its report; those that fall apart are findings.
+
+    Their calibration is that of the largest, `whole`.
+    """
+    result: list[tuple[Scene, dict[str, Any]]] = []
+    for mapper in others:
+        inside = mapper.registered[mapper.image_unit]
+        try:
+            one, findings, stage = _refined(run, mapper, whole.features, whole.pairs, known, calibrated=largest)
+        except ReconstructionError as problem:
+            run.report["findings"].append(as_json(gaps.lost(mapper, problem)))
+            continue
+        header: dict[str, Any] = {
+            name: run.report[name] for name in ("engine_version", "drive", "settings", "models") if name in run.report
+        }
+        one.features = [f if seen else _without_keypoints(f) for f, seen in zip(whole.features, inside, strict=True)]
+        one.calibration, one.calibration_observability = whole.calibration, whole.calibration_observability
+        one.pairs = [pair for pair in whole.pairs if inside[[pair.image_a, pair.image_b]].all()]
+        result.append((one, {**header, "component": len(result) + 1, "findings": findings, "stages": [stage]}))
+    return result
+
+
+def _without_keypoints(features: ImageFeatures) -> ImageFeatures:
+    """Features of an image that takes no part in a component."""
+    scores = None if features.scores is None else features.scores[:0]
+    empty = {name: getattr(features, name)[:0] for name in FEATURE_ARRAYS}
+    return replace(features, **empty, scores=scores, made_mask=None)
+
+
+def _refined(
+    run: Run,
+    mapper: Mapper,
+    found: Sequence[ImageFeatures],
+    pairs: Sequence[PairMatches],
+    known: PriorTrajectory,
+    *,
+    calibrated: Mapper | None = None,
+) -> tuple[Scene, list[dict[str, str]], dict[str, Any]]:
+    """A component's scene, findings, and what the report says of the stage."""
+    started = time.perf_counter()
     refinement = refine(
         mapper,
         absolute_priors(known),
+        calibrated=calibrated,
         progress=run.step(Stage.REFINEMENT),
         cancel=run.cancel,
     )
     between = register_between_keyframes(mapper, max_error_px=run.config.mapping.filter_error_px)
-    if refinement.placement is not None:
-        run.report["findings"] += [as_json(finding) for finding in refinement.placement.findings]
+    findings = [] if refinement.placement is None else list(refinement.placement.findings)
     if refinement.intrinsics is not None:
-        run.report["findings"] += [as_json(finding) for finding in refinement.intrinsics.findings(mapper)]
-    run.report["findings"] += [
-        as_json(miscalibration.finding(run.drive.cameras[wrong.camera].name, wrong))
-        for wrong in refinement.miscalibrations
+        findings += refinement.intrinsics.findings(mapper)
+    findings += [
+        miscalibration.finding(run.drive.cameras[wrong.camera].name, wrong) for wrong in refinement.miscalibrations
     ]
-    run.report["findings"] += [as_json(finding) for finding in refinement.late_cameras]
+    findings += refinement.late_cameras
     if refinement.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
-        run.report["findings"].append(as_json(miscalibration.pair_finding(names, refinement.wrong_pair)))
-    run.report["findings"] += [as_json(finding) for finding in mapping_report.motion_findings(mapper)]
-    run.report["stages"].append(
-        {
-            "stage": Stage.REFINEMENT,
-            "seconds": round(time.perf_counter() - started, 3),
-            "reused": False,
-            **mapping_report.describe_refinement(mapper, refinement),
-            **mapping_report.describe_between(mapper, between),
-        }
-    )
+        findings.append(miscalibration.pair_finding(names, refinement.wrong_pair))
+    findings += mapping_report.motion_findings(mapper)
+    report = {
+        "stage": Stage.REFINEMENT,
+        "seconds": round(time.perf_counter() - started, 3),
+        "reused": False,
+        **mapping_report.describe_refinement(mapper, refinement),
+        **mapping_report.describe_between(mapper, between),
+    }
     result = build_scene(mapper, refinement, found, pairs, known, notes=run.drive.manifest.notes)
     result.own_cars = run.own_cars
-    run.progress(Stage.REFINEMENT, 1, 1)
-    return result
+    return result, [as_json(finding) for finding in findings], report
 
 
 def pictures(run: Run, result: Scene, scratch: Path) -> PictureFiles:

@@ -36,6 +36,7 @@ REPORT_FILE = "report.json"
 MAP_FILE = "map.json"
 PICTURES_FOLDER = "pictures"
 OWN_CAR_FOLDER = "own_car"  # CAMERA.png, 255 where a camera shows the vehicle itself
+COMPONENTS_FOLDER = "components"  # N/, scenes of the parts of a drive that nothing links to the scene
 TEXT_MODEL_FOLDER = "model/text"
 SCENES_FOLDER = "scenes"  # of a map: its scenes as an aggregation reads them
 SEAMS_FOLDER = "seams"  # of a map: its seams, for the next version
@@ -45,6 +46,11 @@ BETWEEN_SCENES = "~"  # no name of a scene has it, and URLs and shells take it a
 def checkpoint_file(name: str) -> str:
     """Name the file of a finished stage, or of anything else that `StageStore` keeps."""
     return f"{name}.npz"
+
+
+def component_folder(number: int) -> str:
+    """Name the folder of a component, counted from 1, inside the scene's."""
+    return f"{COMPONENTS_FOLDER}/{number}"
 
 
 def seam_name(a: str, b: str) -> str:

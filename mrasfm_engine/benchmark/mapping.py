@@ -147,7 +147,7 @@ def _map(
     run.report["findings"] = []
     warm_up(run, features, matches, prior)
     start_memory_bytes = memory_bytes()
-    model = stages.mapping(run, features, matches, prior)
+    model = stages.mapping(run, features, matches, prior)[0]
     scene = stages.scene(run, model, features, matches, prior)
     done = {stage["stage"]: stage for stage in run.report["stages"]}
     revisits = done["mapping"]["revisits"]

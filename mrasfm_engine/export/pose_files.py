@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.types import Floats
+from mrasfm_engine.types import Bools, Floats
 
 POSE_TIME = {
     False: "an image's pose is at its unit's timestamp_us",
@@ -24,8 +25,10 @@ def poses_text(scene: Scene) -> str:
     return format_tum(scene.drive.timestamps_us[kept].tolist(), scene.world_from_rig[kept])
 
 
-def poses_document(scene: Scene) -> dict[str, Any]:
+def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, Any]:
     """`poses.json`: every unit and every image of the drive, with a pose where it is registered.
+
+    Units of `components`, masks (units,) of the first and so on, have their pose in that component's own `poses.json`.
 
     A value that does not exist (the pose of what is not registered, the geodetic position of a scene that is not
     georeferenced, an unknown sigma) is absent, never zero or null.
@@ -45,6 +48,9 @@ def poses_document(scene: Scene) -> dict[str, Any]:
             if np.isfinite(scene.sigma_position_m[u]).all():
                 unit["sigma_position_m"] = scene.sigma_position_m[u].tolist()
             unit |= _place(unit_places, u)
+        for number, own in enumerate(components, start=1):
+            if own[u]:
+                unit["component"] = number
         units.append(unit)
     images = []
     for i, source in enumerate(scene.drive.images):

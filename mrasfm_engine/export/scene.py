@@ -3,13 +3,14 @@
 A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
 `poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
 scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a camera shows the
-vehicle itself, `road.json` where the road was found, and `report.json`. One with a `report.json` is complete.
+vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the drive that
+nothing links to this one, and `report.json`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -35,15 +36,21 @@ from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.types import Floats, Ints
-from schemas.artifacts import OWN_CAR_FOLDER, PICTURES_FOLDER
+from mrasfm_engine.types import Bools, Floats, Ints
+from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
 
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
 
 
-def write_scene(scene: Scene, out: Path, report: Mapping[str, Any], pictures: PictureFiles = NO_PICTURES) -> None:
+def write_scene(
+    scene: Scene,
+    out: Path,
+    report: Mapping[str, Any],
+    pictures: PictureFiles = NO_PICTURES,
+    components: Sequence[tuple[Scene, Mapping[str, Any]]] = (),
+) -> None:
     """Write all files of a scene into the folder `out`.
 
     They are written into a temporary folder, read back and compared with the scene, and only then moved: an interrupted
@@ -56,6 +63,9 @@ def write_scene(scene: Scene, out: Path, report: Mapping[str, Any], pictures: Pi
         What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths.
     pictures
         Files of `pictures/` by name, large ones on the disk of `out`; those of an earlier scene there are removed.
+    components
+        Parts of the drive that nothing links to the scene, each in a frame of its own, with their reports: scenes in
+        `components/1`, `components/2` and so on.
 
     Raises
     ------
@@ -64,10 +74,16 @@ def write_scene(scene: Scene, out: Path, report: Mapping[str, Any], pictures: Pi
     MrasfmError
         Where the scene contradicts itself, or a file that was written does not read back.
     """
-    check_scene(scene)
-    needed = _size_bytes(scene) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=(PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE)) as work:
-        _write(scene, work, report, pictures)
+    scenes = [scene, *(other for other, _ in components)]
+    for one in scenes:
+        check_scene(one)
+    needed = sum(map(_size_bytes, scenes)) + picture_files.size_bytes(pictures)
+    with publishing(out, needed, replaced=(PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER)) as work:
+        for number, (other, own_report) in enumerate(components, start=1):
+            folder = work / component_folder(number)
+            folder.mkdir(parents=True)
+            _write(other, folder, own_report, NO_PICTURES)
+        _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
 
 
 def summary(scene: Scene) -> dict[str, Any]:
@@ -88,7 +104,13 @@ def summary(scene: Scene) -> dict[str, Any]:
     return figures
 
 
-def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: PictureFiles) -> None:
+def _write(
+    scene: Scene,
+    work: Path,
+    report: Mapping[str, Any],
+    pictures: PictureFiles,
+    components: Sequence[Bools] = (),
+) -> None:
     read_back = ReadBack(work)
     figures = write_common(scene, work, pictures, read_back)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
@@ -96,7 +118,7 @@ def _write(scene: Scene, work: Path, report: Mapping[str, Any], pictures: Pictur
     if scene.road is not None:
         write_json(work / ROAD_FILE, road.road_document(scene))
     (work / "poses.tum").write_text(pose_files.poses_text(scene), encoding="utf-8")
-    write_json(work / "poses.json", pose_files.poses_document(scene))
+    write_json(work / "poses.json", pose_files.poses_document(scene, components))
     write_json(work / "calibration.json", calibration.calibration_document(scene))
     write_json(work / "frame.json", coordinate_frame.frame_document(scene))
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)

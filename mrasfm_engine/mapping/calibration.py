@@ -132,6 +132,21 @@ def scale_with_baselines(mapper: Mapper, factor: float) -> None:
     state.camera_position_m[:] = camera_position_m
 
 
+def take_calibration(mapper: Mapper, other: Mapper) -> None:
+    """Give the mapper's cameras the calibration of another scene of the drive; units and points follow its scale."""
+    lengths_m = [np.linalg.norm(m.state.camera_position_m - m.state.camera_position_m.mean(0)) for m in (mapper, other)]
+    if min(lengths_m) ** 2 >= MIN_BASELINES_M2:
+        scale_with_baselines(mapper, float(lengths_m[1] / lengths_m[0]))
+    mapper.state = replace(
+        mapper.state,
+        camera_rotation=other.state.camera_rotation.copy(),
+        camera_position_m=other.state.camera_position_m.copy(),
+        camera_params=other.state.camera_params.copy(),
+        camera_time_offset_s=other.state.camera_time_offset_s.copy(),
+    )
+    mapper.renew_motion()
+
+
 def resolve_scale(mapper: Mapper, terms: Sequence[Term]) -> None:
     """Scale the scene with its baselines to where the terms cost least.
 

@@ -23,7 +23,7 @@ from mrasfm_engine.mapping.dynamic_objects import find_moving_along, units_to_do
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, turned_px
 from mrasfm_engine.mapping.initialization import Initialisation, initialise
 from mrasfm_engine.mapping.keyframes import select_keyframes
-from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits, split_pairs
+from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
@@ -34,7 +34,7 @@ from mrasfm_engine.matching.simultaneous import calibration_sigmas, verified_aga
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
-from mrasfm_engine.types import Cancel, CountProgress, Floats, Ints
+from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats, Ints
 
 LOCAL_TOLERANCE = 1e-3
 GLOBAL_TOLERANCE = 1e-4
@@ -50,6 +50,7 @@ class MappingLog:
     registrations: list[Registration] = field(default_factory=list)
     failures: dict[int, Registration] = field(default_factory=dict)  # by unit, the last attempt
     calibration_free: bool = False  # whether global adjustments vary rig_from_cam
+    calibration_held: bool = False  # whether they never do, as a larger part of the drive tells it better
     local_adjustments: int = 0
     global_adjustments: list[Report] = field(default_factory=list)
     roads: list[RoadAssessment | str] = field(default_factory=list)  # after each of them; why there is none
@@ -66,12 +67,13 @@ def run_incremental_mapping(
     prior_world_from_rig: Floats | None,
     *,
     absolute: AbsolutePriors | None = None,
+    calibration_held: bool = False,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> MappingLog:
     """Register as many units as possible, beginning with the best-connected two.
 
-    Positions and rough poses of `absolute` take part in its adjustments.
+    Positions and rough poses of `absolute` take part in its adjustments; the calibration does not, if it is held.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def run_incremental_mapping(
     CancelledError
         Where `cancel` answers True.
     """
-    log = MappingLog(absolute=AbsolutePriors() if absolute is None else absolute)
+    log = MappingLog(absolute=AbsolutePriors() if absolute is None else absolute, calibration_held=calibration_held)
     log.initialisation = initialise(mapper, pairs, prior_world_from_rig)
     adjust_globally(mapper, log, cancel)
     register_remaining(mapper, log, progress=progress, cancel=cancel)
@@ -118,73 +120,83 @@ def register_remaining(
         retry_missing(mapper)
 
 
-def map_units(
+def mapper_of_drive(
     drive: Drive,
     keypoints: Keypoints,
     pairs: Sequence[PairMatches],
     prior_world_from_rig: Floats | None,
     config: EngineConfig,
-    *,
-    absolute: AbsolutePriors | None = None,
-    progress: CountProgress | None = None,
-    cancel: Cancel | None = None,
-) -> tuple[Mapper, MappingLog]:
-    """The whole mapping: the scene grows along the drive, what moves along is taken out, then loops are closed.
+) -> tuple[Mapper, Bools]:
+    """The mapper of a drive of which nothing is registered yet, with tracks of pairs of units that follow one another.
 
-    Raises
-    ------
-    ReconstructionError
-        Where the scene cannot even begin.
-    CancelledError
-        Where `cancel` answers True.
+    Also the keypoints (k,) that stand still in the image while the car moves, which its tracks do without.
     """
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
-    near, far = split_pairs(pairs)
     image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
-    still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, near)
-    sound = without_keypoints(near, keypoints.first, still) if still.any() else near
+    still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, pairs)
+    sound = without_keypoints(pairs, keypoints.first, still) if still.any() else pairs
     mapper = Mapper(drive, keypoints, build_tracks(keypoints, sound), config)
     if config.bundle_adjustment.reassessment:
         mapper.correct_calibration(sound)
     mapper.keyframe = select_keyframes(mapper)
     if prior_world_from_rig is not None:
         mapper.motion.follow_prior(prior_world_from_rig)
-    log = run_incremental_mapping(
-        mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
-    )
-    again = _verified_again(mapper, near, cancel)
-    if again is not near:
+    return mapper, still
+
+
+def cleaned_and_closed(
+    mapper: Mapper,
+    log: MappingLog,
+    near: Sequence[PairMatches],
+    far: Sequence[PairMatches],
+    still: Bools,
+    *,
+    progress: CountProgress | None = None,
+    cancel: Cancel | None = None,
+) -> Mapper:
+    """The grown scene without what moves along, and with its loops closed.
+
+    Parameters
+    ----------
+    near, far
+        Pairs of units that follow one another, and of those that may be revisits.
+    still
+        Keypoints (k,) that stand still in the image while the car moves.
+    """
+    first = mapper.keypoints.first
+    again = _verified_again(mapper, list(near), cancel)
+    if again is not None:
         near, log.verified_again = again, True
-        sound = without_keypoints(near, keypoints.first, still) if still.any() else near
-        mapper = _with_tracks_of(mapper, sound)
+        sound = without_keypoints(near, first, still) if still.any() else near
+        mapper = with_tracks_of(mapper, sound)
     # Only the poses of all cameras together separate dynamic objects reliably, so mapping comes before the cleaning.
     moving = find_moving_along(mapper, near)
     if moving.any:
         log.covered_images = {int(i): float(moving.share[i]) for i in np.flatnonzero(moving.covered)}
-        near, far = (without_keypoints(p, keypoints.first, moving.keypoint) for p in (near, far))
+        near, far = (without_keypoints(p, first, moving.keypoint) for p in (near, far))
         doubt = units_to_doubt(mapper, moving, still)
         mapper = _registered_anew(mapper, near, doubt, log, progress, cancel)
     revisits, log.revisits_tried = find_revisits(mapper, far)
     if not revisits:
-        return mapper, log
+        return mapper
     log.revisits = [(r.earlier, r.later) for r in revisits]
     log.loop_moved_m = close_loops(mapper, revisits)
     # Tracks anew, now with the matches across the loop that were believed, and points from the moved units.
-    believed = set(log.revisits)
-    across = [p for p in far if (*sorted((int(image_unit[p.image_a]), int(image_unit[p.image_b]))),) in believed]
-    closed = _with_tracks_of(mapper, [*near, *across])
+    believed, unit = set(log.revisits), mapper.image_unit
+    across = [p for p in far if (*sorted((int(unit[p.image_a]), int(unit[p.image_b]))),) in believed]
+    closed = with_tracks_of(mapper, [*near, *across])
     adjust_globally(closed, log, cancel)
-    return closed, log
+    return closed
 
 
-def _verified_again(mapper: Mapper, pairs: list[PairMatches], cancel: Cancel | None) -> list[PairMatches]:
-    """The pairs with matches of simultaneous images judged by the calibration as it is now; as they are, if it stayed.
+def _verified_again(mapper: Mapper, pairs: list[PairMatches], cancel: Cancel | None) -> list[PairMatches] | None:
+    """The pairs with matches of simultaneous images judged by the calibration as it is now; None, if it stayed.
 
     It stayed where no camera has turned against another by more than an inlier may be off.
     """
     focal_px = mapper.state.camera_params[:, :2].mean(axis=1)
     if turned_px(mapper) < mapper.config.matching.max_error_px:
-        return pairs
+        return None
     sigma = np.empty((len(focal_px), 6))
     sigma[:, :3] = LENS_SIGMA_PX / focal_px[:, None]  # what an adjustment may still be off by
     sigma[:, 3:] = calibration_sigmas(mapper.drive, mapper.config.bundle_adjustment)[1][:, None]
@@ -205,7 +217,7 @@ def _registered_anew(
     """The scene with tracks from other matches, in which some units find their pose anew; else they keep it."""
     before = mapper.state.world_from_rig
     mapper.forget(units)
-    mapper = _with_tracks_of(mapper, pairs)
+    mapper = with_tracks_of(mapper, pairs)
     register_remaining(mapper, log, progress=progress, cancel=cancel)
     # Where the units around have no pose either, there is nothing to register against: rather an old pose than none.
     lost = units[~mapper.registered[units]]
@@ -219,7 +231,7 @@ def _registered_anew(
     return mapper
 
 
-def _with_tracks_of(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
+def with_tracks_of(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
     """The mapper's poses and calibration with tracks from other matches, and points from these."""
     result = Mapper(mapper.drive, mapper.keypoints, build_tracks(mapper.keypoints, pairs), mapper.config)
     result.state = replace(mapper.state, points_m=result.state.points_m)
@@ -298,7 +310,7 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> N
     )
     terms = log.absolute.terms(mapper)
     # Once a part of the drive observes the calibration, more of it does so all the more.
-    log.calibration_free = (
+    log.calibration_free = not log.calibration_held and (
         log.calibration_free
         or assess_calibration(
             mapper, free_units=free_units, terms=terms, georeferenced=bool(terms), options=options

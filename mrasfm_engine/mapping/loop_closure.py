@@ -134,7 +134,11 @@ def find_revisits(mapper: Mapper, far_pairs: Sequence[PairMatches]) -> tuple[lis
         units = sorted((int(mapper.image_unit[pair.image_a]), int(mapper.image_unit[pair.image_b])))
         if mapper.registered[units].all():
             by_units.setdefault((units[0], units[1]), []).append(pair)
-    found = [r for (i, j), own in sorted(by_units.items()) if (r := _try(mapper, i, j, own)) is not None]
+    found = []
+    for (earlier, later), own in sorted(by_units.items()):
+        current = mapper.state.world_from_rig_of(np.array([later]))[0]
+        revisit = seen_again(mapper, earlier, later, own, current=current, expected=current)
+        found += [] if revisit is None else [revisit]
     if not found:
         return [], len(by_units)
     model = DriftModel.from_registrations(mapper, np.stack([r.covariance for r in found]))
@@ -143,8 +147,24 @@ def find_revisits(mapper: Mapper, far_pairs: Sequence[PairMatches]) -> tuple[lis
     return supported(plausible, model), len(by_units)
 
 
-def _try(mapper: Mapper, earlier: int, later: int, pairs: Sequence[PairMatches]) -> Revisit | None:
-    """Register the later unit against points that the earlier one observes."""
+def seen_again(
+    mapper: Mapper,
+    earlier: int,
+    later: int,
+    pairs: Sequence[PairMatches],
+    *,
+    current: Floats,
+    expected: Floats | None = None,
+) -> Revisit | None:
+    """Register the later unit against points that the earlier one observes.
+
+    Parameters
+    ----------
+    current
+        Pose (4, 4) of the later unit that its drift is counted from, be it in another frame.
+    expected
+        Where it (4, 4) may be; without it, it is searched.
+    """
     rows_later, tracks = [], []
     for pair in pairs:
         a, b = mapper.matched_keypoints(pair, earlier)
@@ -158,9 +178,8 @@ def _try(mapper: Mapper, earlier: int, later: int, pairs: Sequence[PairMatches])
         camera=mapper.keypoints.camera[rows],
         band=mapper.keypoints.band[rows],
     )
-    current = mapper.state.world_from_rig_of(np.array([later]))[0]
     pose = register_from_correspondences(
-        mapper, later, matched, min_inliers=MIN_INLIERS, by_vote=False, expected=current
+        mapper, later, matched, min_inliers=MIN_INLIERS, by_vote=False, expected=expected
     ).world_from_rig
     if pose is None:
         return None
@@ -171,6 +190,32 @@ def _try(mapper: Mapper, earlier: int, later: int, pairs: Sequence[PairMatches])
         drift=pose @ se3.inverse(current),
         covariance=pose_covariance(mapper, pose, matched.select(inliers_of(mapper, pose, matched))),
     )
+
+
+def largest_agreement(mapper: Mapper, other: Mapper, revisits: Sequence[Revisit]) -> list[Revisit]:
+    """Most of the revisits of two frames' units that report one transform between the frames.
+
+    Earlier units are registered in `mapper`, later ones in `other`. What both have drifted by between two revisits
+    takes part in the test, and a rotation's error over the distance.
+    """
+    if not revisits:
+        return []
+    own = np.stack([revisit.covariance for revisit in revisits])
+    drifts = np.stack([revisit.drift for revisit in revisits])
+    here, there = (DriftModel.from_registrations(one, own) for one in (mapper, other))
+    units = np.array([(revisit.earlier, revisit.later) for revisit in revisits])
+    at_m = there.position_m[units[:, 1]]
+    best = np.zeros(len(revisits), dtype=np.bool_)
+    for i in range(len(revisits)):
+        apart = [np.abs(m[own_units] - m[own_units[i]]) for m, own_units in
+                 ((here.travelled_m, units[:, 0]), (there.travelled_m, units[:, 1]))]  # fmt: skip
+        sigmas = np.hypot(here.step_sigmas(apart[0]), there.step_sigmas(apart[1]))
+        sigmas[:, 1] = np.hypot(sigmas[:, 1], _sigmas(own)[:, 0] * np.linalg.norm(at_m - at_m[i], axis=1))
+        difference = _steps(drifts, at_m[i]) - _steps(drifts[i : i + 1], at_m[i])
+        agrees = squared_lengths(difference, own + own[i] + _diagonal(sigmas)) <= _limit()
+        if agrees.sum() > best.sum():
+            best = agrees
+    return [revisit for revisit, agrees in zip(revisits, best, strict=True) if agrees]
 
 
 def _limit() -> float:

@@ -112,7 +112,7 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, 
             alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
     if isinstance(alignment, str):
         return Placement(reason=alignment)
-    _move(mapper, alignment.world_from_model)
+    move(mapper, alignment.world_from_model)
     placement = Placement(
         alignment=alignment,
         known_m=measured,
@@ -151,6 +151,31 @@ def reassess_positions(
         return placement
     placement = replace(placement, units=units, inlier=inlier, off_m=off_m, noise_factor=factor)
     return _with_prior(mapper, placement, thorough=thorough, clock_varies=clock_varies)
+
+
+def positions_fit(mapper: Mapper, placement: Placement, world_from_model: Floats | None = None) -> bool:
+    """Whether measured positions have the shape of the registered units' trajectory, and lie where that does.
+
+    Parameters
+    ----------
+    placement
+        Has the positions.
+    world_from_model
+        (4, 4) moves the trajectory to where it is judged; by default it stays.
+    """
+    units = np.flatnonzero(mapper.registered & np.isfinite(placement.known_m[:, 0]))
+    if not len(units):
+        return False
+    antenna_m = _antenna_m(mapper, units, placement.lever_arm_m)
+    if world_from_model is not None:
+        antenna_m = se3.apply(world_from_model, antenna_m)
+    inlier, factor = assess_residuals(
+        antenna_m - placement.known_m[units],
+        placement.known_sigma_m[units],
+        np.ones(len(units), dtype=np.bool_),
+        outlier_sigmas=mapper.config.gnss.outlier_sigmas,
+    )
+    return bool(inlier.mean() >= MOST and factor <= BENT)
 
 
 def positions_of_units(mapper: Mapper, placement: Placement, units: Ints) -> ReceiverPositions:
@@ -223,11 +248,11 @@ def place_by_rough_poses(mapper: Mapper, rough_world_from_rig: Floats, sigma_tra
         if _extent(rough[:, :3, 3]) < MIN_EXTENT_SIGMAS * sigma_translation_m:
             return False
         scale_with_baselines(mapper, _extent(rough[:, :3, 3]) / _extent(mapper.state.unit_position_m[units]))
-    _move(mapper, _between_poses(rough, mapper.state.world_from_rig[units]))
+    move(mapper, between_poses(rough, mapper.state.world_from_rig[units]))
     return True
 
 
-def _between_poses(a_from_rig: Floats, b_from_rig: Floats) -> Floats:
+def between_poses(a_from_rig: Floats, b_from_rig: Floats) -> Floats:
     """Transform a_from_b (4, 4) by which poses (n, 4, 4) of the same units agree: rotations determine its rotation."""
     rotation = robust_mean_rotation(a_from_rig[:, :3, :3] @ np.swapaxes(b_from_rig[:, :3, :3], 1, 2))
     return se3.transform(rotation, geometric_median(a_from_rig[:, :3, 3] - b_from_rig[:, :3, 3] @ rotation.T))
@@ -250,7 +275,7 @@ def compare_rough_poses(
     if len(units) < MIN_POSITIONS:
         return None
     own, rough = mapper.state.world_from_rig[units], rough_world_from_rig[units]
-    scene_from_rough = np.eye(4) if scene_stands_there else _between_poses(own, rough)
+    scene_from_rough = np.eye(4) if scene_stands_there else between_poses(own, rough)
     known = scene_from_rough @ rough_world_from_rig
     off_m = own[:, :3, 3] - known[units, :3, 3]
     sigma_m = np.full((len(known), 3), sigma_translation_m)
@@ -276,7 +301,8 @@ def _extent(position_m: Floats) -> float:
     return max(float(np.median(np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1))), 1e-9)
 
 
-def _move(mapper: Mapper, world_from_model: Floats) -> None:
+def move(mapper: Mapper, world_from_model: Floats) -> None:
+    """Move the whole scene by a rigid transform (4, 4)."""
     state = mapper.state
     state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
     state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)

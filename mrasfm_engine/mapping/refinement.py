@@ -23,6 +23,7 @@ from mrasfm_engine.mapping.calibration import (
     resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
+    take_calibration,
 )
 from mrasfm_engine.mapping.georeferencing import BENT
 from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
@@ -54,6 +55,7 @@ from mrasfm_engine.mapping.time_offsets import (
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
 from schemas.findings import Finding
 
+OF_THE_LARGEST = "it is that of the drive's largest component"
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
 MAX_ROUNDS = 6  # and while the weights of positions change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
@@ -113,12 +115,18 @@ def refine(
     mapper: Mapper,
     absolute: AbsolutePriors | None = None,
     *,
+    calibrated: Mapper | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> Refinement:
     """Georeference where positions allow, adjust everything with all priors, and estimate the uncertainty.
 
     Without positions, rough poses say where the scene lies.
+
+    Parameters
+    ----------
+    calibrated
+        A larger, refined scene of the same drive, whose calibration this one takes.
     """
     absolute = AbsolutePriors() if absolute is None else absolute
     result = Refinement(absolute=absolute)
@@ -131,16 +139,22 @@ def refine(
             remedy="Give a second camera with its baseline, or positions along the vehicle's trajectory.",
             code="no-metric-scale",
         )
+    if calibrated is not None:
+        take_calibration(mapper, calibrated)
+        mapper.complete()
     free_units = _free_units(mapper, absolute)
     result.moving = drop_moving(mapper)
     result.sigma_px = _observation_sigma(mapper)
-    result.calibration = assess_calibration(
-        mapper,
-        free_units=free_units,
-        terms=_terms(mapper, result),
-        georeferenced=result.georeferenced,
-        options=_options(mapper, result.sigma_px),
-    )
+    if calibrated is not None:
+        result.calibration = CalibrationDecision(False, OF_THE_LARGEST)
+    else:
+        result.calibration = assess_calibration(
+            mapper,
+            free_units=free_units,
+            terms=_terms(mapper, result),
+            georeferenced=result.georeferenced,
+            options=_options(mapper, result.sigma_px),
+        )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
     few = not result.georeferenced and _reassesses(mapper) and mapper.registered.sum() < MIN_UNITS
     if result.calibration.free and few:

@@ -57,7 +57,7 @@ def _axis_angle_ok(pairs: Ints, world_from_cam: Floats, max_angle_deg: float) ->
 
 
 def units_ahead(motion: Motion, config: PairConfig, usable: Bools | None = None) -> list[Ints]:
-    """The units after each one that it is paired with, unless views say otherwise; of usable ones (units,), if given."""
+    """The units after each one that it is paired with, unless views say otherwise; of usable ones (u,), if given."""
     return following_units(
         motion.travelled_m, spacing_m=spacing_m(config.max_depth_m), count=config.window_units, usable=usable
     )

@@ -231,7 +231,7 @@ def finished_model(drive: Path, scene: Path) -> Mapper:
     prior = stages.prior(run)
     features = stages.features(run)
     matches = stages.matches(run, features, prior)
-    mapper = stages.mapping(run, features, matches, prior)
+    mapper = stages.mapping(run, features, matches, prior)[0]
     stages.scene(run, mapper, features, matches, prior)
     assert all(stage["reused"] for stage in run.report["stages"][:3]), "the scene's stages were to be used again"
     return mapper

@@ -18,7 +18,7 @@ from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import calibration_prior
-from mrasfm_engine.mapping.incremental_mapping import map_units
+from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import Refinement, refine
 from mrasfm_engine.scene.drive import matrix_from_pose
@@ -177,14 +177,14 @@ def _adjusted(drive: SimulatedDrive, rng: np.random.Generator) -> tuple[Mapper, 
         sigma_m=np.tile(GNSS_M, (len(antenna_m), 1)),
         good=np.ones(len(antenna_m), dtype=np.bool_),
     )
-    mapper, _ = map_units(
+    mapper = map_drive(
         drive.drive,
         keypoints,
         true_matches(drive),
         None,
         EngineConfig(bundle_adjustment=settings),
         absolute=AbsolutePriors(gnss=track, antenna_in_rig_m=ANTENNA_M),
-    )
+    )[0].mapper
     return mapper, refine(mapper, AbsolutePriors(gnss=track, antenna_in_rig_m=ANTENNA_M))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from mrasfm_engine.config import EngineConfig, MappingConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.baseline_without_rig import register_images_singly, retry_missing, take_over
-from mrasfm_engine.mapping.incremental_mapping import map_units
+from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.mapper import Mapper
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
@@ -88,7 +88,7 @@ def test_without_the_set_covered_images_are_lost() -> None:
     off = {}
     for config in (ONE_BY_ONE, EngineConfig(threads=1)):
         mapper = make_model(simulated, config=config)
-        mapper, _ = map_units(simulated.drive, mapper.keypoints, true_matches(simulated), None, config)
+        mapper = map_drive(simulated.drive, mapper.keypoints, true_matches(simulated), None, config)[0].mapper
         poses = mapper.state.world_from_rig[mapper.image_unit] @ mapper.motion.unit_from_image(mapper.state)
         good = ~mapper.missing & mapper.registered[mapper.image_unit]
         true = simulated.world_from_rig[mapper.image_unit]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.dynamic_objects import MovingAlong, find_moving_along, without_keypoints
-from mrasfm_engine.mapping.incremental_mapping import MappingLog, map_units
+from mrasfm_engine.mapping.incremental_mapping import MappingLog
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import (
@@ -98,7 +99,8 @@ def test_matches_of_removed_keypoints_are_no_inliers_any_more() -> None:
 
 def mapped(simulated: SimulatedDrive) -> tuple[Mapper, MappingLog]:
     mapper = make_model(simulated)
-    return map_units(simulated.drive, mapper.keypoints, true_matches(simulated), None, EngineConfig(threads=1))
+    whole = map_drive(simulated.drive, mapper.keypoints, true_matches(simulated), None, EngineConfig(threads=1))[0]
+    return whole.mapper, whole.log
 
 
 @pytest.mark.parametrize("cameras", [(1, 4), (0, 1, 2, 4, 5)])

@@ -1,0 +1,300 @@
+"""Components: parts of a drive that grow from seeds of their own, as no unit of one sees enough of another.
+
+Darkness, glare, a tunnel, or minutes without images cut a drive. Each part is mapped by itself, and then put together
+with the others by the best knowledge that there is: images that see the same places, else positions or rough poses,
+which say where each part lies. What nothing links stays a component, metric by the rig, in a frame of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import ReconstructionError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.dynamic_objects import without_keypoints
+from mrasfm_engine.mapping.incremental_mapping import (
+    MappingLog,
+    adjust_globally,
+    cleaned_and_closed,
+    mapper_of_drive,
+    register_remaining,
+    run_incremental_mapping,
+    with_tracks_of,
+)
+from mrasfm_engine.mapping.loop_closure import MIN_SUPPORT, largest_agreement, seen_again, split_pairs
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.placement import between_poses, move, place_by_gnss, place_by_rough_poses, positions_fit
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
+from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
+
+# Two units are a seed; that a third one agrees with their points is the least that confirms it.
+MIN_UNITS = 3
+
+
+class LinkedBy(StrEnum):
+    """Knowledge by which a part of a drive is put together with another."""
+
+    IMAGES = "images"
+    POSITIONS = "GNSS positions"
+    ROUGH_POSES = "rough poses"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """A part of the drive that was put together with the larger one."""
+
+    units: Bools  # (units,) of the smaller part
+    by: LinkedBy
+
+
+@dataclass(kw_only=True)
+class Component:
+    """A part of the drive with a frame of its own.
+
+    Attributes
+    ----------
+    mapper, log
+        The scene, of whose units all others of the drive have no pose, and how it grew.
+    links
+        Parts that it was put together of, besides the one with most units.
+    """
+
+    mapper: Mapper
+    log: MappingLog
+    links: list[Link] = field(default_factory=list)
+
+    @property
+    def size(self) -> int:
+        """Number of units with a pose."""
+        return int(self.mapper.registered.sum())
+
+
+def map_drive(
+    drive: Drive,
+    keypoints: Keypoints,
+    pairs: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    config: EngineConfig,
+    *,
+    absolute: AbsolutePriors | None = None,
+    progress: CountProgress | None = None,
+    cancel: Cancel | None = None,
+) -> list[Component]:
+    """Map a whole drive: parts grow from their seeds, are put together, cleaned of what moves along, and loops closed.
+
+    Returns
+    -------
+    list of Component
+        The one with most units first.
+
+    Raises
+    ------
+    ReconstructionError
+        Where the scene cannot even begin.
+    CancelledError
+        Where `cancel` answers True.
+    """
+    near, far = split_pairs(pairs)
+    absolute = AbsolutePriors() if absolute is None else absolute
+    mapper, still = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
+    sound = without_keypoints(near, keypoints.first, still) if still.any() else near
+    log = run_incremental_mapping(
+        mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
+    )
+    grown = [Component(mapper=mapper, log=log)]
+    while config.mapping.camera_set_registration:
+        part = _another(grown, sound, prior_world_from_rig, replace(absolute), progress, cancel)
+        if part is None:
+            break
+        grown.append(part)
+    together = _put_together(grown, sound, far, prior_world_from_rig, progress, cancel)
+    result, taken = list[Component](), np.zeros(len(drive.manifest.frames), dtype=np.bool_)
+    for part in sorted(together, key=lambda part: -part.size):
+        part.mapper = cleaned_and_closed(part.mapper, part.log, near, far, still, progress=progress, cancel=cancel)
+        part.mapper.forget(np.flatnonzero(part.mapper.registered & taken))
+        if not result or part.size >= MIN_UNITS:
+            taken |= part.mapper.registered
+            result.append(part)
+    return result
+
+
+def _another(
+    grown: Sequence[Component],
+    pairs: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    absolute: AbsolutePriors,
+    progress: CountProgress | None,
+    cancel: Cancel | None,
+) -> Component | None:
+    """A part among the units that have no pose yet, from its own best seed; None where none grows.
+
+    Its calibration is the largest part's, which tells more of it: alone, a few units would change their scale.
+    """
+    largest = grown[0].mapper
+    left = largest.keyframe & ~np.any([part.mapper.registered for part in grown], axis=0)
+    own = [pair for pair in pairs if left[largest.image_unit[[pair.image_a, pair.image_b]]].all()]
+    if left.sum() < MIN_UNITS or not own:
+        return None
+    mapper = _without_poses(largest, own)
+    mapper.keyframe = left
+    if prior_world_from_rig is not None:
+        mapper.motion.follow_prior(prior_world_from_rig)
+
+    def step(done: int, total: int) -> None:
+        if progress is not None:
+            before = sum(part.size for part in grown)
+            progress(before + done, before + total)
+
+    try:
+        log = run_incremental_mapping(
+            mapper, own, prior_world_from_rig, absolute=absolute, progress=step, cancel=cancel
+        )
+    except ReconstructionError:
+        return None  # no two of these units have enough in common
+    mapper.keyframe = largest.keyframe
+    if mapper.registered.sum() < MIN_UNITS:
+        return None
+    return Component(mapper=mapper, log=log)
+
+
+def _without_poses(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
+    """A mapper of the same drive with the calibration as it is now, and tracks of some pairs."""
+    result = Mapper(mapper.drive, mapper.keypoints, build_tracks(mapper.keypoints, pairs), mapper.config)
+    known = mapper.state
+    result.state = replace(
+        result.state,
+        camera_rotation=known.camera_rotation.copy(),
+        camera_position_m=known.camera_position_m.copy(),
+        camera_params=known.camera_params.copy(),
+        camera_time_offset_s=known.camera_time_offset_s.copy(),
+    )
+    result.rig_as_begun = mapper.rig_as_begun
+    return result
+
+
+def _put_together(
+    grown: Sequence[Component],
+    near: Sequence[PairMatches],
+    far: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    progress: CountProgress | None,
+    cancel: Cancel | None,
+) -> list[Component]:
+    """Parts that anything links as one; the others as they are."""
+    result: list[Component] = []
+    for part in sorted(grown, key=lambda part: -part.size):
+        result = _with(result, part, near, far, prior_world_from_rig)
+    for whole in result:
+        if not whole.links:
+            continue
+        adjust_globally(whole.mapper, whole.log, cancel)
+        # Units that saw too little of one part alone may see enough of all.
+        register_remaining(whole.mapper, whole.log, progress=progress, cancel=cancel)
+    return result
+
+
+def _with(
+    wholes: list[Component],
+    part: Component,
+    near: Sequence[PairMatches],
+    far: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+) -> list[Component]:
+    """The parts with another one, linked to the first of them that it can be linked to."""
+    for whole in wholes:
+        whole_from_part = _by_images(whole.mapper, part, [*near, *far])
+        if whole_from_part is not None:
+            _take_in(whole, part, whole_from_part, near, LinkedBy.IMAGES)
+            return wholes
+    for whole in wholes:
+        by = _in_one_world(whole, part, prior_world_from_rig)
+        if by is not None:
+            _take_in(whole, part, np.eye(4), near, by)
+            return wholes
+    return [*wholes, part]
+
+
+def _by_images(whole: Mapper, part: Component, pairs: Sequence[PairMatches]) -> Floats | None:
+    """whole_from_part (4, 4) by units of the part that see points of the whole.
+
+    None where too few of them agree, and where positions are against it.
+    """
+    other, by_units = part.mapper, dict[tuple[int, int], list[PairMatches]]()
+    for pair in pairs:
+        u, v = int(whole.image_unit[pair.image_a]), int(whole.image_unit[pair.image_b])
+        if whole.registered[v] and other.registered[u]:
+            u, v = v, u
+        if whole.registered[u] and other.registered[v]:
+            by_units.setdefault((u, v), []).append(pair)
+    poses = other.state.world_from_rig
+    if not whole.state.simultaneous:  # the rig's motion within the part's units, which is known there
+        rows = np.flatnonzero(other.registered[whole.motion.bands.unit] & ~whole.registered[whole.motion.bands.unit])
+        whole.state.band_rotation[rows] = other.state.band_rotation[rows]
+        whole.state.band_position_m[rows] = other.state.band_position_m[rows]
+    tried = (seen_again(whole, u, v, own, current=poses[v]) for (u, v), own in sorted(by_units.items()))
+    seen = [revisit for revisit in tried if revisit is not None]
+    agreeing = largest_agreement(whole, other, seen)
+    if len(agreeing) < MIN_SUPPORT:
+        return None
+    centre_m = other.state.unit_position_m[[revisit.later for revisit in agreeing]].mean(axis=0)
+    drifts = np.stack([revisit.drift for revisit in agreeing])
+    rotation = robust_mean_rotation(drifts[:, :3, :3])
+    result = se3.transform(rotation, geometric_median(se3.apply(drifts, centre_m[None])[:, 0]) - rotation @ centre_m)
+    known = part.log.absolute.placement
+    if known is not None and known.prior is not None and not positions_fit(other, known, result):
+        return None
+    return result
+
+
+def _in_one_world(whole: Component, part: Component, prior_world_from_rig: Floats | None) -> LinkedBy | None:
+    """Move the part to where positions or rough poses say that it lies in the whole's world, which they tell as well.
+
+    A part too short to be turned by its own positions stands as the prior trajectory does; its positions must fit.
+    """
+    absolute = part.log.absolute
+    if whole.log.absolute.positions is not None and absolute.gnss is not None:
+        assert absolute.antenna_in_rig_m is not None
+        known = whole.log.absolute.placement
+        assert known is not None
+        own = place_by_gnss(part.mapper, absolute.gnss, absolute.antenna_in_rig_m)
+        if own.prior is None and prior_world_from_rig is not None:
+            _move_to_prior(part.mapper, prior_world_from_rig)
+        return LinkedBy.POSITIONS if positions_fit(part.mapper, known) else None
+    sigma, rough = part.mapper.drive.manifest.rough_poses, absolute.rough_world_from_rig
+    if rough is not None and sigma is not None and part.mapper.config.bundle_adjustment.priors:
+        both = all(place_by_rough_poses(one.mapper, rough, sigma.sigma_translation_m) for one in (whole, part))
+        return LinkedBy.ROUGH_POSES if both else None
+    return None
+
+
+def _move_to_prior(mapper: Mapper, prior_world_from_rig: Floats) -> None:
+    units = np.flatnonzero(mapper.registered & np.isfinite(prior_world_from_rig[:, 0, 3]))
+    if len(units):
+        move(mapper, between_poses(prior_world_from_rig[units], mapper.state.world_from_rig[units]))
+
+
+def _take_in(
+    whole: Component, part: Component, whole_from_part: Floats, pairs: Sequence[PairMatches], by: LinkedBy
+) -> None:
+    """Give the whole the part's units, and points from all."""
+    mapper, other = whole.mapper, part.mapper
+    poses = whole_from_part @ other.state.world_from_rig
+    for unit in np.flatnonzero(other.registered).tolist():
+        mapper.set_pose(unit, poses[unit])
+        whole.log.failures.pop(unit, None)
+    mapper.missing |= other.missing
+    images = np.flatnonzero(other.motion.own_poses[0])
+    if len(images):
+        mapper.set_image_poses(images, other.motion.own_poses[1][images])
+    whole.mapper = with_tracks_of(mapper, pairs)
+    whole.links.append(Link(units=other.registered.copy(), by=by))
+    whole.log.registrations += part.log.registrations
