@@ -390,7 +390,7 @@ def mapping(
             for name, array in part.mapper.to_arrays().items()
         }
         return arrays, {
-            **mapping_report.describe(parts[0].mapper, parts[0].log),
+            **mapping_report.describe(parts[0].mapper, parts[0].log, [part.mapper for part in parts[1:]]),
             **gaps.describe(parts),
             "findings": [as_json(finding) for finding in gaps.findings(parts)],
         }

@@ -6,8 +6,9 @@ import argparse
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rich.console import Console
 
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
+from schemas.artifacts import component_folder
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -70,9 +72,12 @@ def cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
 def _say(report: dict[str, Any], out: Path) -> None:
     stages = {stage["stage"]: stage for stage in report["stages"]}
     mapping, refinement = stages["mapping"], stages["refinement"]
-    units = mapping["registered_units"] + len(mapping["units_not_registered"])
+    others = mapping["components"][1:]
+    units = mapping["registered_units"] + len(mapping["units_not_registered"]) + sum(other["units"] for other in others)
     print(f"Scene: {out}")
     print(f"  units registered: {mapping['registered_units']} of {units}")
+    for number, other in enumerate(others, start=1):
+        print(f"  component {number}:      {other['units']} units, {out / component_folder(number)}")
     print(f"  points:           {refinement['points']} in {out / 'points.ply'}")
     if refinement["georeferenced"]:
         gnss = refinement["gnss"]
@@ -91,8 +96,17 @@ def _say(report: dict[str, Any], out: Path) -> None:
         print(f"  occluded:         {camera} in {images} images, by something that moves along")
     for finding in report["findings"]:
         print(f"  {finding['severity']}: {finding['what']}")
-    for missing in mapping["units_not_registered"]:
-        print(f"  not registered: frame {missing['source_frame']}: {missing['reason']}")
+    for frames, reason in _missing(mapping["units_not_registered"]):
+        print(f"  not registered:   {frames}: {reason}")
+
+
+def _missing(units: Sequence[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+    """Frames without a pose and why, those that follow one another with the same reason at once."""
+    # A unit's number less its place in the list is the same as long as units follow one another.
+    runs = groupby(enumerate(units), key=lambda item: (item[1]["unit"] - item[0], item[1]["reason"]))
+    for (_, reason), members in runs:
+        frames = [unit["source_frame"] for _, unit in members]
+        yield f"frame {frames[0]}" if len(frames) == 1 else f"frames {frames[0]} to {frames[-1]}", reason
 
 
 def _verdicts(calibration: dict[str, Any]) -> list[str]:

@@ -79,11 +79,11 @@ def write_scene(
         check_scene(one)
     needed = sum(map(_size_bytes, scenes)) + picture_files.size_bytes(pictures)
     with publishing(out, needed, replaced=(PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER)) as work:
+        _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
         for number, (other, own_report) in enumerate(components, start=1):
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
             _write(other, folder, own_report, NO_PICTURES)
-        _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
 
 
 def summary(scene: Scene) -> dict[str, Any]:

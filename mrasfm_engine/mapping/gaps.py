@@ -1,4 +1,4 @@
-"""What a mapped drive lacks: units without a pose, and parts that no image links to the others."""
+"""Gaps of a mapped drive: units without a pose, and parts that no image links to the others."""
 
 from __future__ import annotations
 

@@ -27,19 +27,19 @@ from schemas.findings import Finding
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
 
-def describe(mapper: Mapper, log: MappingLog) -> dict[str, Any]:
-    """Counts of the incremental loop, and what was rejected and why."""
+def describe(mapper: Mapper, log: MappingLog, others: Sequence[Mapper] = ()) -> dict[str, Any]:
+    """Counts of the incremental loop, and what was rejected and why.
+
+    Units that `others` have registered, components of the same drive, are not missing.
+    """
     frames = mapper.drive.manifest.frames
     covered, poor = _covered(mapper, log), _poorly_seen(mapper)
     unclear = Counter(name for r in log.registrations for name in r.unclear)
     start = log.initialisation
+    known = np.any([mapper.registered, *(other.registered for other in others)], axis=0)
     missing = [
-        {
-            "unit": int(u),
-            "source_frame": frames[u].source_frame,
-            "reason": log.failures[int(u)].reason if int(u) in log.failures else "it sees no point of the scene",
-        }
-        for u in np.flatnonzero(~mapper.registered & mapper.keyframe)
+        {"unit": int(u), "source_frame": frames[u].source_frame, "reason": _why_missing(mapper, log, int(u))}
+        for u in np.flatnonzero(~known & mapper.keyframe)
     ]
     return {
         "initial_units": None if start is None else list(start.units),
@@ -66,6 +66,16 @@ def describe(mapper: Mapper, log: MappingLog) -> dict[str, Any]:
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
         "road_points_dropped": [0 if isinstance(j, str) else int((~j.is_inlier).sum()) for j in log.roads],
     }
+
+
+def _why_missing(mapper: Mapper, log: MappingLog, unit: int) -> str:
+    if unit in log.failures:
+        return log.failures[unit].reason
+    keypoints = int(np.count_nonzero(mapper.keypoints.unit == unit))
+    least = mapper.config.mapping.min_pnp_inliers
+    if keypoints < least:
+        return f"its images have {keypoints} keypoints, {least} are needed"
+    return "it sees no point of the scene"
 
 
 def _covered(mapper: Mapper, log: MappingLog) -> list[dict[str, Any]]:

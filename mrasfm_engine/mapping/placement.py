@@ -154,7 +154,7 @@ def reassess_positions(
 
 
 def positions_fit(mapper: Mapper, placement: Placement, world_from_model: Floats | None = None) -> bool:
-    """Whether measured positions have the shape of the registered units' trajectory, and lie where that does.
+    """True where measured positions have the shape of the registered units' trajectory, and lie where that does.
 
     Parameters
     ----------

@@ -32,8 +32,8 @@ def corrupt(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, change: Any
 
 
 def shift_json(key: list[Any]) -> Any:
-    def change(original: Any, scene: Scene) -> Any:
-        document = original(scene)
+    def change(original: Any, scene: Scene, *args: Any) -> Any:
+        document = original(scene, *args)
         place = document
         for part in key[:-1]:
             place = place[part]

@@ -20,6 +20,7 @@ from mrasfm_engine.errors import MrasfmError, StorageError
 from mrasfm_engine.export import comparisons, feature_database, picture_files, ply, publishing, readers
 from mrasfm_engine.export.calibration import calibration_document, document_in_map
 from mrasfm_engine.export.feature_database import write_features, write_matches
+from mrasfm_engine.export.pose_files import poses_document
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.images import read_image_rgb
@@ -339,6 +340,20 @@ def test_a_report_that_is_not_finite_is_refused(scene: Scene, tmp_path: Path) ->
     with pytest.raises(MrasfmError, match=r"report\.json"):
         write_scene(scene, tmp_path / "scene", {"figure": float("nan")})
     assert_nothing_published(tmp_path / "scene")
+
+
+def test_components_are_scenes_inside_the_scene(scene: Scene, tmp_path: Path) -> None:
+    out, other = tmp_path / "scene", make_scene(georeferenced=False)
+    missing = int(np.flatnonzero(~scene.unit_registered)[0])
+    seen = np.arange(len(scene.unit_registered)) == missing
+    write_scene(scene, out, {"run": 1}, components=[(other, {"component": 1})])
+    assert load(out / "components" / "1" / "report.json")["component"] == 1
+    assert {p.name for p in (out / "components" / "1").iterdir()} == FILES
+    assert pycolmap.Reconstruction(str(out / "components" / "1" / "model")).is_valid()
+    document = poses_document(scene, [seen])
+    assert [unit.get("component") for unit in document["units"]] == [1 if one else None for one in seen]
+    write_scene(scene, out, {"run": 2})
+    assert {p.name for p in out.iterdir()} == FILES  # what an earlier run left is gone
 
 
 def test_writing_again_replaces_the_scene_and_keeps_other_files(scene: Scene, tmp_path: Path) -> None:

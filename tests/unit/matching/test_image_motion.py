@@ -121,3 +121,13 @@ def test_pairs_far_along_the_path_are_revisits() -> None:
     one = PairMatches(image_a=0, image_b=1, matches=np.zeros((1, 2), np.int32), inliers=np.ones(1, dtype=np.bool_))
     pairs = [replace(one, image_b=b) for b in (1, 4, 10, 30)]
     assert [pair.is_revisit for pair in choice.with_revisits(pairs)] == [False, False, False, True]
+
+
+def test_units_that_show_nothing_are_passed_over() -> None:
+    usable = np.ones(12, dtype=np.bool_)
+    usable[3:9] = False
+    ahead = following_units(np.arange(12.0), spacing_m=1.5, count=3, usable=usable)
+    assert ahead[2].tolist() == [9, 10]
+    assert ahead[1].tolist() == [2, 9, 11]
+    assert ahead[5].tolist() == [9, 10]
+    assert not set(np.concatenate(ahead).tolist()) & set(range(3, 9))

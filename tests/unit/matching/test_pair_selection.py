@@ -228,3 +228,15 @@ def test_without_selection_all_images_of_near_units_are_paired() -> None:
     assert {(int(a), int(b)) for a, b in pairs} == expected
     # Also cameras that look in opposite directions, which the selection leaves out.
     assert set(map(tuple, pairs_from_window(drive, PairConfig(window_units=2)).tolist())) < expected
+
+
+def test_grey_images_do_not_cut_the_drive() -> None:
+    drive, config = drive_of(2, 14), PairConfig()
+    unit = np.array([image.unit for image in drive.images])
+    usable = (unit < 4) | (unit > 9)
+    by_motion = pairs_by_motion(drive, config, motion_unknown(drive, config), usable=usable)
+    for pairs in (by_motion, pairs_from_poses(drive, straight_road(14), config, usable)):
+        assert usable[pairs].all()
+        units = np.sort(unit[pairs], axis=1)
+        across = units[(units[:, 0] < 4) & (units[:, 1] > 9)]
+        assert {tuple(row) for row in across.tolist()} >= {(3, 10), (3, 11), (2, 10)}
