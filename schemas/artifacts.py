@@ -65,7 +65,8 @@ def seam_checkpoint(a: str, b: str) -> str:
 
 def is_read_by_aggregation(path: str) -> bool:
     """Return whether an aggregation reads this file of a scene."""
-    return not path.startswith((f"{PICTURES_FOLDER}/", f"{OWN_CAR_FOLDER}/", f"{TEXT_MODEL_FOLDER}/"))
+    unread = (PICTURES_FOLDER, OWN_CAR_FOLDER, TEXT_MODEL_FOLDER, COMPONENTS_FOLDER)
+    return not path.startswith(tuple(f"{folder}/" for folder in unread))
 
 
 def is_read_by_next_version(path: str) -> bool:

@@ -29,6 +29,7 @@
 | 25 | the own car in images without masks, rendered and real; a bar with the time over a fifth of all images |
 | 26 | traffic without masks: tracks on vehicles that move, and those of the street |
 | 27 | the road's picture of the best views: markings against the painted ones |
+| 28 | a real drive with grey images: parts that images, positions or nothing links |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -59,6 +60,7 @@ from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fresh_clone import fresh_clone
+from tests.benchmarks.gaps import gaps
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
 from tests.benchmarks.moving_objects import moving_objects
@@ -122,6 +124,7 @@ LINES = {
     "25": Line(untimed=(real_own_car,), by_seed=(rendered_own_car, bar_with_time)),
     "26": Line(by_seed=(moving_objects,)),
     "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
+    "28": Line(untimed=(gaps,)),
 }
 
 
