@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import ReconstructionError
@@ -34,7 +36,7 @@ from mrasfm_engine.mapping.placement import between_poses, move, place_by_gnss, 
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
-from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
+from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats, Ints
 
 # Two units are a seed; that a third one agrees with their points is the least that confirms it.
 MIN_UNITS = 3
@@ -111,11 +113,8 @@ def map_drive(
         mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
     )
     grown = [Component(mapper=mapper, log=log)]
-    while config.mapping.camera_set_registration:
-        part = _another(grown, sound, prior_world_from_rig, replace(absolute), progress, cancel)
-        if part is None:
-            break
-        grown.append(part)
+    if config.mapping.camera_set_registration:
+        _grow_others(grown, sound, prior_world_from_rig, absolute, progress, cancel)
     together = _put_together(grown, sound, far, prior_world_from_rig, progress, cancel)
     result, taken = list[Component](), np.zeros(len(drive.manifest.frames), dtype=np.bool_)
     for part in sorted(together, key=lambda part: -part.size):
@@ -127,7 +126,41 @@ def map_drive(
     return result
 
 
-def _another(
+def _grow_others(
+    grown: list[Component],
+    pairs: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    absolute: AbsolutePriors,
+    progress: CountProgress | None,
+    cancel: Cancel | None,
+) -> None:
+    """Grow parts among the units that have no pose yet, each from its own best seed, until none grows any more."""
+    mapper = grown[0].mapper
+    ends = np.array([(pair.image_a, pair.image_b) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    units = mapper.image_unit[ends]
+    left = mapper.keyframe & ~mapper.registered
+    while (group := _largest_group(units, left)) is not None:
+        own = [pair for pair, inside in zip(pairs, group[units].all(axis=1), strict=True) if inside]
+        part = _grown_in(group, grown, own, prior_world_from_rig, replace(absolute), progress, cancel)
+        if part is None:
+            left &= ~group  # nothing grows there
+        else:
+            grown.append(part)
+            left &= ~part.mapper.registered
+
+
+def _largest_group(pair_units: Ints, left: Bools) -> Bools | None:
+    """The most of the units `left` (u,) that pairs (n, 2) hold together; None where these are too few for a part."""
+    rows = pair_units[left[pair_units].all(axis=1)]
+    links = coo_matrix((np.ones(len(rows)), (rows[:, 0], rows[:, 1])), shape=(len(left), len(left)))
+    label = connected_components(links, directed=False)[1]
+    most = int(np.bincount(label[left], minlength=1).argmax())
+    group: Bools = left & (label == most)
+    return group if group.sum() >= MIN_UNITS else None
+
+
+def _grown_in(
+    group: Bools,
     grown: Sequence[Component],
     pairs: Sequence[PairMatches],
     prior_world_from_rig: Floats | None,
@@ -135,17 +168,13 @@ def _another(
     progress: CountProgress | None,
     cancel: Cancel | None,
 ) -> Component | None:
-    """A part among the units that have no pose yet, from its own best seed; None where none grows.
+    """A part among a group of units (u,), from its best seed; None where none grows.
 
     Its calibration is the largest part's, which tells more of it: alone, a few units would change their scale.
     """
     largest = grown[0].mapper
-    left = largest.keyframe & ~np.any([part.mapper.registered for part in grown], axis=0)
-    own = [pair for pair in pairs if left[largest.image_unit[[pair.image_a, pair.image_b]]].all()]
-    if left.sum() < MIN_UNITS or not own:
-        return None
-    mapper = _without_poses(largest, own)
-    mapper.keyframe = left
+    mapper = _without_poses(largest, pairs)
+    mapper.keyframe = group
     if prior_world_from_rig is not None:
         mapper.motion.follow_prior(prior_world_from_rig)
 
@@ -156,14 +185,18 @@ def _another(
 
     try:
         log = run_incremental_mapping(
-            mapper, own, prior_world_from_rig, absolute=absolute, progress=step, cancel=cancel
+            mapper,
+            pairs,
+            prior_world_from_rig,
+            absolute=absolute,
+            calibration_held=True,
+            progress=step,
+            cancel=cancel,
         )
     except ReconstructionError:
         return None  # no two of these units have enough in common
     mapper.keyframe = largest.keyframe
-    if mapper.registered.sum() < MIN_UNITS:
-        return None
-    return Component(mapper=mapper, log=log)
+    return Component(mapper=mapper, log=log) if mapper.registered.sum() >= MIN_UNITS else None
 
 
 def _without_poses(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:

@@ -38,10 +38,10 @@ def findings(parts: Sequence[Component]) -> list[Finding]:
         result.append(
             error(
                 "drive-in-components",
-                f"nothing links all parts of the drive: besides the scene's {parts[0].size} units, "
-                f"{listed(others)} are components in frames of their own",
+                f"nothing links all parts of the drive: besides the scene's {parts[0].size} units there are components "
+                f"of {listed(others)} in frames of their own",
                 "Look at the images between them (dark, covered, or missing?). GNSS or rough poses put parts together "
-                "that share no view. The others lie in components/N; an aggregation with other drives may join them.",
+                "that share no view. The others lie in components/N.",
             )
         )
     apart = [link for link in parts[0].links if link.by != LinkedBy.IMAGES]

@@ -165,3 +165,17 @@ def test_a_drive_in_one_piece_has_no_finding(simulated: SimulatedDrive) -> None:
 def test_spans_of_units() -> None:
     assert gaps.spans(np.array([1, 1, 0, 1, 0, 0, 1], dtype=np.bool_)) == [(0, 1), (3, 3), (6, 6)]
     assert gaps.spans(np.zeros(3, dtype=np.bool_)) == []
+
+
+def test_a_group_without_a_scene_does_not_keep_others_from_growing(simulated: SimulatedDrive) -> None:
+    """Units 2 to 5 match one another alone, and in a way that no pose explains."""
+    pairs = without_dark(simulated, true_matches(simulated))
+    rng = np.random.default_rng(0)
+    nonsense = [
+        replace(pair, matches=np.stack([pair.matches[:, 0], rng.permutation(pair.matches[:, 1])], 1))
+        for pair in true_matches(simulated, window=8)
+        if units_of(simulated, pair) <= set(range(2, 6))
+    ]
+    kept = [pair for pair in pairs if not units_of(simulated, pair) & set(range(2, 6))]
+    parts = mapped(simulated, [*kept, *nonsense])
+    assert [registered(part) for part in parts] == [list(range(DARK.stop, UNITS)), list(range(6, DARK.start))]
