@@ -140,7 +140,8 @@ def _grow_others(
     units = mapper.image_unit[ends]
     left = mapper.keyframe & ~mapper.registered
     while (group := _largest_group(units, left)) is not None:
-        own = [pair for pair, inside in zip(pairs, group[units].all(axis=1), strict=True) if inside]
+        inside = np.asarray(group[units].all(axis=1))
+        own = [pair for pair, chosen in zip(pairs, inside, strict=True) if chosen]
         part = _grown_in(group, grown, own, prior_world_from_rig, replace(absolute), progress, cancel)
         if part is None:
             left &= ~group  # nothing grows there
