@@ -225,7 +225,9 @@ def _put_together(
 ) -> list[Component]:
     """Parts that anything links as one; the others as they are."""
     result: list[Component] = []
-    for part in sorted(grown, key=lambda part: -part.size):
+    ordered = sorted(grown, key=lambda part: -part.size)
+    ordered[0].log.calibration_held = False
+    for part in ordered:
         result = _with(result, part, near, far, prior_world_from_rig)
     for whole in result:
         if not whole.links:
@@ -260,9 +262,12 @@ def _with(
 def _by_images(whole: Mapper, part: Component, pairs: Sequence[PairMatches]) -> Floats | None:
     """whole_from_part (4, 4) by units of the part that see points of the whole.
 
-    None where too few of them agree, and where positions are against it.
+    None where too few of them agree, where positions are against it, and for one camera, whose scale is arbitrary in
+    each part unless positions tell it.
     """
     other, by_units = part.mapper, dict[tuple[int, int], list[PairMatches]]()
+    if whole.drive.has_single_camera and part.log.absolute.positions is None:
+        return None
     for pair in pairs:
         u, v = int(whole.image_unit[pair.image_a]), int(whole.image_unit[pair.image_b])
         if whole.registered[v] and other.registered[u]:
