@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
@@ -66,7 +66,7 @@ def mapped(threads: int, work: Callable[[Item], Result], items: Sequence[Item]) 
         yield from _pool(threads).map(work, items[begin : begin + BATCH])
 
 
-def in_order(threads: int, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+def in_order(threads: int, work: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result]:
     """Results of long work in the items' order, in threads of its own; `IN_FLIGHT` items of a thread are under way.
 
     Closing the iterator waits for the work that has begun, and does no more.

@@ -53,6 +53,8 @@ from schemas.findings import as_json
 Result = TypeVar("Result")
 
 PROBE_UNITS = 5
+PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit")
+WINDOW_PAIRS = 4096  # written at once: some megabytes, with nearly nothing for headers
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
 VERSIONS = {Stage.FEATURES: 4, Stage.MATCHES: 5, Stage.MAPPING: 8}
@@ -303,7 +305,7 @@ def _unpack_own_cars(stage: StoredStage) -> list[Bools | None]:
 def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> list[PairMatches]:
     """Candidate pairs by the prior (or by window and similarity), matched and verified."""
 
-    def work() -> tuple[Arrays, dict[str, Any]]:
+    def work(stage: StageWriter) -> dict[str, Any]:
         chosen = PairChoice(run.drive, found, known, run.config)
         result = match_pairs(
             run.drive,
@@ -320,7 +322,8 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
         )
         names = [camera.name for camera in run.drive.cameras]
         contradicted = contradiction(names, run.drive.rig_from_cam, result.rig)
-        return pack_pairs(chosen.with_revisits(result.pairs)), {
+        _write_pairs(stage, chosen.with_revisits(result.pairs))
+        return {
             "candidate_pairs": result.candidates,
             "verified_pairs": len(result.pairs) - result.against_calibration,
             "rejected_pairs": {
@@ -348,7 +351,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
     priors = {"refine_calibration", "sigma_rotation_deg", "sigma_translation_m"}
     settings.append(run.config.bundle_adjustment.model_dump(include=priors))
     settings.append({"use_gnss": run.config.use_gnss, "models": run.components.fingerprint_of("matcher")})
-    arrays, report = run.stage(Stage.MATCHES, settings, work)
+    stage, report = run.large_stage(Stage.MATCHES, settings, work)
     if report["contradiction"] is not None:
         run.report["findings"].append(report["contradiction"])
     if not report["verified_pairs"]:
@@ -357,7 +360,24 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             remedy="Check that consecutive frames show the same scene, and that images are sharp and not mixed up.",
             code="nothing-matches",
         )
-    return unpack_pairs(arrays)
+    return _read_pairs(stage)
+
+
+def _write_pairs(stage: StageWriter, pairs: Sequence[PairMatches]) -> None:
+    """Write matches window by window, so that they are not in memory twice."""
+    first = range(0, len(pairs), WINDOW_PAIRS)
+    stage.add("windows", np.array(len(first), dtype=np.int64))
+    for window, begin in enumerate(first):
+        for name, array in pack_pairs(pairs[begin : begin + WINDOW_PAIRS]).items():
+            stage.add(f"{name}.{window}", array)
+
+
+def _read_pairs(stage: StoredStage) -> list[PairMatches]:
+    return [
+        pair
+        for window in range(int(stage.read("windows")))
+        for pair in unpack_pairs({name: stage.read(f"{name}.{window}") for name in PAIR_ARRAYS})
+    ]
 
 
 def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:

@@ -139,8 +139,9 @@ class StoredStage:
         return name in self._members
 
     def read(self, name: str) -> NDArray[Any]:
-        """A whole array."""
-        return self.rows(name, 0, None)
+        """A whole array, as `rows` reads it."""
+        shape = self._members[name].shape
+        return self.rows(name, 0, None) if shape else self._read_at(name, shape, 0)
 
     def rows(self, name: str, first: int, stop: int | None) -> NDArray[Any]:
         """Rows of an array, read anew at every call and from any thread.
@@ -150,10 +151,13 @@ class StoredStage:
         StorageError
             Where they cannot be read.
         """
+        shape = self._members[name].shape
+        return self._read_at(name, ((shape[0] if stop is None else stop) - first, *shape[1:]), first)
+
+    def _read_at(self, name: str, shape: tuple[int, ...], first: int) -> NDArray[Any]:
         member = self._members[name]
-        stop = member.shape[0] if stop is None else stop
-        result = np.empty((stop - first, *member.shape[1:]), member.dtype)
-        row_bytes = member.dtype.itemsize * int(np.prod(member.shape[1:], dtype=np.int64))
+        result = np.empty(shape, member.dtype)
+        row_bytes = member.dtype.itemsize * int(np.prod(shape[1:], dtype=np.int64))
         into, at = result.reshape(-1).view(np.uint8).data, member.offset + first * row_bytes
         try:
             while len(into):
