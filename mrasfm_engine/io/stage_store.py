@@ -250,7 +250,7 @@ def _header(archive: zipfile.ZipFile) -> dict[str, Any]:
 
 
 def _member(archive: zipfile.ZipFile, file: BinaryIO, name: str) -> _Member:
-    """Where an uncompressed array lies. The lengths of name and extra field stand at bytes 26 and 28 of what the
+    """Find an uncompressed array in the file. The lengths of name and extra field stand at bytes 26 and 28 of what the
     archive keeps in front of a member, 30 bytes and these two (section 4.3.7 of the format's description).
     """
     info = archive.getinfo(name)

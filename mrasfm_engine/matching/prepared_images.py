@@ -62,7 +62,7 @@ class PreparedImages:
 
 
 def images_at_once(pairs: Ints, unit: Ints, threads: int) -> int:
-    """How many images are gone back to while pairs (n, 2) come in the order of their first images.
+    """Number of images that are gone back to while pairs (n, 2) come in the order of their first images.
 
     From one unit to the next they are the images of both and their partners; the pairs that are under way have two
     each. So the number follows from the window that pairs are chosen in, and not from the length of the drive.
