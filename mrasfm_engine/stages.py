@@ -39,13 +39,15 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_traje
 from mrasfm_engine.matching.simultaneous import contradiction
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
+from mrasfm_engine.preflight.standing import Standing, find_standing, without_standing
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import CLASS_NAMES, count_classes
+from mrasfm_engine.scene.standing_units import with_standing_units
 from mrasfm_engine.triangulation.tracks import Keypoints
-from mrasfm_engine.types import Bools, CountProgress, StageProgress
+from mrasfm_engine.types import Bools, CountProgress, Ints, StageProgress
 from mrasfm_engine.visualization.pictures import draw_pictures
 from schemas.artifacts import CHECKPOINT_FOLDER, Stage
 from schemas.findings import as_json
@@ -53,6 +55,7 @@ from schemas.findings import as_json
 Result = TypeVar("Result")
 
 PROBE_UNITS = 5
+STANDING, STANDING_VERSION = "standing", 1
 PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit")
 WINDOW_PAIRS = 4096  # written at once: some megabytes, with nearly nothing for headers
 # Raise a stage's version with every change after which the same input and settings give another result: what was
@@ -73,6 +76,8 @@ class Run:
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
     own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once its images were looked at
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
+    standing: Standing | None = None  # where units are left out: which, and the drive with all of them
+    whole_drive: Drive | None = None
 
     @cached_property
     def components(self) -> Components:
@@ -188,6 +193,80 @@ def prior(run: Run) -> PriorTrajectory:
         "gnss_samples": 0 if result.gnss is None else len(result.gnss.good),
         "gnss_gross_errors": 0 if result.gnss is None else int((~result.gnss.good).sum()),
     }
+    return result
+
+
+def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
+    """Leave out units between the first and the last of each stop; the prior trajectory of those that are kept.
+
+    The run goes on with the drive of these, until `all_units`.
+    """
+    if not run.config.mapping.keyframe_motion_px or len(run.drive.timestamps_us) < 3:
+        return known
+    of_prior = [run.config.gnss.model_dump(), run.config.use_gnss]
+    key = fingerprint(run.drive_key, STANDING, run.config.mapping.keyframe_motion_px, of_prior, STANDING_VERSION)
+    if (stored := run.store.load(STANDING, key)) is not None:
+        kept, moved_px, compared = (stored[0][name] for name in ("kept", "moved_px", "compared"))
+        standing = Standing(kept=kept, moved_px=moved_px, compared=int(compared))
+    else:
+        standing = find_standing(
+            run.drive,
+            known,
+            min_motion_px=run.config.mapping.keyframe_motion_px,
+            threads=run.config.threads,
+            cancel=run.cancel,
+        )
+    if standing.kept.all():
+        return known
+    if stored is None:
+        arrays = {"kept": standing.kept, "moved_px": standing.moved_px, "compared": np.array(standing.compared)}
+        run.store.save(STANDING, key, arrays, {})
+    run.standing, run.whole_drive = standing, run.drive
+    run.key = fingerprint(run.drive_key, standing.kept.tolist())
+    run.drive = without_standing(run.drive, standing.kept)
+    return prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
+
+
+def all_units(run: Run, result: Scene) -> Scene:
+    """The scene with the units that `leave_out_standing` left out, and the report in the drive's own units."""
+    standing, drive = run.standing, run.whole_drive
+    if standing is None or drive is None:
+        return result
+    result, stops = with_standing_units(result, drive, standing.kept, standing.moved_px)
+    run.drive = drive
+    run.report["stages"] = [in_units(stage, np.flatnonzero(standing.kept)) for stage in run.report["stages"]]
+    frames = drive.manifest.frames
+    run.report["standing"] = {
+        "units": int((~standing.kept).sum()),
+        "units_compared": standing.compared,
+        "stops": [
+            {
+                "first_unit": stop.first,
+                "last_unit": stop.last,
+                "first_source_frame": frames[stop.first].source_frame,
+                "last_source_frame": frames[stop.last].source_frame,
+                "units_between": stop.last - stop.first - 1,
+                "images_moved_at_most_px": round(float(standing.moved_px[stop.first + 1 : stop.last].max()), 3),
+                "posed": bool(result.unit_registered[stop.first + 1]),
+                "sigma_at_most_m": float(stop.sigma_m.max()) if np.isfinite(stop.sigma_m).all() else None,
+            }
+            for stop in stops
+        ],
+    }
+    return result
+
+
+def in_units(report: Any, unit_of: Ints) -> Any:
+    """A report with other numbers of its units: unit k of it becomes `unit_of[k]`."""
+    if isinstance(report, list):
+        return [in_units(part, unit_of) for part in report]
+    if not isinstance(report, dict):
+        return report
+    result = {name: in_units(value, unit_of) for name, value in report.items()}
+    if isinstance(report.get("unit"), int):
+        result["unit"] = int(unit_of[report["unit"]])
+    if report.get("initial_units") is not None:
+        result["initial_units"] = [int(unit_of[unit]) for unit in report["initial_units"]]
     return result
 
 
