@@ -197,7 +197,7 @@ def prior(run: Run) -> PriorTrajectory:
 
 
 def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
-    """Leave out units between the first and the last of each stop; the prior trajectory of those that are kept.
+    """Leave out units between the first and the last of each stop; the prior trajectory of all others.
 
     The run goes on with the drive of these, until `all_units`.
     """
@@ -206,8 +206,8 @@ def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
     of_prior = [run.config.gnss.model_dump(), run.config.use_gnss]
     key = fingerprint(run.drive_key, STANDING, run.config.mapping.keyframe_motion_px, of_prior, STANDING_VERSION)
     if (stored := run.store.load(STANDING, key)) is not None:
-        kept, moved_px, compared = (stored[0][name] for name in ("kept", "moved_px", "compared"))
-        standing = Standing(kept=kept, moved_px=moved_px, compared=int(compared))
+        included, moved_px, compared = (stored[0][name] for name in ("included", "moved_px", "compared"))
+        standing = Standing(included=included, moved_px=moved_px, compared=int(compared))
     else:
         standing = find_standing(
             run.drive,
@@ -216,14 +216,14 @@ def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
             threads=run.config.threads,
             cancel=run.cancel,
         )
-    if standing.kept.all():
+    if standing.included.all():
         return known
     if stored is None:
-        arrays = {"kept": standing.kept, "moved_px": standing.moved_px, "compared": np.array(standing.compared)}
+        arrays = {"included": standing.included, "moved_px": standing.moved_px, "compared": np.array(standing.compared)}
         run.store.save(STANDING, key, arrays, {})
     run.standing, run.whole_drive = standing, run.drive
-    run.key = fingerprint(run.drive_key, standing.kept.tolist())
-    run.drive = without_standing(run.drive, standing.kept)
+    run.key = fingerprint(run.drive_key, standing.included.tolist())
+    run.drive = without_standing(run.drive, standing.included)
     return prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
 
 
@@ -232,12 +232,12 @@ def all_units(run: Run, result: Scene) -> Scene:
     standing, drive = run.standing, run.whole_drive
     if standing is None or drive is None:
         return result
-    result, stops = with_standing_units(result, drive, standing.kept, standing.moved_px)
+    result, stops = with_standing_units(result, drive, standing.included, standing.moved_px)
     run.drive = drive
-    run.report["stages"] = [in_units(stage, np.flatnonzero(standing.kept)) for stage in run.report["stages"]]
+    run.report["stages"] = [in_units(stage, np.flatnonzero(standing.included)) for stage in run.report["stages"]]
     frames = drive.manifest.frames
     run.report["standing"] = {
-        "units": int((~standing.kept).sum()),
+        "units": int((~standing.included).sum()),
         "units_compared": standing.compared,
         "stops": [
             {

@@ -1,13 +1,13 @@
 """Units of a standing car, found in small images before anything is extracted.
 
-A minute at a red light is hundreds of units that show the same. The first and the last unit of a stop are kept, those
-between take no part in the reconstruction and get their poses from these two (see `scene.standing_units`).
+A minute at a red light is hundreds of units that show the same. Of a stop the first and the last unit are included,
+those between take no part in the reconstruction and get their poses from these two (see `scene.standing_units`).
 
-Each unit is compared with the last one that was kept, so that the steps of a creeping car add up. An image is divided
-into blocks, and each block's displacement follows from its gradients and its change (Lucas and Kanade, IJCAI 1981),
-where a change of exposure is allowed. A camera moved as the median of its blocks did: traffic covers less than half of
-most images. The car moved where more than half of the cameras did: a lorry beside it fills the cameras of one side.
-Where the prior trajectory shows motion no image is read.
+Each unit is compared with the last one that moved, so that the steps of a creeping car add up. An image is divided into
+blocks, and each block's displacement follows from its gradients and its change (Lucas and Kanade, IJCAI 1981), where a
+change of exposure is allowed. A camera moved as the median of its blocks did: traffic covers less than half of most
+images. The car moved where more than half of the cameras did: a lorry beside it fills the cameras of one side. Where
+the prior trajectory shows motion no image is read.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -30,6 +31,7 @@ from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import Bools, Cancel, Floats, Floats32
 
 REDUCED = 8  # times smaller: libjpeg then decodes one value of a block; noise averages out
+SMOOTHING_PX = 1.0  # sigma: of finer detail the difference of two neighbours is less than the gradient
 BLOCK_PX = 8  # side of a block in the reduced image
 # Grey levels: a sensor's noise in daylight is about 4 levels, an eighth of which is left, and rounding adds to it.
 SIGMA_GREY = 1.0
@@ -50,23 +52,23 @@ class Standing:
 
     Attributes
     ----------
-    kept
+    included
         (units,) those that are reconstructed; the others stand between two of them.
     moved_px
-        (units,) how far a unit that is not kept moved against the one kept before it, at full size: in the camera that
-        moved most, but for cameras that show something else; NaN for units that are kept.
+        (units,) how far a unit that is left out moved against the first of its stop, at full size: in the camera that
+        moved most, but for cameras that show something else; NaN for the other units.
     compared
         Units whose images were read.
     """
 
-    kept: Bools
+    included: Bools
     moved_px: Floats
     compared: int
 
     def spans(self) -> list[tuple[int, int]]:
-        """First and last unit, both kept, of each stop."""
-        kept = np.flatnonzero(self.kept).tolist()
-        return [(a, b) for a, b in pairwise(kept) if b - a > 1]
+        """First and last unit, both included, of each stop."""
+        included = np.flatnonzero(self.included).tolist()
+        return [(a, b) for a, b in pairwise(included) if b - a > 1]
 
 
 def find_standing(
@@ -74,8 +76,8 @@ def find_standing(
 ) -> Standing:
     """Find the units that moved less than `min_motion_px`, in pixels of full images.
 
-    A drive without any motion keeps all units, as mapping does. Units with an image that cannot be read are kept: the
-    extraction says what is wrong with it.
+    A drive without any motion keeps all units, as mapping does. Units with an image that cannot be read are not left
+    out: the extraction says what is wrong with it.
 
     Raises
     ------
@@ -105,11 +107,11 @@ def find_standing(
                 stands[unit], moved_px[unit] = True, motion_px[1]
             else:
                 last, kept_images = unit, now
-    kept = ~(stands & np.append(stands[1:], False))  # the last one of a stop is kept
+    included = ~(stands & np.append(stands[1:], False))  # the last one of a stop is included
     if stands.sum() >= units - 1:
-        kept[:] = True
-    moved_px[kept] = np.nan
-    return Standing(kept=kept, moved_px=moved_px, compared=len(read))
+        included[:] = True
+    moved_px[included] = np.nan
+    return Standing(included=included, moved_px=moved_px, compared=len(read))
 
 
 def moving_by_prior(drive: Drive, prior: PriorTrajectory) -> Bools:
@@ -213,7 +215,8 @@ def _small_images(drive: Drive, images: Sequence[DriveImage]) -> dict[int, Float
             return {}
         if rgb is None:
             return {}
-        result[image.camera] = rgb.mean(axis=2, dtype=np.float32)
+        grey = rgb.mean(axis=2, dtype=np.float32)
+        result[image.camera] = np.asarray(cv2.GaussianBlur(grey, (0, 0), SMOOTHING_PX), dtype=np.float32)
     return result
 
 
@@ -259,7 +262,7 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
     return result
 
 
-def without_standing(drive: Drive, kept: Bools) -> Drive:
-    """The drive of the units that are kept (units,)."""
-    frames = [frame for frame, is_kept in zip(drive.manifest.frames, kept.tolist(), strict=True) if is_kept]
+def without_standing(drive: Drive, included: Bools) -> Drive:
+    """The drive of the units that are included (units,)."""
+    frames = [frame for frame, is_included in zip(drive.manifest.frames, included.tolist(), strict=True) if is_included]
     return Drive(drive.root, drive.manifest.model_copy(update={"frames": frames}))

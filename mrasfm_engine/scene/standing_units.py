@@ -30,8 +30,8 @@ class Stop:
     sigma_m: Floats
 
 
-def with_standing_units(scene: Scene, drive: Drive, kept: Bools, moved_px: Floats) -> tuple[Scene, list[Stop]]:
-    """The scene of all units of a drive, from that of those that are kept (units,).
+def with_standing_units(scene: Scene, drive: Drive, included: Bools, moved_px: Floats) -> tuple[Scene, list[Stop]]:
+    """The scene of all units of a drive, from that of those that are included (units,).
 
     A unit between is posed between the two ends of its stop, by time, or where the one is that has a pose. Its position
     is as uncertain as theirs, and by what it may have moved meanwhile: the way between the ends, as if evenly spread,
@@ -40,11 +40,11 @@ def with_standing_units(scene: Scene, drive: Drive, kept: Bools, moved_px: Float
     Parameters
     ----------
     moved_px
-        (units,) how far the images of units between moved, NaN for those that are kept.
+        (units,) how far the images of units between moved, NaN for those that are included.
     """
-    unit_of = np.flatnonzero(kept)
-    units, images = len(kept), drive.images
-    new_image = np.flatnonzero(kept[[image.unit for image in images]])
+    unit_of = np.flatnonzero(included)
+    units, images = len(included), drive.images
+    new_image = np.flatnonzero(included[[image.unit for image in images]])
     registered = np.zeros(units, dtype=np.bool_)
     poses, sigma = np.full((units, 4, 4), np.nan), np.full((units, 3), np.nan)
     registered[unit_of] = scene.unit_registered
