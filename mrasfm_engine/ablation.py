@@ -15,7 +15,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, ReconstructionError
 from mrasfm_engine.evaluation.pose_errors import TOLERANCE_US, PoseErrors, compare_scene
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, match_timestamps
-from mrasfm_engine.io.stage_store import Arrays, StageStore
+from mrasfm_engine.io.stage_store import Arrays, StageStore, StoredStage
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.mapping import components
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -172,6 +172,11 @@ class _Store(StageStore):
             return None
         own = super()._read(name, key, arrays=arrays)
         return own if own is not None or self._shared is None else self._shared._read(name, key, arrays=arrays)
+
+    def open(self, name: str, key: str) -> StoredStage | None:
+        """See `StageStore`; no row times what is opened."""
+        own = super().open(name, key)
+        return own if own is not None or self._shared is None else self._shared.open(name, key)
 
 
 def _require_truth(drive: Drive, truth: Trajectory) -> None:

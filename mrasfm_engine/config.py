@@ -116,7 +116,9 @@ class MappingConfig(_Section):
         True, description="`false` registers every image by its own PnP, as without a rig; for comparison"
     )
     keyframe_motion_px: Threshold = Field(
-        2.0, description="units whose keypoints moved less are registered in the finished scene; 0 maps with all units"
+        2.0,
+        description="units whose images or keypoints moved less take no part in mapping and are posed in the finished "
+        "scene; 0 maps with all units",
     )
     motion_compensation: bool = Field(
         True, description="images, and rows where a readout time is declared, are posed at their own times"

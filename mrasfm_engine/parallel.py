@@ -6,8 +6,9 @@ Work must not start such passes of its own: the threads that it would wait for a
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 from typing import TypeVar
@@ -22,6 +23,9 @@ Result = TypeVar("Result")
 FEW = 512  # items that one thread has done before others have heard of them
 RANGES = 4  # a thread: items take unequal times, and starting on a range takes some, too
 BATCH = 128  # items whose results are held at one time
+# Items that wait for a thread, or for the result of an earlier one, by thread: one that takes several times the usual
+# time does not leave the other threads without work.
+IN_FLIGHT = 4
 
 
 def in_ranges(threads: int, count: int, work: Callable[[int, int], None]) -> None:
@@ -60,6 +64,24 @@ def mapped(threads: int, work: Callable[[Item], Result], items: Sequence[Item]) 
         return
     for begin in range(0, len(items), BATCH):
         yield from _pool(threads).map(work, items[begin : begin + BATCH])
+
+
+def in_order(threads: int, work: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result]:
+    """Results of long work in the items' order, in threads of its own; `IN_FLIGHT` items of a thread are under way.
+
+    Closing the iterator waits for the work that has begun, and does no more.
+    """
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) >= IN_FLIGHT * threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @cache

@@ -70,7 +70,7 @@ def reconstruct(
     with watched_compilation() as compiled:
         stages.load_models(run)
         stages.preflight(run)
-        prior = stages.prior(run)
+        prior = stages.leave_out_standing(run, stages.prior(run))
         stages.probe(run)
         features = stages.features(run)
         matches = stages.matches(run, features, prior)
@@ -83,6 +83,7 @@ def reconstruct(
                 raise CancelledError
             run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
             run.begin(Stage.EXPORT)
-            write_scene(scene, out, run.report, pictures, components)
+            whole, parts = stages.all_units(run, scene, components)
+            write_scene(whole, out, run.report, pictures, parts)
     run.progress(Stage.EXPORT, 1, 1)
     return run.report

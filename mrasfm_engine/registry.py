@@ -24,7 +24,7 @@ from mrasfm_engine.features.segmentation import OnnxSegmenter, Segmenter
 from mrasfm_engine.learned.catalogue import LearnedMethod, Method, default_model, known_models
 from mrasfm_engine.learned.model_folder import InstalledModel, ModelFolder, default_folder
 from mrasfm_engine.learned.network import Network
-from mrasfm_engine.matching.pair_matching import Matcher
+from mrasfm_engine.matching.prepared_images import Matcher
 from schemas import LabelMap
 from schemas.methods import EXTRACTORS, MATCHERS
 

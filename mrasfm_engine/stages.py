@@ -6,23 +6,26 @@ Each takes its input, leaves its result and a report in the store, and is skippe
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.errors import CancelledError, ReconstructionError
+from mrasfm_engine.errors import CancelledError, ReconstructionError, StorageError
 from mrasfm_engine.export.picture_files import PictureFiles
-from mrasfm_engine.features.extraction import extract_features
+from mrasfm_engine.features.extraction import extract_features, features_by_image
 from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_finding
+from mrasfm_engine.features.stored_features import FeatureWriter, StoredFeatures
 from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.images import mask_of_png, mask_png
-from mrasfm_engine.io.stage_store import Arrays, StageStore, drive_fingerprint, fingerprint
+from mrasfm_engine.io.stage_store import Arrays, StageStore, StageWriter, StoredStage, drive_fingerprint, fingerprint
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.components import map_drive
@@ -37,22 +40,28 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_traje
 from mrasfm_engine.matching.simultaneous import contradiction
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
+from mrasfm_engine.preflight.standing import Standing, find_standing, without_standing
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
-from mrasfm_engine.scene.semantics import count_classes
+from mrasfm_engine.scene.semantics import CLASS_NAMES, count_classes
+from mrasfm_engine.scene.standing_units import with_standing_units
 from mrasfm_engine.triangulation.tracks import Keypoints
-from mrasfm_engine.types import Bools, CountProgress, StageProgress
+from mrasfm_engine.types import Bools, CountProgress, Ints, StageProgress
 from mrasfm_engine.visualization.pictures import draw_pictures
 from schemas.artifacts import CHECKPOINT_FOLDER, Stage
 from schemas.findings import as_json
 
+Result = TypeVar("Result")
+
 PROBE_UNITS = 5
-FEATURE_ARRAYS = ("xy_px", "descriptors", "colors", "classes")
+STANDING, STANDING_VERSION = "standing", 1
+PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit")
+WINDOW_PAIRS = 4096  # written at once: some megabytes, with nearly nothing for headers
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-VERSIONS = {Stage.FEATURES: 3, Stage.MATCHES: 5, Stage.MAPPING: 9}
+VERSIONS = {Stage.FEATURES: 4, Stage.MATCHES: 6, Stage.MAPPING: 9}
 
 
 @dataclass
@@ -68,6 +77,8 @@ class Run:
     report: dict[str, Any] = field(default_factory=lambda: {"engine_version": __version__, "stages": []})
     own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once its images were looked at
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
+    standing: Standing | None = None  # where units are left out: which, and the drive with all of them
+    whole_drive: Drive | None = None
 
     @cached_property
     def components(self) -> Components:
@@ -105,22 +116,58 @@ class Run:
 
         A stage's fingerprint covers the one before it, its own settings and its version.
         """
+
+        def done() -> tuple[Arrays, dict[str, Any]]:
+            found = work()
+            self.store.save(name, self.key, *found)
+            return found
+
+        return self._found_or_done(
+            name, settings, lambda: self.store.load(name, self.key), done, lambda found: found[1]
+        )
+
+    def large_stage(
+        self, name: Stage, settings: object, work: Callable[[StageWriter], dict[str, Any]]
+    ) -> tuple[StoredStage, dict[str, Any]]:
+        """Do a stage whose arrays are written as they come, or find its file in the store; `work` gives its report."""
+
+        def done() -> StoredStage:
+            with self.store.writing(name, self.key) as writer:
+                writer.finish(work(writer))
+            written = self.store.open(name, self.key)
+            if written is None:
+                raise StorageError(
+                    f"what was written of the stage {name} does not come back from the disk",
+                    remedy="Check the disk that the scene is written to.",
+                )
+            return written
+
+        found = self._found_or_done(
+            name, settings, lambda: self.store.open(name, self.key), done, lambda found: found.report
+        )
+        return found, found.report
+
+    def _found_or_done(
+        self,
+        name: Stage,
+        settings: object,
+        find: Callable[[], Result | None],
+        do: Callable[[], Result],
+        report_of: Callable[[Result], dict[str, Any]],
+    ) -> Result:
         if self.cancel():
             raise CancelledError
         self.key = self.next_key(name, settings)
         started = time.perf_counter()
-        found = self.store.load(name, self.key)
+        found = find()
         reused = found is not None
         if found is None:
             self.begin(name)
-            found = work()
-            self.store.save(name, self.key, *found)
-        arrays, report = found
-        self.report["stages"].append(
-            {"stage": name, "seconds": round(time.perf_counter() - started, 3), "reused": reused, **report}
-        )
+            found = do()
+        seconds = round(time.perf_counter() - started, 3)
+        self.report["stages"].append({"stage": name, "seconds": seconds, "reused": reused, **report_of(found)})
         self.progress(name, 1, 1)
-        return arrays, report
+        return found
 
 
 def load_models(run: Run) -> None:
@@ -150,6 +197,89 @@ def prior(run: Run) -> PriorTrajectory:
     return result
 
 
+def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
+    """Leave out units between the first and the last of each stop; the prior trajectory of all others.
+
+    The run goes on with the drive of these, until `all_units`.
+    """
+    if not run.config.mapping.keyframe_motion_px or len(run.drive.timestamps_us) < 3:
+        return known
+    of_prior = [run.config.gnss.model_dump(), run.config.use_gnss]
+    key = fingerprint(run.drive_key, STANDING, run.config.mapping.keyframe_motion_px, of_prior, STANDING_VERSION)
+    if (stored := run.store.load(STANDING, key)) is not None:
+        included, moved_px, compared = (stored[0][name] for name in ("included", "moved_px", "compared"))
+        standing = Standing(included=included, moved_px=moved_px, compared=int(compared))
+    else:
+        standing = find_standing(
+            run.drive,
+            known,
+            min_motion_px=run.config.mapping.keyframe_motion_px,
+            threads=run.config.threads,
+            cancel=run.cancel,
+        )
+    if standing.included.all():
+        return known
+    if stored is None:
+        arrays = {"included": standing.included, "moved_px": standing.moved_px, "compared": np.array(standing.compared)}
+        run.store.save(STANDING, key, arrays, {})
+    run.standing, run.whole_drive = standing, run.drive
+    run.key = fingerprint(run.drive_key, standing.included.tolist())
+    run.drive = without_standing(run.drive, standing.included)
+    return prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
+
+
+def all_units(
+    run: Run, result: Scene, components: Sequence[tuple[Scene, dict[str, Any]]] = ()
+) -> tuple[Scene, list[tuple[Scene, dict[str, Any]]]]:
+    """The scenes with the units that `leave_out_standing` left out, and the reports in the drive's own units."""
+    standing, drive = run.standing, run.whole_drive
+    if standing is None or drive is None:
+        return result, list(components)
+    result, stops = with_standing_units(result, drive, standing.included, standing.moved_px)
+    unit_of = np.flatnonzero(standing.included)
+    parts = [
+        (with_standing_units(part, drive, standing.included, standing.moved_px)[0], in_units(report, unit_of))
+        for part, report in components
+    ]
+    run.drive = drive
+    run.report["stages"] = [in_units(stage, unit_of) for stage in run.report["stages"]]
+    frames = drive.manifest.frames
+    run.report["standing"] = {
+        "units": int((~standing.included).sum()),
+        "units_compared": standing.compared,
+        "stops": [
+            {
+                "first_unit": stop.first,
+                "last_unit": stop.last,
+                "first_source_frame": frames[stop.first].source_frame,
+                "last_source_frame": frames[stop.last].source_frame,
+                "units_between": stop.last - stop.first - 1,
+                "images_moved_at_most_px": round(float(standing.moved_px[stop.first + 1 : stop.last].max()), 3),
+                "posed": bool(result.unit_registered[stop.first + 1]),
+                "sigma_at_most_m": float(stop.sigma_m.max()) if np.isfinite(stop.sigma_m).all() else None,
+            }
+            for stop in stops
+        ],
+    }
+    return result, parts
+
+
+def in_units(report: Any, unit_of: Ints) -> Any:
+    """A report with other numbers of its units: unit k of it becomes `unit_of[k]`."""
+    if isinstance(report, list):
+        return [in_units(part, unit_of) for part in report]
+    if not isinstance(report, dict):
+        return report
+    result = {name: in_units(value, unit_of) for name, value in report.items()}
+    if isinstance(report.get("unit"), int):
+        result["unit"] = int(unit_of[report["unit"]])
+    if "spans" in report:
+        result["spans"] = [[int(unit_of[unit]) for unit in span] for span in report["spans"]]
+    if report.get("initial_units") is not None:
+        result["initial_units"] = [int(unit_of[unit]) for unit in report["initial_units"]]
+    return result
+
+
 def probe(run: Run) -> None:
     """Check on the first units that the calibration is the right way round."""
     images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
@@ -169,14 +299,17 @@ def probe(run: Run) -> None:
     require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)
 
 
-def features(run: Run) -> list[ImageFeatures]:
-    """Keypoints and descriptors of all images."""
+def features(run: Run) -> Sequence[ImageFeatures]:
+    """Keypoints and descriptors of all images; they stay on disk."""
 
-    def work() -> tuple[Arrays, dict[str, Any]]:
+    def work(stage: StageWriter) -> dict[str, Any]:
         own_cars: list[OwnCar] = []
         if run.config.features.own_car:
             own_cars = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
-        found = extract_features(
+        writer = FeatureWriter(stage)
+        by_class: Counter[str] = Counter()
+        made, left_out = 0, dict[str, Incomplete]()
+        extracted = features_by_image(
             run.drive,
             run.components.extractor,
             threads=run.config.threads,
@@ -186,45 +319,51 @@ def features(run: Run) -> list[ImageFeatures]:
             progress=run.step(Stage.FEATURES),
             cancel=run.cancel,
         )
-        arrays = _pack_features(found) | _pack_own_cars(own_cars)
-        return arrays, {
-            "images": len(found),
-            "keypoints": int(arrays["counts"].sum()),
-            "keypoints_by_class": count_classes([f.classes for f in found]),
+        with closing(extracted):
+            for image, found in zip(run.drive.images, extracted, strict=True):
+                writer.add(found)
+                if isinstance(found, Incomplete):
+                    left_out[image.file] = found
+                else:
+                    by_class.update(count_classes([found.classes]))
+                    made += found.made_mask is not None
+        writer.finish()
+        for name, array in _pack_own_cars(own_cars).items():
+            stage.add(name, array)
+        few = [run.drive.images[i].file for i in np.flatnonzero(writer.counts < 100)]
+        return {
+            "images": len(run.drive.images),
+            "keypoints": int(writer.counts.sum()),
+            "keypoints_by_class": {name: by_class[name] for name in CLASS_NAMES.values() if by_class[name]},
             "images_with_mask": {
                 "given": sum(image.mask is not None for image in run.drive.images),
-                "made_by_model": sum(f.made_mask is not None for f in found),
+                "made_by_model": made,
             },
             "own_car": {
                 camera.name: car.report()
                 for camera, car in zip(run.drive.cameras if own_cars else [], own_cars, strict=True)
             },
-            "images_with_under_100_keypoints": [
-                run.drive.images[i].file for i in np.flatnonzero(arrays["counts"] < 100) if not found[i].left_out
-            ],
-            "images_left_out": [
-                {"file": image.file, "reason": str(f.left_out)}
-                for image, f in zip(run.drive.images, found, strict=True)
-                if f.left_out
-            ],
+            "images_with_under_100_keypoints": [file for file in few if file not in left_out],
+            "images_left_out": [{"file": file, "reason": str(reason)} for file, reason in left_out.items()],
         }
 
-    arrays, report = run.stage(Stage.FEATURES, run.feature_settings, work)
+    stage, report = run.large_stage(Stage.FEATURES, run.feature_settings, work)
     left_out = {image["file"]: Incomplete(image["reason"]) for image in report["images_left_out"]}
     _say_left_out(run, left_out)
-    run.own_cars = _unpack_own_cars(arrays) or [None for _ in run.drive.cameras]
+    run.own_cars = _unpack_own_cars(stage) or [None for _ in run.drive.cameras]
     run.report["own_car"] = report["own_car"]
     for camera, mask in zip(run.drive.cameras, run.own_cars, strict=True):
         run.report["findings"] += [as_json(finding) for finding in large_share_finding(camera.name, mask)]
     if len(left_out) == len(run.drive.images):
         raise left_out_images.nothing_left(left_out)
-    if not arrays["counts"].sum():
+    found = StoredFeatures(stage, [left_out.get(image.file) for image in run.drive.images])
+    if not found.counts.sum():
         raise ReconstructionError(
             "no image of the drive has a keypoint",
             remedy="Check that the images are not empty, and that masks do not cover everything.",
             code="no-features",
         )
-    return _unpack_features(arrays, [left_out.get(image.file) for image in run.drive.images])
+    return found
 
 
 def _say_left_out(run: Run, left_out: Mapping[str, Incomplete]) -> None:
@@ -232,17 +371,6 @@ def _say_left_out(run: Run, left_out: Mapping[str, Incomplete]) -> None:
     findings = [finding for finding in run.report.get("findings", []) if finding["code"] not in left_out_images.CODES]
     found = left_out_images.left_out_findings(left_out, len(run.drive.images))
     run.report["findings"] = findings + [as_json(finding) for finding in found]
-
-
-def _pack_features(found: Sequence[ImageFeatures]) -> Arrays:
-    masks = [np.zeros(0, np.uint8) if f.made_mask is None else f.made_mask for f in found]
-    names = [*FEATURE_ARRAYS, *(["scores"] if all(f.scores is not None for f in found) else [])]
-    return {
-        "counts": np.array([len(f.xy_px) for f in found], dtype=np.int64),
-        **{name: np.concatenate([getattr(f, name) for f in found]) for name in names},
-        "mask_bytes": np.array([len(mask) for mask in masks], dtype=np.int64),
-        "masks": np.concatenate(masks),
-    }
 
 
 def _pack_own_cars(own_cars: Sequence[OwnCar]) -> Arrays:
@@ -255,34 +383,18 @@ def _pack_own_cars(own_cars: Sequence[OwnCar]) -> Arrays:
     }
 
 
-def _unpack_own_cars(arrays: Arrays) -> list[Bools | None]:
-    if not len(arrays["own_car_bytes"]):
+def _unpack_own_cars(stage: StoredStage) -> list[Bools | None]:
+    sizes = stage.read("own_car_bytes")
+    if not len(sizes):
         return []
-    masks = np.split(arrays["own_cars"], np.cumsum(arrays["own_car_bytes"])[:-1])
+    masks = np.split(stage.read("own_cars"), np.cumsum(sizes)[:-1])
     return [mask_of_png(mask) > 0 if len(mask) else None for mask in masks]
-
-
-def _unpack_features(arrays: Arrays, left_out: Sequence[Incomplete | None]) -> list[ImageFeatures]:
-    parts = {
-        name: np.split(arrays[name], np.cumsum(arrays["counts"])[:-1])
-        for name in (*FEATURE_ARRAYS, "scores")
-        if name in arrays
-    }
-    masks = np.split(arrays["masks"], np.cumsum(arrays["mask_bytes"])[:-1])
-    return [
-        ImageFeatures(
-            **{name: part[i] for name, part in parts.items()},
-            made_mask=mask if len(mask) else None,
-            left_out=left_out[i],
-        )
-        for i, mask in enumerate(masks)
-    ]
 
 
 def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> list[PairMatches]:
     """Candidate pairs by the prior (or by window and similarity), matched and verified."""
 
-    def work() -> tuple[Arrays, dict[str, Any]]:
+    def work(stage: StageWriter) -> dict[str, Any]:
         chosen = PairChoice(run.drive, found, known, run.config)
         result = match_pairs(
             run.drive,
@@ -299,7 +411,8 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
         )
         names = [camera.name for camera in run.drive.cameras]
         contradicted = contradiction(names, run.drive.rig_from_cam, result.rig)
-        return pack_pairs(chosen.with_revisits(result.pairs)), {
+        _write_pairs(stage, chosen.with_revisits(result.pairs))
+        return {
             "candidate_pairs": result.candidates,
             "verified_pairs": len(result.pairs) - result.against_calibration,
             "rejected_pairs": {
@@ -327,7 +440,7 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
     priors = {"refine_calibration", "sigma_rotation_deg", "sigma_translation_m"}
     settings.append(run.config.bundle_adjustment.model_dump(include=priors))
     settings.append({"use_gnss": run.config.use_gnss, "models": run.components.fingerprint_of("matcher")})
-    arrays, report = run.stage(Stage.MATCHES, settings, work)
+    stage, report = run.large_stage(Stage.MATCHES, settings, work)
     if report["contradiction"] is not None:
         run.report["findings"].append(report["contradiction"])
     if not report["verified_pairs"]:
@@ -336,7 +449,24 @@ def matches(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) ->
             remedy="Check that consecutive frames show the same scene, and that images are sharp and not mixed up.",
             code="nothing-matches",
         )
-    return unpack_pairs(arrays)
+    return _read_pairs(stage)
+
+
+def _write_pairs(stage: StageWriter, pairs: Sequence[PairMatches]) -> None:
+    """Write matches window by window, so that they are not in memory twice."""
+    first = range(0, len(pairs), WINDOW_PAIRS)
+    stage.add("windows", np.array(len(first), dtype=np.int64))
+    for window, begin in enumerate(first):
+        for name, array in pack_pairs(pairs[begin : begin + WINDOW_PAIRS]).items():
+            stage.add(f"{name}.{window}", array)
+
+
+def _read_pairs(stage: StoredStage) -> list[PairMatches]:
+    return [
+        pair
+        for window in range(int(stage.read("windows")))
+        for pair in unpack_pairs({name: stage.read(f"{name}.{window}") for name in PAIR_ARRAYS})
+    ]
 
 
 def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
@@ -465,8 +595,13 @@ def components(
 def _without_keypoints(features: ImageFeatures) -> ImageFeatures:
     """Features of an image that takes no part in a component."""
     scores = None if features.scores is None else features.scores[:0]
-    empty = {name: getattr(features, name)[:0] for name in FEATURE_ARRAYS}
-    return replace(features, **empty, scores=scores, made_mask=None)
+    return ImageFeatures(
+        xy_px=features.xy_px[:0],
+        descriptors=features.descriptors[:0],
+        colors=features.colors[:0],
+        scores=scores,
+        left_out=features.left_out,
+    )
 
 
 def _refined(

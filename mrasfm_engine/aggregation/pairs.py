@@ -34,10 +34,10 @@ class Probe:
 
 
 def thinned(scene: SourceScene, spacing_m: float) -> Ints:
-    """Registered units at least so far apart along the trajectory."""
+    """Registered units with keypoints at least so far apart along the trajectory."""
     chosen: list[int] = []
     last = None
-    for unit in np.flatnonzero(scene.unit_registered):
+    for unit in np.unique(scene.image_unit[scene.image_matchable]):
         at = scene.world_from_rig[unit, :3, 3]
         if last is None or np.linalg.norm(at - last) >= spacing_m:
             chosen.append(int(unit))
@@ -87,7 +87,7 @@ def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggregation
 
 
 def _images_of(scene: SourceScene, units: Ints) -> Ints:
-    return np.flatnonzero(np.isin(scene.image_unit, units) & scene.image_registered)
+    return np.flatnonzero(np.isin(scene.image_unit, units) & scene.image_matchable)
 
 
 def _near_pairs(poses_a: Floats, poses_b: Floats, reach_m: float, max_angle_deg: float) -> tuple[Ints, Floats]:
@@ -131,7 +131,7 @@ def common_view(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggreg
 
 def _overlapping(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> tuple[Ints, Floats]:
     """Image pairs (n, 2) whose footprints overlap, and how alike (n,) they should look."""
-    images_a, images_b = np.flatnonzero(a.image_registered), np.flatnonzero(b.image_registered)
+    images_a, images_b = np.flatnonzero(a.image_matchable), np.flatnonzero(b.image_matchable)
     poses_a, poses_b = a.world_from_cam[images_a], a_from_b @ b.world_from_cam[images_b]
     pairs, _ = _near_pairs(poses_a, poses_b, 1.5 * SIGHT_SHIFT_M, config.max_view_angle_deg)
     if not len(pairs):

@@ -14,7 +14,7 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.matching.pair_matching import Matcher
+from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import may_match

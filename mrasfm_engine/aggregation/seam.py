@@ -25,7 +25,7 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
-from mrasfm_engine.matching.pair_matching import Matcher
+from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.types import CountProgress, Floats, Ints
 
 BATCH_UNITS = 4  # relocalised between two tests of their agreement

@@ -79,6 +79,11 @@ class SourceScene:
         return np.array([image.camera for image in self.drive.images], dtype=np.int64)
 
     @cached_property
+    def image_matchable(self) -> Bools:
+        """(i,) registered images with keypoints: those of units that stood have none, others show the same."""
+        return self.image_registered & (np.diff(self.keypoint_first) > 0)
+
+    @cached_property
     def world_from_cam(self) -> Floats:
         """Poses (i, 4, 4) of all images in the scene's frame; NaN where not registered."""
         poses = self.world_from_rig[self.image_unit]

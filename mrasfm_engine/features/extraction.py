@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Protocol
@@ -17,6 +16,7 @@ from mrasfm_engine.features.own_car import with_margin
 from mrasfm_engine.features.segmentation import Segmenter
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
+from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
@@ -66,7 +66,35 @@ def extract_features(
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> list[ImageFeatures]:
-    """Features of every image of the drive, in the order of `drive.images`.
+    """Features of every image of a short drive, all in memory; see `features_by_image`.
+
+    Images that were left out have none, of the kind that the others have.
+    """
+    found = features_by_image(
+        drive,
+        extractor,
+        threads=threads,
+        segmenter=segmenter,
+        class_margin_px=class_margin_px,
+        own_cars=own_cars,
+        progress=progress,
+        cancel=cancel,
+    )
+    return _with_left_out(list(found))
+
+
+def features_by_image(
+    drive: Drive,
+    extractor: Extractor,
+    *,
+    threads: int,
+    segmenter: Segmenter | None = None,
+    class_margin_px: int = 2,
+    own_cars: Sequence[Bools | None] = (),
+    progress: CountProgress | None = None,
+    cancel: Cancel | None = None,
+) -> Generator[ImageFeatures | Incomplete]:
+    """Features of every image of the drive, in the order of `drive.images`; those of few images exist at one time.
 
     Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
     have the class of what they show; within `class_margin_px` of another class they are unknown. Images without a mask
@@ -74,8 +102,8 @@ def extract_features(
 
     Nothing is extracted where `own_cars` is True either: masks (h, w) by camera, as the pixels show the own car.
 
-    An image whose pixels are not all there has no keypoints, and `left_out` says why: the grey that fills it up has
-    texture at its border.
+    An image whose pixels are not all there is left out, with the reason in the place of its features: the grey that
+    fills it up has texture at its border.
 
     Raises
     ------
@@ -124,18 +152,12 @@ def extract_features(
 
     label_map = drive.manifest.label_map or LabelMap.cityscapes()
     outside_own_car = [None if mask is None else ~with_margin(mask) for mask in own_cars]
-    result: list[ImageFeatures | Incomplete] = []
-    with one_opencv_thread(), ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(one, index) for index in range(len(drive.images))]
-        try:
-            for future in futures:
-                result.append(future.result())
-                if progress is not None:
-                    progress(len(result), len(futures))
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-    return _with_left_out(result)
+    count = len(drive.images)
+    with one_opencv_thread():
+        for done, found in enumerate(in_order(threads, one, range(count)), 1):
+            yield found
+            if progress is not None:
+                progress(done, count)
 
 
 def _with_left_out(found: Sequence[ImageFeatures | Incomplete]) -> list[ImageFeatures]:

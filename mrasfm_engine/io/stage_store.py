@@ -1,15 +1,24 @@
-"""Finished stages on disk, so that a second run does not do them again."""
+"""Finished stages on disk, so that a second run does not do them again.
+
+A stage's file is an archive of arrays as numpy writes it, uncompressed. Large arrays can be written in parts while the
+stage goes on, and read in parts after: neither has to stand in memory.
+"""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import secrets
-from collections.abc import Mapping
+import weakref
+import zipfile
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +58,118 @@ def _content_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+class StageWriter:
+    """The file of a stage that is being done. It counts for nothing until `finish`."""
+
+    def __init__(self, folder: Path, name: str, key: str) -> None:
+        self._path = folder / checkpoint_file(name)
+        self._partial = folder / f".{name}.{secrets.token_hex(4)}.partial"
+        self._key = key
+        self._names: list[str] = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = self._partial.open("wb")
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+        self._archive = zipfile.ZipFile(self._file, "w")
+
+    def add(self, name: str, array: NDArray[Any]) -> None:
+        """Write one array.
+
+        Raises
+        ------
+        StorageError
+            Where the disk is full or cannot be written.
+        """
+        self._write(name, array)
+        self._names.append(name)
+
+    def finish(self, report: Mapping[str, Any]) -> None:
+        """Put the stage in the place of an earlier one, in one step; raises as `add` does."""
+        self._write("header", np.array(json.dumps({"key": self._key, "report": report, "arrays": self._names})))
+        try:
+            self._archive.close()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._partial.replace(self._path)
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+
+    def discard(self) -> None:
+        """Remove what has not been finished."""
+        with suppress(OSError, ValueError):  # a full disk takes no directory either
+            self._archive.close()
+        with suppress(OSError):
+            self._file.close()
+        self._partial.unlink(missing_ok=True)
+
+    def _write(self, name: str, array: NDArray[Any]) -> None:
+        try:
+            with self._archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Member:
+    """An array inside a stage's file."""
+
+    offset: int  # of its first number in the file
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
+class StoredStage:
+    """A finished stage in its file, of whose arrays parts are read.
+
+    The file stays open, and what is read is that file even where another has taken its place. All bytes were compared
+    with their checksums when it was opened.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO, members: Mapping[str, _Member], report: dict[str, Any]) -> None:
+        self.report = report
+        self._path = path
+        self._members = members
+        self._descriptor = os.dup(file.fileno())
+        weakref.finalize(self, os.close, self._descriptor)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._members
+
+    def read(self, name: str) -> NDArray[Any]:
+        """A whole array, as `rows` reads it."""
+        shape = self._members[name].shape
+        return self.rows(name, 0, None) if shape else self._read_at(name, shape, 0)
+
+    def rows(self, name: str, first: int, stop: int | None) -> NDArray[Any]:
+        """Rows of an array, read anew at every call and from any thread.
+
+        Raises
+        ------
+        StorageError
+            Where they cannot be read.
+        """
+        shape = self._members[name].shape
+        return self._read_at(name, ((shape[0] if stop is None else stop) - first, *shape[1:]), first)
+
+    def _read_at(self, name: str, shape: tuple[int, ...], first: int) -> NDArray[Any]:
+        member = self._members[name]
+        result = np.empty(shape, member.dtype)
+        row_bytes = member.dtype.itemsize * int(np.prod(shape[1:], dtype=np.int64))
+        into, at = result.reshape(-1).view(np.uint8).data, member.offset + first * row_bytes
+        try:
+            while len(into):
+                count = os.preadv(self._descriptor, [into], at)
+                if not count:
+                    raise OSError(errno.EIO, "the file has become shorter")
+                into, at = into[count:], at + count
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+        return result
+
+
 class StageStore:
     """Arrays and a small report of every finished stage, in one folder.
 
@@ -65,6 +186,22 @@ class StageStore:
     def load(self, name: str, key: str) -> tuple[Arrays, dict[str, Any]] | None:
         """Arrays and report of a stage, or None where it has not been finished with this fingerprint."""
         return self._read(name, key, arrays=True)
+
+    def open(self, name: str, key: str) -> StoredStage | None:
+        """The file of a stage, to read parts of its arrays, or None where `load` finds none."""
+        path = self._folder / checkpoint_file(name)
+        try:
+            with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+                header = _header(archive)
+                if header["key"] != key or archive.testzip() is not None:
+                    return None
+                members = {name: _member(archive, file, f"{name}.npy") for name in header["arrays"]}
+                return StoredStage(path, file, members, header["report"])
+        except MemoryError:
+            raise
+        except Exception:
+            # On a damaged file zipfile and numpy raise a dozen kinds.
+            return None
 
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
         path = self._folder / checkpoint_file(name)
@@ -83,6 +220,15 @@ class StageStore:
             # On a damaged file zipfile and numpy raise a dozen kinds.
             return None
 
+    @contextmanager
+    def writing(self, name: str, key: str) -> Iterator[StageWriter]:
+        """A stage that is written in parts, and kept where it is finished before the block ends."""
+        writer = StageWriter(self._folder, name, key)
+        try:
+            yield writer
+        finally:
+            writer.discard()
+
     def save(self, name: str, key: str, arrays: Mapping[str, NDArray[Any]], report: Mapping[str, Any]) -> None:
         """Keep a finished stage.
 
@@ -91,19 +237,30 @@ class StageStore:
         StorageError
             Where the disk is full or cannot be written.
         """
-        path = self._folder / checkpoint_file(name)
-        partial = self._folder / f".{name}.{secrets.token_hex(4)}.partial"
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            try:
-                with partial.open("wb") as file:
-                    header = json.dumps({"key": key, "report": report, "arrays": list(arrays)})
-                    named: dict[str, Any] = {"header": np.array(header), **arrays}
-                    np.savez(file, **named)
-                    file.flush()
-                    os.fsync(file.fileno())
-                partial.replace(path)
-            finally:
-                partial.unlink(missing_ok=True)
-        except OSError as error:
-            raise storage_error(path, error) from error
+        with self.writing(name, key) as writer:
+            for array_name, array in arrays.items():
+                writer.add(array_name, array)
+            writer.finish(report)
+
+
+def _header(archive: zipfile.ZipFile) -> dict[str, Any]:
+    with archive.open("header.npy") as member:
+        header: dict[str, Any] = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
+        return header
+
+
+def _member(archive: zipfile.ZipFile, file: BinaryIO, name: str) -> _Member:
+    """Find an uncompressed array in the file. The lengths of name and extra field stand at bytes 26 and 28 of what the
+    archive keeps in front of a member, 30 bytes and these two (section 4.3.7 of the format's description).
+    """
+    info = archive.getinfo(name)
+    with archive.open(info) as member:
+        if np.lib.format.read_magic(member) != (1, 0) or info.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(name)
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(member)
+        within = member.tell()
+    if is_fortran or dtype.hasobject:
+        raise ValueError(name)
+    lengths = os.pread(file.fileno(), 4, info.header_offset + 26)
+    before = 30 + int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
+    return _Member(offset=info.header_offset + before + within, shape=shape, dtype=dtype)

@@ -93,9 +93,9 @@ def _in_words(drive: Drive, runs: Sequence[tuple[int, int]]) -> str:
     start_us = frames[0].timestamp_us
 
     def one(first: int, last: int) -> str:
-        at_s = [(frames[unit].timestamp_us - start_us) / 1e6 for unit in (first, last)]
+        at_s = [f"{(frames[unit].timestamp_us - start_us) / 1e6:.1f}" for unit in (first, last)]
         if first == last:
-            return f"unit {first} at {at_s[0]:.1f} s"
-        return f"units {first} to {last} at {at_s[0]:.1f} to {at_s[1]:.1f} s"
+            return f"frame {frames[first].source_frame} at {at_s[0]} s"
+        return f"frames {frames[first].source_frame} to {frames[last].source_frame} at {at_s[0]} to {at_s[1]} s"
 
     return listed([one(*run) for run in runs])

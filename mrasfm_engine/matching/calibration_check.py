@@ -12,7 +12,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.io.axes import flu_from_body
-from mrasfm_engine.matching.pair_matching import Matcher
+from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.verification import (
     MIN_FORWARD,
     epipolar_errors,

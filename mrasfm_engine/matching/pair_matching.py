@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Protocol
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.prior_verification import PriorVerdict, verified_by_prior
 from mrasfm_engine.matching.simultaneous import (
@@ -22,26 +23,15 @@ from mrasfm_engine.matching.simultaneous import (
     verified_in_rig,
 )
 from mrasfm_engine.matching.verification import essential_inliers
+from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import may_match
-from mrasfm_engine.types import Cancel, CountProgress, Floats, Ints, Ints32
+from mrasfm_engine.types import Cancel, CountProgress, Floats, Ints
 
 # Further pairs (n, 2) from those that matched so far, and the viewing rays of a pair's inliers.
 Further = Callable[[Sequence[PairMatches], Callable[[PairMatches], tuple[Floats, Floats]]], Ints]
 NO_PRIOR = PriorTrajectory(source="none", world_from_rig=None)
-
-
-class Matcher(Protocol):
-    """Matches two images' features."""
-
-    def prepare(self, features: ImageFeatures, *, width: int, height: int) -> Any:
-        """Prepare one image of width x height pixels for the matcher, once."""
-        ...
-
-    def match(self, a: Any, b: Any) -> Ints32:
-        """Pairs (m, 2) of keypoint indices of two prepared images."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +50,12 @@ class SearchResult:
     def against_calibration(self) -> int:
         """Pairs of simultaneous images that keep no inlier, as their matches contradict the calibration."""
         return sum(not pair.inliers.any() for pair in self.pairs)
+
+
+def in_order_of_drive(pairs: Ints) -> Ints:
+    """Pairs (n, 2) by their first images and then by their second ones: neighbours have images in common."""
+    result: Ints = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    return result
 
 
 def match_pairs(
@@ -84,37 +80,31 @@ def match_pairs(
     trajectory does the same where images do not contradict it (see `prior_verification`). Matches between different
     semantic classes are dropped before all that.
     """
-    cameras = [drive.cameras[i.camera] for i in drive.images]
-    prepared = [matcher.prepare(f, width=c.width, height=c.height) for f, c in zip(features, cameras, strict=True)]
-    kinds, params = pack_cameras(drive.cameras)
-    rays = [
-        unproject_pixels(int(kinds[i.camera]), params[i.camera], f.xy_px)
-        for i, f in zip(drive.images, features, strict=True)
-    ]
-    focal = params[:, :2].mean(1)
-    across_classes = 0
+    focal = pack_cameras(drive.cameras)[1][:, :2].mean(1)
 
     def one(pair: Ints) -> tuple[PairMatches | str, int]:
         if cancel is not None and cancel():
             raise CancelledError
         a, b = int(pair[0]), int(pair[1])
-        matches = matcher.match(prepared[a], prepared[b])
+        of_a, of_b = images.prepared(a), images.prepared(b)
+        matches = matcher.match(of_a.for_matcher, of_b.for_matcher)
         across = 0
         if config.same_class:
-            fits = may_match(features[a].classes[matches[:, 0]], features[b].classes[matches[:, 1]])
+            fits = may_match(of_a.classes[matches[:, 0]], of_b.classes[matches[:, 1]])
             across = len(fits) - int(fits.sum())
             matches = matches[fits]
         if len(matches) < config.min_matches:
             return "few matches", across
-        ra, rb = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
+        ra, rb = images.rays(a)[matches[:, 0]], images.rays(b)[matches[:, 1]]
         inliers = essential_inliers(ra, rb, max_error=max_error_rad(drive, a, b, focal, config))
         if inliers.sum() < config.min_matches:
             return "few inliers", across
-        return PairMatches(image_a=a, image_b=b, matches=matches, inliers=inliers), across
+        # A copy: a matcher may have given a part of a large array.
+        return PairMatches(image_a=a, image_b=b, matches=matches.copy(), inliers=inliers), across
 
     def rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
         a, b = pair.matches.T
-        return rays[pair.image_a][a], rays[pair.image_b][b]
+        return images.rays(pair.image_a)[a], images.rays(pair.image_b)[b]
 
     def inlier_rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
         a, b = rays_of(pair)
@@ -122,25 +112,27 @@ def match_pairs(
 
     found: list[PairMatches] = []
     lost = {"few matches": 0, "few inliers": 0}
+    across_classes, done, total = 0, 0, len(pairs)
+    batch = in_order_of_drive(pairs)
     # Every thread multiplies matrices on its own core.
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(one, pair) for pair in pairs]
-        try:
-            done = 0
-            while done < len(futures):
-                result, across = futures[done].result()
-                done, across_classes = done + 1, across_classes + across
-                if isinstance(result, str):
-                    lost[result] += 1
-                else:
-                    found.append(result)
-                if done == len(pairs) and further is not None:
-                    futures += [pool.submit(one, pair) for pair in further(found, inlier_rays_of)]
-                if progress is not None:
-                    progress(done, len(futures))
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+    with threadpool_limits(1, "blas"):
+        while True:
+            images, following = PreparedImages(drive, features, matcher, batch, threads=threads), batch[:0]
+            with closing(in_order(threads, one, batch)) as results:
+                for number, (result, across) in enumerate(results, 1):
+                    done, across_classes = done + 1, across_classes + across
+                    if isinstance(result, str):
+                        lost[result] += 1
+                    else:
+                        found.append(result)
+                    if number == len(batch) and further is not None:
+                        following, further = in_order_of_drive(further(found, inlier_rays_of)), None
+                        total += len(following)
+                    if progress is not None:
+                        progress(done, total)
+            if not len(following):
+                break
+            batch = following
 
     rig = rig_of_drive(drive, found, inlier_rays_of, config, calibration)
     by_prior = verified_by_prior(
@@ -155,7 +147,7 @@ def match_pairs(
             kept.append(pair)
     return SearchResult(
         pairs=sorted(kept, key=lambda pair: (pair.image_a, pair.image_b)),
-        candidates=len(futures),
+        candidates=total,
         few_matches=lost["few matches"],
         few_inliers=lost["few inliers"] + len(found) - len(kept),
         across_classes=across_classes,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mrasfm_engine.config import PairConfig
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE
@@ -18,6 +20,12 @@ from mrasfm_engine.types import Bytes, Floats32, Ints
 WORDS = 64
 TRAINING_DESCRIPTORS = 30_000
 KEYPOINTS_PER_IMAGE = 1000
+DIRECTIONS = 256  # 1 KB of an image, where its vector has 32
+SAMPLED_VECTORS = 4 * DIRECTIONS  # from which they are learned: more than span them, and 32 MB
+SHORTLIST = 32  # candidates for each pair that is kept; of these the whole vectors are compared
+ROUNDING = 1e-6  # of single precision: directions with less energy say nothing
+BATCH = 64  # images of which numbers of single precision exist at one time
+NO_CANDIDATE = -2.0  # less than any scalar product of unit vectors
 MIN_LIKENESS = 0.5  # of what images at the edge of the window have with each other
 
 
@@ -26,8 +34,10 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
 
     Units nearer than `REVISIT_PATH_M`, or in each other's window, are alike because they are neighbours.
 
-    Images are compared by VLAD (Jegou et al., CVPR 2010) over a vocabulary learned from the drive itself. Of every unit
-    the most alike images are kept; where two units have a pair, their images of one camera are paired as well.
+    Images are compared by VLAD (Jegou et al., CVPR 2010) over a vocabulary learned from the drive itself. An index of a
+    few directions gives candidates (Jegou and Chum, ECCV 2012), which the whole vectors then rank: no matrix of all
+    images by all images exists, and of an image 9 KB stay in memory. Of every unit the most alike images are kept;
+    where two units have a pair, their images of one camera are paired as well.
     """
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     camera = np.array([image.camera for image in drive.images], dtype=np.int64)
@@ -35,28 +45,32 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
     ahead = units_ahead(motion, config)
     if config.revisit_pairs_per_unit == 0 or np.ptp(travelled_m) <= REVISIT_PATH_M:
         return np.zeros((0, 2), dtype=np.int64)
-    vectors = _vlad(features)
-    likeness = vectors @ vectors.T
     last = np.array([units[-1] if len(units) else -1 for units in ahead], dtype=np.int64)
-    edge = (last[unit][:, None] == unit[None, :]) & (camera[:, None] == camera[None, :])
-    if not edge.any():
-        return np.zeros((0, 2), dtype=np.int64)
-    limit = MIN_LIKENESS * float(np.median(likeness[edge]))
-    likeness[np.abs(travelled_m[:, None] - travelled_m[None, :]) <= REVISIT_PATH_M] = -1.0
-    first = np.searchsorted(unit, np.arange(len(ahead) + 1))  # images are in the order of their units
-    for u, units in enumerate(ahead):
-        for v in units:
-            here, there = slice(first[u], first[u + 1]), slice(first[v], first[v + 1])
-            likeness[here, there] = likeness[there, here] = -1.0
-    chosen: set[tuple[int, int]] = set()
     where = {(int(u), int(c)): i for i, (u, c) in enumerate(zip(unit, camera, strict=True))}
-    for u in np.unique(unit):
-        rows = np.flatnonzero(unit == u)
-        best = np.argsort(-likeness[rows], axis=None, kind="stable")[: config.revisit_pairs_per_unit]
-        for a, b in zip(*np.unravel_index(best, (len(rows), len(unit))), strict=True):
-            i, j = int(rows[a]), int(b)
-            if likeness[i, j] < limit:
-                continue
+    edge = [(i, j) for i in range(len(unit)) if (j := where.get((int(last[unit[i]]), int(camera[i])))) is not None]
+    if not edge:
+        return np.zeros((0, 2), dtype=np.int64)
+    index = _Index.from_features(features)
+    limit = MIN_LIKENESS * float(np.median([index.likeness(i, np.array([j]))[0] for i, j in edge]))
+    first = np.searchsorted(unit, np.arange(len(ahead) + 1))  # images are in the order of their units
+    behind: list[list[int]] = [[] for _ in ahead]
+    for u, units in enumerate(ahead):
+        for v in units.tolist():
+            behind[v].append(u)
+    chosen: set[tuple[int, int]] = set()
+    for u in np.unique(unit).tolist():
+        rows = np.arange(first[u], first[u + 1])
+        likeness = index.directions[rows] @ index.directions.T
+        likeness[:, np.abs(travelled_m - motion.travelled_m[u]) <= REVISIT_PATH_M] = NO_CANDIDATE
+        for v in (*ahead[u].tolist(), *behind[u]):
+            likeness[:, first[v] : first[v + 1]] = NO_CANDIDATE
+        row, column = _largest(likeness, SHORTLIST * config.revisit_pairs_per_unit, above=NO_CANDIDATE)
+        exact = np.full(likeness.shape, NO_CANDIDATE, np.float32)
+        for k in np.unique(row).tolist():
+            mine = column[row == k]
+            exact[k, mine] = index.likeness(int(rows[k]), mine)
+        row, column = _largest(exact, config.revisit_pairs_per_unit, above=limit)
+        for i, j in zip((row + first[u]).tolist(), column.tolist(), strict=True):
             chosen.add((min(i, j), max(i, j)))
             if camera[i] == camera[j]:
                 for c in range(len(drive.cameras)):
@@ -66,24 +80,91 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
     return np.array(sorted(chosen), dtype=np.int64).reshape(-1, 2)
 
 
-def _vlad(features: Sequence[ImageFeatures]) -> Floats32:
-    """Unit-length VLAD vectors (images, WORDS * D) with intra-normalisation (Arandjelovic and Zisserman, 2013)."""
-    strongest = [_unit_length(f.descriptors[:KEYPOINTS_PER_IMAGE]) for f in features]
-    everything = np.concatenate(strongest)
-    sample = everything[np.linspace(0, len(everything) - 1, min(len(everything), TRAINING_DESCRIPTORS)).astype(int)]
-    words = min(WORDS, max(1, len(sample) // 10))
+def _largest(values: Floats32, count: int, *, above: float) -> tuple[Ints, Ints]:
+    """Rows and columns (n,) of the `count` largest values, the first ones of equals, and none that is not `above`."""
+    flat = values.ravel()
+    least = np.partition(flat, -count)[-count] if count < len(flat) else flat.min()
+    candidates = np.flatnonzero((flat >= least) & (flat > above))
+    best = candidates[np.argsort(-flat[candidates], kind="stable")[:count]]
+    row, column = np.unravel_index(best, values.shape)
+    return row.astype(np.int64), column.astype(np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Index:
+    """VLAD vectors of all images: in few directions to find candidates, in bytes to compare these with.
+
+    Attributes
+    ----------
+    directions
+        (images, k) unit-length vectors in the directions that the vectors of evenly chosen images span best.
+    codes
+        (images, WORDS * D) int8 the vectors in steps of their own largest number, which makes errors of 1e-4.
+    steps
+        (images,)
+    """
+
+    directions: Floats32
+    codes: NDArray[np.int8]
+    steps: Floats32
+
+    @staticmethod
+    def from_features(features: Sequence[ImageFeatures]) -> _Index:
+        centres, count = _vocabulary(features), len(features)
+        codes, steps = np.zeros((count, centres.size), np.int8), np.zeros(count, np.float32)
+        for image, found in enumerate(features):
+            vector = _vlad(found, centres)
+            steps[image] = max(float(np.abs(vector).max()), 1e-6) / np.iinfo(np.int8).max
+            codes[image] = np.round(vector / steps[image])
+        sample = np.unique(np.linspace(0, count - 1, min(count, SAMPLED_VECTORS)).astype(np.int64))
+        sampled = codes[sample] * steps[sample, None]
+        energy, directions = np.linalg.eigh(sampled @ sampled.T)  # smaller than the vectors' own covariance
+        keep = np.flatnonzero(energy > energy[-1] * ROUNDING)[-DIRECTIONS:]
+        basis = (sampled.T @ directions[:, keep]) / np.sqrt(energy[keep])
+        del sampled
+        result = np.zeros((count, len(keep)), np.float32)
+        for begin in range(0, count, BATCH):
+            batch = slice(begin, begin + BATCH)
+            result[batch] = (codes[batch] * steps[batch, None]) @ basis
+        result /= np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-6)
+        return _Index(directions=result, codes=codes, steps=steps)
+
+    def likeness(self, image: int, others: Ints) -> Floats32:
+        """Scalar products (n,) of an image's vector with others'."""
+        own = self.codes[image].astype(np.float32) * self.steps[image]
+        result: Floats32 = (self.codes[others].astype(np.float32) @ own) * self.steps[others]
+        return result
+
+
+def _vocabulary(features: Sequence[ImageFeatures]) -> Floats32:
+    """Words (w, D) from descriptors that are taken evenly from the whole drive."""
+    stops = np.cumsum([min(len(found.xy_px), KEYPOINTS_PER_IMAGE) for found in features])
+    total = int(stops[-1])
+    sample = np.linspace(0, total - 1, min(total, TRAINING_DESCRIPTORS)).astype(np.int64)
+    image = np.searchsorted(stops, sample, side="right")
+    parts = []
+    for i in np.unique(image).tolist():
+        rows = sample[image == i] - (stops[i - 1] if i else 0)
+        parts.append(_unit_length(features[i].descriptors[rows]))
+    chosen = np.concatenate(parts)
+    words = min(WORDS, max(1, len(chosen) // 10))
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 12, 1e-3)
-    _, _, centres = cv2.kmeans(sample, words, np.empty(0), criteria, 1, cv2.KMEANS_PP_CENTERS)
-    result = np.zeros((len(features), words, sample.shape[1]), np.float32)
-    half_norms = 0.5 * (centres**2).sum(1)
-    for row, d in zip(result, strongest, strict=True):
-        if len(d):
-            word = (d @ centres.T - half_norms).argmax(1)
-            np.add.at(row, word, d - centres[word])
-    result /= np.maximum(np.linalg.norm(result, axis=2, keepdims=True), 1e-6)
-    flat = result.reshape(len(features), -1)
-    normalised: Floats32 = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6)
+    _, _, centres = cv2.kmeans(chosen, words, np.empty(0), criteria, 1, cv2.KMEANS_PP_CENTERS)
+    result: Floats32 = centres
+    return result
+
+
+def _vlad(found: ImageFeatures, centres: Floats32) -> Floats32:
+    """Unit-length VLAD vector (WORDS * D,) with intra-normalisation (Arandjelovic and Zisserman, 2013)."""
+    result = np.zeros(centres.shape, np.float32)
+    strongest = _unit_length(found.descriptors[:KEYPOINTS_PER_IMAGE])
+    if len(strongest):
+        word = (strongest @ centres.T - 0.5 * (centres**2).sum(1)).argmax(1)
+        np.add.at(result, word, strongest - centres[word])
+    result /= np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-6)
+    flat = result.ravel()
+    normalised: Floats32 = flat / np.maximum(np.linalg.norm(flat), 1e-6)
     return normalised
 
 

@@ -16,7 +16,7 @@ well enough stays exactly as given.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,16 +108,12 @@ def rig_of_drive(
 
     `rays_of` tells the viewing rays (n, 3) of a pair's inliers in image_a and image_b.
     """
-    found = []
-    for pair in pairs if calibration.refine_calibration else ():
-        if are_simultaneous(drive, pair.image_a, pair.image_b):
-            a, b = (drive.images[image].camera for image in (pair.image_a, pair.image_b))
-            rays_a, rays_b = rays_of(pair)
-            found.append(SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays_a, rays_b=rays_b))
+    simultaneous = [pair for pair in pairs if are_simultaneous(drive, pair.image_a, pair.image_b)]
+    found = _pooled(drive, simultaneous if calibration.refine_calibration else (), rays_of)
     sigma_rotation_rad, sigma_translation_m = calibration_sigmas(drive, calibration)
     return estimate_rig(
         drive.rig_from_cam,
-        _pooled(found),
+        found,
         sigma_rotation_rad=sigma_rotation_rad,
         sigma_translation_m=sigma_translation_m,
         focal_px=pack_cameras(drive.cameras)[1][:, :2].mean(1),
@@ -192,16 +188,26 @@ def calibration_sigmas(drive: Drive, settings: BundleAdjustmentConfig) -> tuple[
     )
 
 
-def _pooled(found: Iterable[SimultaneousMatches]) -> list[SimultaneousMatches]:
-    """All matches of each pair of cameras together, at most `MAX_MATCHES` of each."""
-    by_pair: dict[tuple[int, int], list[SimultaneousMatches]] = {}
-    for one in found:
-        by_pair.setdefault((one.camera_a, one.camera_b), []).append(one)
+def _pooled(
+    drive: Drive, pairs: Sequence[PairMatches], rays_of: Callable[[PairMatches], tuple[Floats, Floats]]
+) -> list[SimultaneousMatches]:
+    """All inliers of each pair of cameras together, at most `MAX_MATCHES` of each, evenly chosen before rays exist."""
+    by_cameras: dict[tuple[int, int], list[PairMatches]] = {}
+    for pair in pairs:
+        a, b = (drive.images[image].camera for image in (pair.image_a, pair.image_b))
+        by_cameras.setdefault((a, b), []).append(pair)
     result = []
-    for (a, b), parts in sorted(by_pair.items()):
-        rays_a, rays_b = (np.concatenate([getattr(part, name) for part in parts]) for name in ("rays_a", "rays_b"))
-        keep = np.unique(np.linspace(0, len(rays_a) - 1, min(len(rays_a), MAX_MATCHES)).astype(np.int64))
-        result.append(SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays_a[keep], rays_b=rays_b[keep]))
+    for (a, b), parts in sorted(by_cameras.items()):
+        stops = np.cumsum([int(part.inliers.sum()) for part in parts])
+        keep = np.unique(np.linspace(0, stops[-1] - 1, min(int(stops[-1]), MAX_MATCHES)).astype(np.int64))
+        rays: tuple[list[Floats], list[Floats]] = ([np.zeros((0, 3))], [np.zeros((0, 3))])
+        for part, first, stop in zip(parts, [0, *stops[:-1]], stops, strict=True):
+            rows = keep[slice(*np.searchsorted(keep, [first, stop]))] - first
+            if len(rows):
+                for kept, of_part in zip(rays, rays_of(part), strict=True):
+                    kept.append(of_part[rows])
+        rays_a, rays_b = map(np.concatenate, rays)
+        result.append(SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays_a, rays_b=rays_b))
     return result
 
 

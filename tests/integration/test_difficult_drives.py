@@ -35,6 +35,26 @@ def test_standing_car_and_missing_images(tmp_path: Path, mrasfm: Run) -> None:
     assert 0 < errors["similarity"]["rmse_m"] < 0.03
 
 
+@pytest.mark.slow
+def test_units_of_a_stop_are_posed_between_its_ends(tmp_path: Path, mrasfm: Run) -> None:
+    """They are in no stage but the last, and the trajectory has them to a centimetre."""
+    drive = synth(
+        tmp_path / "drive", "--cameras", 3, "--units", 14, "--standing", 6, "--moving-cars", 3, "--no-gnss", "--seed", 5
+    )
+    errors = reconstructed(mrasfm, drive, tmp_path / "scene")
+    report = read_report(tmp_path / "scene")
+    (stop,) = report["standing"]["stops"]
+    assert report["standing"]["units"] == stop["units_between"] >= 4
+    assert stop["posed"]
+    assert report["by_stage"]["features"]["images"] == errors["total_images"] - 3 * stop["units_between"]
+    assert errors["registered_units"] == 14
+    assert errors["registered_images"] == errors["total_images"]
+    assert 0 < errors["similarity"]["rmse_m"] < 0.01
+    poses = json.loads((tmp_path / "scene" / "poses.json").read_text())["units"]
+    at_end, between = (poses[stop["first_unit"] + k]["sigma_position_m"] for k in (0, 1))
+    assert all(b > a for a, b in zip(at_end, between, strict=True))
+
+
 def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None:
     drive = synth(
         tmp_path / "drive", "--cameras", 4, "--units", 8, "--moving-cars", 8, "--occlude", "left", "--seed", 6

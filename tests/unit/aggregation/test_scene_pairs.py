@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -159,3 +161,24 @@ def test_thinned_units_are_apart(drives: dict[str, Driven]) -> None:
     apart = np.linalg.norm(np.diff(a.world_from_rig[found, :3, 3], axis=0), axis=1)
     assert 5.0 <= apart.min() <= apart.max() < 7.0
     assert thinned(a, 0.0).tolist() == list(range(12))
+
+
+def test_units_that_stood_crowd_out_no_others(drives: dict[str, Driven]) -> None:
+    """Their images have a pose and no keypoints."""
+    a, b = drives["a"].source, drives["same"].source
+    stood = np.isin(b.image_unit, (4, 5))
+    counts = np.where(stood, 0, np.diff(b.keypoint_first))
+    rows = np.repeat(~stood, np.diff(b.keypoint_first))
+    b = replace(
+        b,
+        keypoint_first=np.concatenate([[0], np.cumsum(counts)]),
+        keypoint_xy_px=b.keypoint_xy_px[rows],
+        keypoint_point=b.keypoint_point[rows],
+        descriptors=b.descriptors[b.descriptor_row[rows & (b.keypoint_point >= 0)]],
+    )
+    a_from_b = true_a_from_b(drives["a"], drives["same"])
+    pairs = guided_pairs(a, b, a_from_b, SETTINGS)
+    assert len(pairs)
+    assert not stood[pairs[:, 1]].any()
+    assert not {4, 5} & {probe.unit for probe in probes(a, b, a_from_b, SETTINGS)}
+    assert not {4, 5} & set(thinned(b, 0.1).tolist())

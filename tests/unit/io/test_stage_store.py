@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import StorageError
-from mrasfm_engine.io.stage_store import StageStore, drive_fingerprint, fingerprint
+from mrasfm_engine.io.stage_store import StageStore, StoredStage, drive_fingerprint, fingerprint
 from mrasfm_engine.preflight.drive_reader import read_drive
 
 ARRAYS: dict[str, np.ndarray] = {
@@ -19,6 +19,7 @@ ARRAYS: dict[str, np.ndarray] = {
     "poses": np.random.default_rng(1).normal(size=(5, 4, 4)),
     "empty": np.zeros((0, 2), np.int32),
     "flags": np.array([True, False]),
+    "number": np.array(7),
 }
 REPORT = {"images": 5, "rejected": {"few matches": 3}, "files": ["a b.png", "ü.png"], "seconds": 0.25, "none": None}
 
@@ -34,6 +35,17 @@ def file_of(tmp_path: Path) -> Path:
     return tmp_path / ".stages" / "features.npz"
 
 
+def assert_parts_are_the_same(opened: StoredStage | None) -> None:
+    assert opened is not None
+    assert opened.report == REPORT
+    for name, expected in ARRAYS.items():
+        np.testing.assert_array_equal(opened.read(name), expected)
+        assert opened.read(name).dtype == expected.dtype
+        if expected.ndim:
+            middle = len(expected) // 2
+            np.testing.assert_array_equal(opened.rows(name, middle, None), expected[middle:])
+
+
 def assert_same(found: tuple[dict[str, Any], dict[str, Any]] | None) -> None:
     assert found is not None
     arrays, report = found
@@ -47,6 +59,40 @@ def assert_same(found: tuple[dict[str, Any], dict[str, Any]] | None) -> None:
 def test_a_stage_comes_back_as_it_was_saved(store: StageStore, tmp_path: Path) -> None:
     assert_same(store.load("features", "key"))
     assert_same(StageStore(tmp_path / ".stages").load("features", "key"))
+    assert [p.name for p in (tmp_path / ".stages").iterdir()] == ["features.npz"]
+
+
+def test_parts_of_a_stage_are_read_from_its_file(store: StageStore, tmp_path: Path) -> None:
+    opened = store.open("features", "key")
+    assert_parts_are_the_same(opened)
+    assert store.open("features", "other") is None
+    assert store.open("matches", "key") is None
+    store.save("features", "newer", {"poses": np.ones(3)}, {})
+    assert_parts_are_the_same(opened)
+
+
+def test_a_stage_written_in_parts_counts_when_it_is_finished(tmp_path: Path) -> None:
+    store = StageStore(tmp_path / ".stages")
+    with store.writing("features", "key") as writer:
+        for name, array in ARRAYS.items():
+            writer.add(name, array)
+            assert store.load("features", "key") is None
+            assert store.open("features", "key") is None
+        writer.finish(REPORT)
+    assert_same(store.load("features", "key"))
+    assert [p.name for p in (tmp_path / ".stages").iterdir()] == ["features.npz"]
+
+
+@pytest.mark.parametrize("error", [ValueError(), KeyboardInterrupt()])
+def test_a_stage_that_is_not_finished_leaves_nothing(store: StageStore, tmp_path: Path, error: BaseException) -> None:
+    def half() -> None:
+        with store.writing("features", "newer") as writer:
+            writer.add("poses", ARRAYS["poses"])
+            raise error
+
+    with pytest.raises(type(error)):
+        half()
+    assert_same(store.load("features", "key"))
     assert [p.name for p in (tmp_path / ".stages").iterdir()] == ["features.npz"]
 
 
@@ -70,6 +116,7 @@ def test_a_truncated_file_counts_as_not_finished(store: StageStore, tmp_path: Pa
     for length in [*range(0, 40), *range(40, len(whole), 97), len(whole) - 1]:
         file_of(tmp_path).write_bytes(whole[:length])
         assert store.load("features", "key") is None, length
+        assert store.open("features", "key") is None, length
     file_of(tmp_path).write_bytes(whole)
     assert_same(store.load("features", "key"))
 
@@ -85,6 +132,8 @@ def test_a_corrupt_file_is_never_taken_for_a_result(store: StageStore, tmp_path:
         damaged[k] ^= 0xFF
         file_of(tmp_path).write_bytes(damaged)
         found = store.load("features", "key")
+        if (opened := store.open("features", "key")) is not None:
+            assert_parts_are_the_same(opened)
         if found is None:
             found_nothing += 1
         else:
@@ -117,11 +166,11 @@ def test_a_strange_header_is_ignored(store: StageStore, tmp_path: Path, header: 
 def test_an_interrupted_save_leaves_the_old_file_and_no_rest(
     store: StageStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    def fail(file: Any, **arrays: Any) -> None:
+    def fail(file: Any, array: Any, **options: Any) -> None:
         file.write(b"half of it")
         raise error
 
-    monkeypatch.setattr(np, "savez", fail)
+    monkeypatch.setattr(np.lib.format, "write_array", fail)
     with pytest.raises(StorageError if isinstance(error, OSError) else KeyboardInterrupt):
         store.save("features", "newer", {"a": np.ones(3)}, {})
     monkeypatch.undo()

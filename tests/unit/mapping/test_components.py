@@ -77,8 +77,8 @@ def test_parts_that_nothing_links_are_components_of_their_own(simulated: Simulat
         assert rmse(metric_errors_m(part.mapper, simulated)) < 0.02
     found = {finding.code: finding for finding in gaps.findings(parts)}
     assert found["drive-in-components"].severity == "error"
-    assert "8 (units 16 to 23 at 1.6 to 2.3 s)" in found["drive-in-components"].what
-    assert "3 of 24 units have no pose: units 13 to 15" in found["units-without-pose"].what
+    assert "8 (frames 16 to 23 at 1.6 to 2.3 s)" in found["drive-in-components"].what
+    assert "3 of 24 units have no pose: frames 13 to 15" in found["units-without-pose"].what
     report = gaps.describe(parts)["components"]
     assert [one["spans"] for one in report] == [[[0, 12]], [[16, 23]]]
     missing = describe(parts[0].mapper, parts[0].log, [parts[1].mapper])["units_not_registered"]
@@ -114,7 +114,7 @@ def test_positions_put_parts_into_one_frame(simulated: SimulatedDrive) -> None:
     assert (np.abs(off_m) < 4 * sigmas).all()
     found = {finding.code: finding for finding in gaps.findings(parts)}
     assert found["gap-without-images"].severity == "error"
-    assert "units 16 to 23 at 1.6 to 2.3 s by GNSS positions" in found["gap-without-images"].what
+    assert "frames 16 to 23 at 1.6 to 2.3 s by GNSS positions" in found["gap-without-images"].what
 
 
 def test_positions_of_another_shape_link_nothing(simulated: SimulatedDrive) -> None:

@@ -171,7 +171,7 @@ def test_further_pairs_follow_from_what_the_first_show() -> None:
         simulated.drive, simulated.features, np.array([[0, 1], [2, 3], [1, 2]]), NearestNeighbourMatcher(config),
         config, CALIBRATION, threads=2, further=further, progress=lambda done, total: calls.append((done, total)),
     )  # fmt: skip
-    assert asked == [[(0, 1, True), (2, 3, True), (1, 2, True)]]
+    assert asked == [[(0, 1, True), (1, 2, True), (2, 3, True)]], "in the order of the drive"
     assert [(p.image_a, p.image_b) for p in result.pairs] == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
     assert result.candidates == 5
     assert calls == [(1, 3), (2, 3), (3, 5), (4, 5), (5, 5)]

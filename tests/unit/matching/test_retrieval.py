@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import PairConfig
+from mrasfm_engine.matching import retrieval
 from mrasfm_engine.matching.image_motion import Motion
 from mrasfm_engine.matching.pair_selection import REVISIT_PATH_M
 from mrasfm_engine.matching.retrieval import revisit_pairs as revisits_of_motion
@@ -127,3 +128,30 @@ def test_neighbours_along_the_path_are_no_revisits_at_any_rate() -> None:
     unit = np.array([i.unit for i in drive.images])[revisit_pairs(drive, features, PairConfig(), step_m=17.0)]
     assert (unit[:, 1] - unit[:, 0]).min() > PairConfig().window_units
     assert {(a, a + 30) for a in range(10)} <= set(map(tuple, unit.tolist()))
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_few_directions_find_what_all_do(cameras: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long drive has more images than directions: the candidates they give have to hold the most alike images."""
+    drive, features = drive_of(cameras), features_of(places_of_a_loop(), cameras)
+    exact = revisit_pairs(drive, features, PairConfig(revisit_pairs_per_unit=2))
+    monkeypatch.setattr(retrieval, "DIRECTIONS", 8)
+    monkeypatch.setattr(retrieval, "SAMPLED_VECTORS", 16)
+    monkeypatch.setattr(retrieval, "SHORTLIST", 4)
+    few = revisit_pairs(drive, features, PairConfig(revisit_pairs_per_unit=2))
+    unit = np.array([i.unit for i in drive.images])
+    assert {(a, a + 30) for a in range(10)} <= set(map(tuple, unit[few].tolist()))
+    common = set(map(tuple, few.tolist())) & set(map(tuple, exact.tolist()))
+    assert len(common) > 0.9 * len(exact)
+
+
+def test_memory_of_an_image_is_a_quarter_of_its_vector() -> None:
+    features = features_of(places_of_a_loop(), 1)
+    index = retrieval._Index.from_features(features)
+    centres = retrieval._vocabulary(features)
+    vectors = np.stack([retrieval._vlad(found, centres) for found in features])
+    assert index.codes.nbytes == vectors.nbytes // 4
+    everything = np.arange(len(features))
+    likeness = np.stack([index.likeness(i, everything) for i in everything.tolist()])
+    np.testing.assert_allclose(likeness, vectors @ vectors.T, atol=2e-3)
+    np.testing.assert_allclose(index.directions @ index.directions.T, vectors @ vectors.T, atol=2e-3)
