@@ -19,8 +19,8 @@ from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bytes, Floats32, Ints
 
 KINDS = ("xy_px", "descriptors", "colors", "classes", "scores")
-# Written at once: some hundred bytes of headers are nothing against it, and it is less than what threads hold.
-WINDOW_BYTES = 1 << 25
+# Written at once: some hundred bytes of headers are nothing against it, and it is what a few images in work take.
+WINDOW_BYTES = 1 << 23
 
 
 class FeatureWriter:

@@ -7,6 +7,7 @@ stage goes on, and read in parts after: neither has to stand in memory.
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -68,7 +69,10 @@ class StageWriter:
         self._names: list[str] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            _remove_orphans(folder, name)
             self._file = self._partial.open("wb")
+            with suppress(OSError):  # some network file systems have no locks: there an orphan stays
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise storage_error(self._path, error) from error
         self._archive = zipfile.ZipFile(self._file, "w")
@@ -110,6 +114,14 @@ class StageWriter:
                 np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
         except OSError as error:
             raise storage_error(self._path, error) from error
+
+
+def _remove_orphans(folder: Path, name: str) -> None:
+    """Remove what killed runs left half-written of a stage: no process has a lock on it any more."""
+    for path in folder.glob(f".{name}.*.partial"):
+        with suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,6 +96,21 @@ def test_a_stage_that_is_not_finished_leaves_nothing(store: StageStore, tmp_path
     assert [p.name for p in (tmp_path / ".stages").iterdir()] == ["features.npz"]
 
 
+def test_what_a_killed_run_left_is_removed_by_the_next(store: StageStore, tmp_path: Path) -> None:
+    """But not what another run is writing at this moment, nor what belongs to another stage."""
+    folder = tmp_path / ".stages"
+    orphan, other = folder / ".features.0123.partial", folder / ".matches.0123.partial"
+    for path in (orphan, other):
+        path.write_bytes(b"half of it")
+    with store.writing("features", "first") as first, store.writing("features", "second") as second:
+        assert not orphan.exists()
+        assert other.exists()
+        second.finish({"run": "second"})
+        first.finish({"run": "first"})
+    assert store.load("features", "first") == ({}, {"run": "first"})
+    assert sorted(path.name for path in folder.iterdir()) == [".matches.0123.partial", "features.npz"]
+
+
 def test_another_fingerprint_or_name_finds_nothing(store: StageStore, tmp_path: Path) -> None:
     assert store.load("features", "other") is None
     assert store.load("matches", "key") is None
