@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammainc, gammaincinv
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import CancelledError
@@ -27,7 +27,8 @@ from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.types import Bools, Cancel, Floats
 
 # Matches show five directions of a relative pose, all but the distance. As improbable as an error of `GATE_SIGMAS`.
-MAX_CORRECTION = float(chi2.ppf(chi2.cdf(GATE_SIGMAS**2, 1), 5))
+# The quantile of chi-squared with 5 degrees of freedom, without scipy.stats, which takes half a second to import.
+MAX_CORRECTION = float(2.0 * gammaincinv(5 / 2, float(gammainc(1 / 2, GATE_SIGMAS**2 / 2))))
 # Rotations known worse than this (20 degrees) predict nothing that derivatives could be taken of.
 MAX_SIGMA_RAD = np.radians(20.0)
 MAX_WRONG = 0.1  # share of the matches that fit one essential matrix and are wrong all the same

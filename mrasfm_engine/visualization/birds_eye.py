@@ -7,6 +7,7 @@ not. The poses of the vehicle are the final ones in both.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,7 +97,10 @@ def birds_eye(
         if scratch is not None:
             drawn = finish_road(scene, plan, road, scratch, optional.error)
     agreement = measure_agreement(plots or [mosaic], plan.trajectory_m)
-    before, after = (_picture(scene, mosaic, which, agreement, plan.plan_from_world) for which in (GIVEN, REFINED))
+    with ThreadPoolExecutor(2) as pool:
+        before, after = pool.map(
+            lambda which: _picture(scene, mosaic, which, agreement, plan.plan_from_world), (GIVEN, REFINED)
+        )
     report = _report(scene, mosaic, agreement)
     report["world_from_pixel"] = _world_from_pixel(mosaic, plan, after.top_px).tolist()
     pictures = {BEFORE: before.picture, AFTER: after.picture, **drawn.pictures}
@@ -174,12 +178,12 @@ def chequerboard(mosaic: Mosaic, which: int) -> Bytes:
     tile = round(max(TILE_M, 16 * mosaic.grid.cell_m) / mosaic.grid.cell_m)
     odd = ((np.arange(mosaic.grid.rows) // tile)[:, None] + (np.arange(mosaic.grid.columns) // tile)[None]) % 2 == 1
     second = odd & (mosaic.owner[1] > 0) & (mosaic.score[1] >= MIN_SECOND_SHARE * mosaic.score[0])
-    result = np.where(second[..., None], mosaic.color[which, 1], mosaic.color[which, 0])
+    result = mosaic.color[which, 0].copy()
+    cv2.copyTo(mosaic.color[which, 1], second.astype(np.uint8), result)
     owner = np.where(second, mosaic.owner[1], mosaic.owner[0])
     for camera, gain in enumerate(camera_gains(mosaic), 1):
         table = np.minimum(gain * np.arange(256.0) + 0.5, 255).astype(np.uint8)
-        cells = owner == camera
-        result[cells] = table[result[cells]]
+        cv2.copyTo(cv2.LUT(result, table), (owner == camera).astype(np.uint8), result)
     result[mosaic.owner[0] == 0] = EMPTY
     cut: Bytes = result[mosaic.seen()]
     return cut

@@ -6,6 +6,7 @@ They never cost the scene: what cannot be drawn is left out, and the report says
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +43,16 @@ def draw_pictures(
         road.update(drawn.road_report)
         return drawn.pictures, drawn.files, drawn.report
 
-    above, above_report = _files(from_above)
+    # The points' picture needs one core for a while that the road's leaves idle.
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(_files, lambda: (road_points(scene), {}, {}))
+        above, above_report = _files(from_above)
+        points, points_report = beside.result()
     if "not_drawn" in above_report:
         if road and "not_drawn" not in road:
             road = {"not_drawn": above_report["not_drawn"]}  # its files are left out with the others
         if scratch is not None:
             (scratch / TIFF).unlink(missing_ok=True)  # the scene may need its space
-    points, points_report = _files(lambda: (road_points(scene), {}, {}))
     report = {"birds_eye": above_report, "road": road, "road_points": points_report}
     return {**above, **points}, {name: part for name, part in report.items() if part or name == "birds_eye"}
 
@@ -57,7 +61,9 @@ def _files(draw: Callable[[], Drawn]) -> tuple[dict[str, bytes | LargeFile], dic
     """All of what is drawn as files, or none of it where anything fails."""
     try:
         pictures, files, report = draw()
-        return {**{name: png_of(picture) for name, picture in pictures.items()}, **files}, report
+        with ThreadPoolExecutor(max(len(pictures), 1)) as pool:
+            pngs = dict(zip(pictures, pool.map(png_of, pictures.values()), strict=True))
+        return {**pngs, **files}, report
     except CancelledError:
         raise
     except MrasfmError as error:

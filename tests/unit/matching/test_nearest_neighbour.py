@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.matching.integer_products import product_of_bytes
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, _mutual_ratio
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import random_descriptors
@@ -12,6 +13,12 @@ from tests.helpers.simulated_drive import random_descriptors
 def features(descriptors: np.ndarray) -> ImageFeatures:
     n = len(descriptors)
     return ImageFeatures(xy_px=np.zeros((n, 2), np.float32), descriptors=descriptors, colors=np.zeros((n, 3), np.uint8))
+
+
+def mutual_ratio(similarity: np.ndarray, ratio2: float) -> np.ndarray:
+    one = (np.ones(side, np.float32) for side in similarity.shape)
+    found: np.ndarray = _mutual_ratio(similarity, *one, ratio2)
+    return found
 
 
 def brute_force(similarity: np.ndarray, ratio: float) -> list[tuple[int, int]]:
@@ -33,9 +40,29 @@ def test_mutual_ratio_agrees_with_brute_force(seed: int, ratio: float) -> None:
     b = np.concatenate([a[rng.permutation(60)[:40]] + rng.normal(size=(40, 16)) * 0.5, rng.normal(size=(15, 16))])
     a, b = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b))
     similarity = (a @ b.T).astype(np.float32)
-    found = [tuple(pair) for pair in _mutual_ratio(similarity, ratio**2).tolist()]
+    found = [tuple(pair) for pair in mutual_ratio(similarity, ratio**2).tolist()]
     assert found == brute_force(similarity, ratio)
     assert 5 < len(found) < 55
+
+
+@pytest.mark.parametrize(("n", "m"), [(70, 64), (150, 129), (90, 300), (300, 63)])
+def test_mutual_ratio_agrees_with_brute_force_over_many_columns(n: int, m: int) -> None:
+    rng = np.random.default_rng(n)
+    a, b = (rng.normal(size=(k, 16)) for k in (n, m))
+    both = min(n, m) // 2
+    b[:both] = a[rng.permutation(n)[:both]] + rng.normal(size=(both, 16)) * 0.4
+    b[both] = b[0]  # as near as another one: neither matches
+    a, b = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b))
+    similarity = (a @ b[rng.permutation(m)].T).astype(np.float32)
+    found = [tuple(pair) for pair in mutual_ratio(similarity, 0.8**2).tolist()]
+    assert found == brute_force(similarity, 0.8)
+    assert both / 3 < len(found) < 2 * both
+
+
+def test_of_equal_descriptors_one_matches_at_most() -> None:
+    similarity = np.full((3, 80), -0.5, np.float32)
+    similarity[:2, 70] = 0.9
+    assert mutual_ratio(similarity, 0.8**2).tolist() == [[0, 70]]
 
 
 def test_planted_matches_are_found_and_nothing_else() -> None:
@@ -68,12 +95,34 @@ def test_hardly_any_keypoints(n: int, m: int) -> None:
     assert len(matches) <= min(n, m)
 
 
-def test_an_empty_descriptor_is_no_nan() -> None:
+def test_an_empty_descriptor_matches_nothing() -> None:
     d = random_descriptors(5, np.random.default_rng(3))
     d[2] = 0
-    prepared = NearestNeighbourMatcher(MatchConfig()).prepare(features(d))
-    assert np.isfinite(prepared).all()
-    np.testing.assert_allclose(np.linalg.norm(prepared, axis=1), [1, 1, 0, 1, 1], atol=1e-6)
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    prepared = matcher.prepare(features(d))
+    assert np.isfinite(prepared.inverse_lengths).all()
+    assert matcher.match(prepared, prepared).tolist() == [[i, i] for i in (0, 1, 3, 4)]
+
+
+def test_bytes_match_as_the_same_floats_do() -> None:
+    rng = np.random.default_rng(5)
+    a = random_descriptors(300, rng)
+    b = np.clip(a[rng.permutation(300)[:200]].astype(int) + rng.integers(-25, 26, (200, 128)), 0, 255).astype(np.uint8)
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    found = [
+        matcher.match(*(matcher.prepare(features(d.astype(kind))) for d in (a, b))).tolist()
+        for kind in (np.uint8, np.float32)
+    ]
+    assert found[0] == found[1]
+    assert 150 < len(found[0]) <= 200
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 3), (5, 128, 700), (33, 64, 2)])
+def test_products_of_bytes_are_exact(shape: tuple[int, int, int]) -> None:
+    n, k, m = shape
+    rng = np.random.default_rng(k)
+    a, b = (rng.integers(128, 256, size, dtype=np.uint8) for size in ((n, k), (k, m)))
+    assert np.array_equal(product_of_bytes(a, b), a.astype(np.int64) @ b.astype(np.int64))
 
 
 def test_float_descriptors_of_any_length_match_too() -> None:

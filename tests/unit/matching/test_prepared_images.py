@@ -7,7 +7,7 @@ import pytest
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.matching import pair_matching
-from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
+from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, Prepared
 from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.prepared_images import PreparedImages, images_at_once
 from mrasfm_engine.scene.drive import Drive
@@ -28,7 +28,7 @@ def window_pairs(images: int) -> np.ndarray:
 class CountingMatcher(NearestNeighbourMatcher):
     prepared = 0
 
-    def prepare(self, features: ImageFeatures, *, width: int = 0, height: int = 0) -> np.ndarray:
+    def prepare(self, features: ImageFeatures, *, width: int = 0, height: int = 0) -> Prepared:
         self.prepared += 1
         return super().prepare(features)
 
