@@ -38,9 +38,9 @@ from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.matching.simultaneous import contradiction
+from mrasfm_engine.matching.standing import Standing, find_standing, without_standing
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
-from mrasfm_engine.preflight.standing import Standing, find_standing, without_standing
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.row_bands import RowBands

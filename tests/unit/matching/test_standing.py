@@ -11,7 +11,7 @@ import pytest
 
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.preflight.standing import Standing, find_standing, moving_by_prior, without_standing
+from mrasfm_engine.matching.standing import Standing, find_standing, moving_by_prior, without_standing
 from mrasfm_engine.scene.drive import Drive
 from tests.helpers.simulated_drive import make_drive
 
