@@ -14,7 +14,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.scene.drive import Drive
 from schemas.artifacts import Stage
-from tests.unit.preflight.test_standing import stop_px, view, write
+from tests.unit.matching.test_standing import stop_px, view, write
 
 
 @pytest.fixture
