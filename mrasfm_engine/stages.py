@@ -46,7 +46,7 @@ from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.scene.semantics import CLASS_NAMES, count_classes
-from mrasfm_engine.scene.standing_units import with_standing_units
+from mrasfm_engine.scene.standing_units import with_standing_units, without_units
 from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import Bools, CountProgress, Ints, StageProgress
 from mrasfm_engine.visualization.pictures import draw_pictures
@@ -237,10 +237,12 @@ def all_units(
         return result, list(components)
     result, stops = with_standing_units(result, drive, standing.included, standing.moved_px)
     unit_of = np.flatnonzero(standing.included)
-    parts = [
-        (with_standing_units(part, drive, standing.included, standing.moved_px)[0], in_units(report, unit_of))
-        for part, report in components
-    ]
+    parts, taken = list[tuple[Scene, dict[str, Any]]](), result.unit_registered.copy()
+    for part, report in components:
+        whole = with_standing_units(part, drive, standing.included, standing.moved_px)[0]
+        # A stop between two parts has its pose in the larger one.
+        parts.append((without_units(whole, taken), in_units(report, unit_of)))
+        taken |= whole.unit_registered
     run.drive = drive
     run.report["stages"] = [in_units(stage, unit_of) for stage in run.report["stages"]]
     frames = drive.manifest.frames

@@ -85,6 +85,20 @@ def with_standing_units(scene: Scene, drive: Drive, included: Bools, moved_px: F
     )
 
 
+def without_units(scene: Scene, units: Bools) -> Scene:
+    """The scene in which units (units,), of which none has an observation, have no pose."""
+    unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)
+    poses, sigma = scene.world_from_rig.copy(), scene.sigma_position_m.copy()
+    poses[units], sigma[units] = np.nan, np.nan
+    return replace(
+        scene,
+        unit_registered=scene.unit_registered & ~units,
+        image_registered=scene.image_registered & ~units[unit],
+        world_from_rig=poses,
+        sigma_position_m=sigma,
+    )
+
+
 def _metres_per_px(scene: Scene, drive: Drive) -> float:
     """Way across the view that moves the scene's points by a pixel, at their median distance; NaN without points."""
     if not len(scene.observation_point):

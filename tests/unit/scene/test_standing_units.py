@@ -10,7 +10,7 @@ import pytest
 from mrasfm_engine.export.scene import check_scene
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.scene.standing_units import with_standing_units
+from mrasfm_engine.scene.standing_units import with_standing_units, without_units
 from tests.helpers.export_example import make_scene
 
 AT, BETWEEN = 2, 3  # the unit of the scene where the car stops, and units of the stop between it and the next
@@ -86,3 +86,14 @@ def test_one_end_is_enough_and_none_is_said() -> None:
         else:
             assert np.isnan(stop.sigma_m).all()
             assert not result.image_registered[[not kept[i.unit] for i in drive.images]].any()
+
+
+def test_a_stop_between_two_parts_has_its_pose_in_one_of_them() -> None:
+    scene = make_scene()
+    drive, kept, moved_px = with_stop(scene)
+    result, _ = with_standing_units(scene, drive, kept, moved_px)
+    without = without_units(result, ~kept)
+    check_scene(without)
+    assert not without.unit_registered[~kept].any()
+    assert np.isnan(without.world_from_rig[~kept]).all()
+    np.testing.assert_array_equal(without.unit_registered[kept], scene.unit_registered)
