@@ -74,8 +74,11 @@ def _say(report: dict[str, Any], out: Path) -> None:
     mapping, refinement = stages["mapping"], stages["refinement"]
     others = mapping["components"][1:]
     units = mapping["registered_units"] + len(mapping["units_not_registered"]) + sum(other["units"] for other in others)
+    standing = report.get("standing", {"units": 0})["units"]
     print(f"Scene: {out}")
     print(f"  units registered: {mapping['registered_units']} of {units}")
+    if standing:
+        print(f"  units standing:   {standing} more, posed between the ends of their stops")
     for number, other in enumerate(others, start=1):
         print(f"  component {number}:      {other['units']} units, {out / component_folder(number)}")
     print(f"  points:           {refinement['points']} in {out / 'points.ply'}")
