@@ -27,6 +27,7 @@ def stops(data: Path, work: Path) -> Iterator[Figure]:
     drive = work / "without a stop"
     mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", SEED, *SIZE, "--no-masks", "--out", drive)
     stopped = _with_stop(drive, work / "with a stop")
+    mrasfm("reconstruct", drive, "--out", work / "warm-up")  # compiles what no run before has
     cpu_s = {}
     for one in (drive, stopped):
         before_s = _cpu_s()
