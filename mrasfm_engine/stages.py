@@ -56,7 +56,7 @@ from schemas.findings import as_json
 Result = TypeVar("Result")
 
 PROBE_UNITS = 5
-STANDING, STANDING_VERSION = "standing", 1
+STANDING, STANDING_VERSION = "standing", 2
 PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit")
 WINDOW_PAIRS = 4096  # written at once: some megabytes, with nearly nothing for headers
 # Raise a stage's version with every change after which the same input and settings give another result: what was

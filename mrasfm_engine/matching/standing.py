@@ -41,6 +41,9 @@ MIN_BLOCKS = 8  # that tell, of a camera: the median of fewer is that of one pas
 # What is left of a block's change may be no more than its gradients would make of this many reduced pixels: where they
 # do not explain the change, the block shows something else.
 MAX_UNEXPLAINED_PX = 1.0
+# Contrast of two images of one view differs by no more than two stops of exposure. A grey image would else be any other
+# with another exposure.
+MAX_CONTRAST_RATIO = 4.0
 # The prior shows motion where it went this many sigmas, and a metre, within a window.
 MOVED_SIGMAS, MOVED_M = 6.0, 1.0
 WINDOWS_S = (0.5, 1.0, 2.0)  # before the unit, and after it: a stop of two seconds and more is seen
@@ -224,7 +227,8 @@ def _small_images(drive: Drive, images: Sequence[DriveImage]) -> dict[int, Float
 def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
     """Displacement (blocks,) of each block between two small images (h, w), in their pixels.
 
-    NaN where a block has too little texture to tell, infinite where a displacement does not explain its change.
+    NaN where a block has too little texture to tell, infinite where neither a displacement nor an exposure
+    explains its change.
     """
     height, width = before.shape
     rows, columns = (height - 2) // BLOCK_PX, (width - 2) // BLOCK_PX
@@ -232,6 +236,7 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
     for block in range(rows * columns):
         top, left = 1 + (block // columns) * BLOCK_PX, 1 + (block % columns) * BLOCK_PX
         normal, right, square = np.zeros((4, 4)), np.zeros(4), 0.0
+        contrast_before, contrast_now = 0.0, 0.0  # sums of squared gradients
         column = np.empty(4)
         for y in range(top, top + BLOCK_PX):
             for x in range(left, left + BLOCK_PX):
@@ -240,6 +245,10 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
                 column[1] = 0.25 * (before[y + 1, x] - before[y - 1, x] + now[y + 1, x] - now[y - 1, x])
                 column[2] = before[y, x] - before[top, left]  # another exposure
                 column[3] = 1.0
+                contrast_before += (before[y, x + 1] - before[y, x - 1]) ** 2 + (
+                    before[y + 1, x] - before[y - 1, x]
+                ) ** 2
+                contrast_now += (now[y, x + 1] - now[y, x - 1]) ** 2 + (now[y + 1, x] - now[y - 1, x]) ** 2
                 change = now[y, x] - before[y, x]
                 square += change * change
                 for i in range(4):
@@ -249,6 +258,9 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
         xx, xy, yy = normal[0, 0], normal[0, 1], normal[1, 1]
         weakest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         if weakest < (SIGMA_GREY / max_sigma_px) ** 2:
+            continue
+        if max(contrast_before, contrast_now) > MAX_CONTRAST_RATIO**2 * min(contrast_before, contrast_now):
+            result[block] = np.inf
             continue
         for i in range(4):
             normal[i, i] += 1e-6 * (1.0 + normal[i, i])

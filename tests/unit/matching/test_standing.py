@@ -75,6 +75,15 @@ def test_the_first_and_the_last_unit_of_a_stop_are_kept(tmp_path: Path) -> None:
     assert found.compared == 11
 
 
+def test_grey_images_do_not_stand(tmp_path: Path) -> None:
+    """They show nothing: as a picture of another exposure, each would be any other."""
+
+    def drawn(unit: int, camera: int) -> np.ndarray:
+        return np.full(SIZE_PX[::-1], 128.0) if 3 <= unit <= 7 else view(camera, 25.0 * unit)
+
+    assert standing_of(write(tmp_path, 11, drawn)).included.all()
+
+
 def test_steps_of_a_creeping_car_add_up(tmp_path: Path) -> None:
     """0.8 px from unit to unit are no motion, three times that is: against the last unit that was kept."""
     found = standing_of(write(tmp_path, 17, lambda unit, camera: view(camera, 0.8 * unit)))
