@@ -137,13 +137,7 @@ def take_calibration(mapper: Mapper, other: Mapper) -> None:
     lengths_m = [np.linalg.norm(m.state.camera_position_m - m.state.camera_position_m.mean(0)) for m in (mapper, other)]
     if min(lengths_m) ** 2 >= MIN_BASELINES_M2:
         scale_with_baselines(mapper, float(lengths_m[1] / lengths_m[0]))
-    mapper.state = replace(
-        mapper.state,
-        camera_rotation=other.state.camera_rotation.copy(),
-        camera_position_m=other.state.camera_position_m.copy(),
-        camera_params=other.state.camera_params.copy(),
-        camera_time_offset_s=other.state.camera_time_offset_s.copy(),
-    )
+    mapper.state = mapper.state.with_cameras_of(other.state)
     mapper.renew_motion()
 
 

@@ -203,14 +203,7 @@ def _grown_in(
 def _without_poses(mapper: Mapper, pairs: Sequence[PairMatches]) -> Mapper:
     """A mapper of the same drive with the calibration as it is now, and tracks of some pairs."""
     result = Mapper(mapper.drive, mapper.keypoints, build_tracks(mapper.keypoints, pairs), mapper.config)
-    known = mapper.state
-    result.state = replace(
-        result.state,
-        camera_rotation=known.camera_rotation.copy(),
-        camera_position_m=known.camera_position_m.copy(),
-        camera_params=known.camera_params.copy(),
-        camera_time_offset_s=known.camera_time_offset_s.copy(),
-    )
+    result.state = result.state.with_cameras_of(mapper.state)
     result.rig_as_begun = mapper.rig_as_begun
     return result
 
@@ -225,10 +218,11 @@ def _put_together(
 ) -> list[Component]:
     """Parts that anything links as one; the others as they are."""
     result: list[Component] = []
+    across = [*near, *far]
     ordered = sorted(grown, key=lambda part: -part.size)
     ordered[0].log.calibration_held = False
     for part in ordered:
-        result = _with(result, part, near, far, prior_world_from_rig)
+        result = _with(result, part, near, across, prior_world_from_rig)
     for whole in result:
         if not whole.links:
             continue
@@ -242,12 +236,12 @@ def _with(
     wholes: list[Component],
     part: Component,
     near: Sequence[PairMatches],
-    far: Sequence[PairMatches],
+    across: Sequence[PairMatches],
     prior_world_from_rig: Floats | None,
 ) -> list[Component]:
     """The parts with another one, linked to the first of them that it can be linked to."""
     for whole in wholes:
-        whole_from_part = _by_images(whole.mapper, part, [*near, *far])
+        whole_from_part = _by_images(whole.mapper, part, across)
         if whole_from_part is not None:
             _take_in(whole, part, whole_from_part, near, LinkedBy.IMAGES)
             return wholes

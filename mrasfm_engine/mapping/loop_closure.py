@@ -203,14 +203,16 @@ def largest_agreement(mapper: Mapper, other: Mapper, revisits: Sequence[Revisit]
     own = np.stack([revisit.covariance for revisit in revisits])
     drifts = np.stack([revisit.drift for revisit in revisits])
     here, there = (DriftModel.from_registrations(one, own) for one in (mapper, other))
-    units = np.array([(revisit.earlier, revisit.later) for revisit in revisits])
-    at_m = there.position_m[units[:, 1]]
+    earlier, later = np.array([(revisit.earlier, revisit.later) for revisit in revisits]).T
+    way_here_m, way_there_m = here.travelled_m[earlier], there.travelled_m[later]
+    at_m, turn_sigma_rad = there.position_m[later], _sigmas(own)[:, 0]
     best = np.zeros(len(revisits), dtype=np.bool_)
     for i in range(len(revisits)):
-        apart = [np.abs(m[own_units] - m[own_units[i]]) for m, own_units in
-                 ((here.travelled_m, units[:, 0]), (there.travelled_m, units[:, 1]))]  # fmt: skip
-        sigmas = np.hypot(here.step_sigmas(apart[0]), there.step_sigmas(apart[1]))
-        sigmas[:, 1] = np.hypot(sigmas[:, 1], _sigmas(own)[:, 0] * np.linalg.norm(at_m - at_m[i], axis=1))
+        sigmas = np.hypot(
+            here.step_sigmas(np.abs(way_here_m - way_here_m[i])),
+            there.step_sigmas(np.abs(way_there_m - way_there_m[i])),
+        )
+        sigmas[:, 1] = np.hypot(sigmas[:, 1], turn_sigma_rad * np.linalg.norm(at_m - at_m[i], axis=1))
         difference = _steps(drifts, at_m[i]) - _steps(drifts[i : i + 1], at_m[i])
         agrees = squared_lengths(difference, own + own[i] + _diagonal(sigmas)) <= _limit()
         if agrees.sum() > best.sum():

@@ -37,8 +37,13 @@ def describe(mapper: Mapper, log: MappingLog, others: Sequence[Mapper] = ()) -> 
     unclear = Counter(name for r in log.registrations for name in r.unclear)
     start = log.initialisation
     known = np.any([mapper.registered, *(other.registered for other in others)], axis=0)
+    keypoints = np.bincount(mapper.keypoints.unit, minlength=len(frames))
     missing = [
-        {"unit": int(u), "source_frame": frames[u].source_frame, "reason": _why_missing(mapper, log, int(u))}
+        {
+            "unit": int(u),
+            "source_frame": frames[u].source_frame,
+            "reason": _why_missing(mapper, log, int(u), int(keypoints[u])),
+        }
         for u in np.flatnonzero(~known & mapper.keyframe)
     ]
     return {
@@ -68,10 +73,9 @@ def describe(mapper: Mapper, log: MappingLog, others: Sequence[Mapper] = ()) -> 
     }
 
 
-def _why_missing(mapper: Mapper, log: MappingLog, unit: int) -> str:
+def _why_missing(mapper: Mapper, log: MappingLog, unit: int, keypoints: int) -> str:
     if unit in log.failures:
         return log.failures[unit].reason
-    keypoints = int(np.count_nonzero(mapper.keypoints.unit == unit))
     least = mapper.config.mapping.min_pnp_inliers
     if keypoints < least:
         return f"its images have {keypoints} keypoints, {least} are needed"

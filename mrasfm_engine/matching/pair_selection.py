@@ -63,8 +63,10 @@ def units_ahead(motion: Motion, config: PairConfig, usable: Bools | None = None)
     )
 
 
-def usable_units(drive: Drive, usable: Bools) -> Bools:
-    """Units (units,) that have an image that is usable (images,)."""
+def usable_units(drive: Drive, usable: Bools | None) -> Bools | None:
+    """Units (units,) that have an image that is usable (images,); None, as all are, where that is not given."""
+    if usable is None:
+        return None
     result = np.zeros(len(drive.timestamps_us), dtype=np.bool_)
     result[[image.unit for image, good in zip(drive.images, usable, strict=True) if good]] = True
     return result
@@ -83,7 +85,7 @@ def pairs_from_window(
     pairs = set()
     if usable is not None:
         index = {place: image for place, image in index.items() if usable[image]}
-    for unit, ahead in enumerate(units_ahead(motion, config, None if usable is None else usable_units(drive, usable))):
+    for unit, ahead in enumerate(units_ahead(motion, config, usable_units(drive, usable))):
         for place, other in enumerate([unit, *ahead.tolist()]):
             near = place <= config.cross_window_units
             common = linked.after(motion.travelled_m[other] - motion.travelled_m[unit]) if near else None
@@ -171,7 +173,7 @@ def pairs_from_poses(drive: Drive, world_from_rig: Floats, config: PairConfig, u
     motion = motion_from_poses(drive, world_from_rig)
     travelled_m = motion.travelled_m
     unit_a, unit_b = views.unit[pairs].T
-    ahead = units_ahead(motion, config, None if usable is None else usable_units(drive, usable))
+    ahead = units_ahead(motion, config, usable_units(drive, usable))
     near = are_following(ahead, unit_a, unit_b)
     between_m = np.abs(travelled_m[unit_a] - travelled_m[unit_b])
     position = world_from_rig[views.unit, :3, 3]

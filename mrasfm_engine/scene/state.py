@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,3 +51,13 @@ class State:
     def unit_from_band(self) -> Floats:
         """The rig's poses at the row bands, relative to its pose at their unit's timestamp (s, 4, 4)."""
         return se3.transform(self.band_rotation, self.band_position_m)
+
+    def with_cameras_of(self, other: State) -> State:
+        """The state with copies of another one's calibration and time offsets of the cameras."""
+        return replace(
+            self,
+            camera_rotation=other.camera_rotation.copy(),
+            camera_position_m=other.camera_position_m.copy(),
+            camera_params=other.camera_params.copy(),
+            camera_time_offset_s=other.camera_time_offset_s.copy(),
+        )
