@@ -109,6 +109,20 @@ class MatchConfig(_Section):
     max_error_px: Positive = Field(2.0, description="largest epipolar distance of an inlier")
 
 
+class SubmapConfig(_Section):
+    """The cut of a long drive into sub-maps, which are extracted, matched and mapped by themselves and then joined."""
+
+    count: Count | None = Field(
+        None, description="by default as few as `memory_mb` allows, or as many as there are workers for"
+    )
+    memory_mb: Positive = Field(
+        1500.0, description="expected memory of mapping a sub-map besides the program's own; larger drives are cut"
+    )
+    overlap_units: Annotated[int, Field(ge=3)] = Field(
+        10, description="units that two neighbouring sub-maps share, which say how one lies to the other"
+    )
+
+
 class MappingConfig(_Section):
     """Incremental mapping."""
 
@@ -291,6 +305,7 @@ class EngineConfig(_Section):
     features: FeatureConfig = FeatureConfig()
     pairs: PairConfig = PairConfig()
     matching: MatchConfig = MatchConfig()
+    submaps: SubmapConfig = SubmapConfig()
     mapping: MappingConfig = MappingConfig()
     bundle_adjustment: BundleAdjustmentConfig = BundleAdjustmentConfig()
     gnss: GnssConfig = GnssConfig()

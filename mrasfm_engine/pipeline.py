@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mrasfm_engine import stages
 from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.errors import CancelledError, InputError, StorageError
 from mrasfm_engine.export.publishing import scratch_folder
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.scene.submaps import Span, Submap
 from mrasfm_engine.types import StageProgress
 from schemas.artifacts import Stage
 
@@ -68,13 +73,14 @@ def reconstruct(
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
     with watched_compilation() as compiled:
-        stages.load_models(run)
-        stages.preflight(run)
-        prior = stages.leave_out_standing(run, stages.prior(run))
-        stages.probe(run)
-        features = stages.features(run)
-        matches = stages.matches(run, features, prior)
-        model, *others = stages.mapping(run, features, matches, prior)
+        prior, spans = _begun(run)
+        features: Sequence[ImageFeatures]
+        if spans:
+            features, matches, (model, *others) = stages.join_submaps(run, stages.run_submaps(run, spans), prior)
+        else:
+            features = stages.features(run)
+            matches = stages.matches(run, features, prior)
+            model, *others = stages.mapping(run, features, matches, prior)
         scene = stages.scene(run, model, features, matches, prior)
         components = stages.components(run, model, scene, others, prior)
         with scratch_folder(out) as scratch:
@@ -87,3 +93,99 @@ def reconstruct(
             write_scene(whole, out, run.report, pictures, parts)
     run.progress(Stage.EXPORT, 1, 1)
     return run.report
+
+
+def plan_submaps(
+    drive_folder: Path,
+    out: Path,
+    config: EngineConfig,
+    *,
+    workers: int,
+    progress: StageProgress = lambda stage, done, total: None,
+    cancel: Callable[[], bool] = lambda: False,
+    content_sha256: Mapping[str, str] | None = None,
+) -> list[Submap]:
+    """Check a drive and cut it into sub-maps, which any processes may do by `reconstruct_submap` before `reconstruct`.
+
+    What all of them need to know stays in `out/.stages`, see `PLAN_CHECKPOINTS`.
+
+    Parameters
+    ----------
+    workers
+        Number of processes that a long drive is cut for, at least.
+
+    Returns
+    -------
+    list of Submap
+        None where the drive is one piece.
+
+    Raises
+    ------
+    InputError, ReconstructionError, StorageError, CancelledError
+        As `reconstruct`, whose other parameters these are.
+    """
+    drive = read_drive(drive_folder)
+    run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
+    _, spans = _begun(run, workers)
+    stages.own_cars(run)
+    unit_of = np.arange(len(drive.manifest.frames)) if run.standing is None else np.flatnonzero(run.standing.included)
+    result = []
+    for span in spans:
+        images = [run.drive.images[image] for image in span.images_of(run.drive)]
+        files = [name for image in images for name in (image.file, image.mask) if name is not None]
+        result.append(
+            Submap(
+                number=span.number,
+                first_unit=int(unit_of[span.first]),
+                last_unit=int(unit_of[span.last]),
+                files=tuple(files),
+                is_finished=stages.SubmapRun(run, span).is_finished,
+            )
+        )
+    return result
+
+
+def reconstruct_submap(
+    drive_folder: Path,
+    out: Path,
+    config: EngineConfig,
+    number: int,
+    *,
+    progress: StageProgress = lambda stage, done, total: None,
+    cancel: Callable[[], bool] = lambda: False,
+    content_sha256: Mapping[str, str] | None = None,
+) -> None:
+    """Extract, match and map one of the sub-maps that `plan_submaps` made; its finished stages stay in `out/.stages`.
+
+    Of the drive's files its own are enough, if the SHA-256 of all are given.
+
+    Raises
+    ------
+    InputError, StorageError, CancelledError
+        As `reconstruct`, whose other parameters these are. A sub-map in which nothing can be mapped is no error: its
+        units may be those of a tunnel.
+    """
+    drive = read_drive(drive_folder)
+    run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
+    with watched_compilation():
+        stages.load_models(run)
+        stages.leave_out_standing(run, stages.prior(run))
+        span = next((span for span in stages.cut_drive(run) if span.number == number), None)
+        if span is None:
+            raise StorageError(
+                f"the plan of sub-map {number} is not there any more", remedy="Ask for the reconstruction again."
+            )
+        stages.own_cars(run)
+        stages.SubmapRun(run, span).finish()
+
+
+def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Span]]:
+    """Everything before the long work: the prior trajectory of the units that are mapped, and the cut of the drive."""
+    stages.load_models(run)
+    stages.preflight(run)
+    prior = stages.leave_out_standing(run, stages.prior(run))
+    stages.probe(run)
+    spans = stages.cut_drive(run, workers)
+    if spans:
+        stages.own_cars(run)
+    return prior, spans

@@ -48,6 +48,15 @@ def checkpoint_file(name: str) -> str:
     return f"{name}.npz"
 
 
+# What is done of a long drive before it is cut: names of checkpoints.
+PLAN_CHECKPOINTS = ("standing", "own-car", "submaps")
+
+
+def submap_checkpoint(number: int, stage: str) -> str:
+    """Name the checkpoint of a stage of a sub-map, counted from 1."""
+    return f"submap-{number}-{stage}"
+
+
 def component_folder(number: int) -> str:
     """Name the folder of a component, counted from 1, inside the scene's."""
     return f"{COMPONENTS_FOLDER}/{number}"

@@ -39,6 +39,11 @@ class FeatureWriter:
         """Keypoints of the images so far."""
         return np.array(self._counts, dtype=np.int64)
 
+    @property
+    def made_masks(self) -> int:
+        """Number of images so far whose mask a network made."""
+        return sum(size > 0 for size in self._mask_bytes)
+
     def add(self, found: ImageFeatures | Incomplete) -> None:
         """Write the next image; raises as `StageWriter.add` does."""
         self._window.append(self._windows)
@@ -95,6 +100,10 @@ class StoredFeatures(Sequence[ImageFeatures]):
                 kind: stage.rows(part, 0, 0) if (part := _part(kind, some)) in stage else None for kind in KINDS
             }
 
+    def with_empty_images_of(self, other: StoredFeatures) -> None:
+        """Give images without keypoints the kinds of arrays that another file's images have."""
+        self._none = other._none
+
     def __len__(self) -> int:
         return len(self.counts)
 
@@ -123,6 +132,45 @@ class StoredFeatures(Sequence[ImageFeatures]):
         """Bytes of the PNG that a network made for an image."""
         first, count = int(self._mask_row[image]), int(self.mask_bytes[image])
         return self._stage.rows(_part("masks", int(self._window[image])), first, first + count) if count else None
+
+
+class JoinedFeatures(Sequence[ImageFeatures]):
+    """Features of a drive in the files of its sub-maps; an image that several of them have is read from the first.
+
+    Parameters
+    ----------
+    parts
+        Features of each sub-map and the drive's images (n,) that they are of; all images of the drive together.
+    """
+
+    def __init__(self, parts: Sequence[tuple[StoredFeatures, Ints]]) -> None:
+        self._parts = [features for features, _ in parts]
+        images = max(int(images.max()) for _, images in parts) + 1
+        self._part, self._row = np.empty(images, dtype=np.int64), np.empty(images, dtype=np.int64)
+        self.counts = np.empty(images, dtype=np.int64)
+        for number, (features, own) in reversed(list(enumerate(parts))):
+            self._part[own], self._row[own], self.counts[own] = number, np.arange(len(own)), features.counts
+        seen = next((part for part in self._parts if part.counts.any()), self._parts[0])
+        for part in self._parts:
+            if not part.counts.any():
+                part.with_empty_images_of(seen)
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @overload
+    def __getitem__(self, image: int) -> ImageFeatures: ...
+    @overload
+    def __getitem__(self, image: slice) -> list[ImageFeatures]: ...
+    def __getitem__(self, image: int | slice) -> ImageFeatures | list[ImageFeatures]:
+        if isinstance(image, slice):
+            return [self[i] for i in range(*image.indices(len(self)))]
+        index = range(len(self))[image]
+        features, row = self._parts[int(self._part[index])], int(self._row[index])
+        return features[row]
+
+    def __iter__(self) -> Iterator[ImageFeatures]:
+        return (self[i] for i in range(len(self)))
 
 
 def _within_window(counts: Ints, window: Ints) -> Ints:

@@ -186,10 +186,20 @@ class StageStore:
     """Arrays and a small report of every finished stage, in one folder.
 
     A result is found again only under the same name and fingerprint; writing replaces it in one step.
+
+    Parameters
+    ----------
+    prefix
+        Begins the names of all files, and tells those of several stores in one folder apart.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, prefix: str = "") -> None:
         self._folder = folder
+        self._prefix = prefix
+
+    def with_prefix(self, prefix: str) -> StageStore:
+        """The store of other stages in the same folder."""
+        return StageStore(self._folder, prefix)
 
     def has(self, name: str, key: str) -> bool:
         """Return whether a stage has been finished with this fingerprint, without reading its arrays."""
@@ -201,7 +211,7 @@ class StageStore:
 
     def open(self, name: str, key: str) -> StoredStage | None:
         """The file of a stage, to read parts of its arrays, or None where `load` finds none."""
-        path = self._folder / checkpoint_file(name)
+        path = self._folder / checkpoint_file(self._prefix + name)
         try:
             with path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 header = _header(archive)
@@ -216,7 +226,7 @@ class StageStore:
             return None
 
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
-        path = self._folder / checkpoint_file(name)
+        path = self._folder / checkpoint_file(self._prefix + name)
         try:
             # Opened here: np.load leaves a file open that turns out not to be an archive.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -235,7 +245,7 @@ class StageStore:
     @contextmanager
     def writing(self, name: str, key: str) -> Iterator[StageWriter]:
         """A stage that is written in parts, and kept where it is finished before the block ends."""
-        writer = StageWriter(self._folder, name, key)
+        writer = StageWriter(self._folder, self._prefix + name, key)
         try:
             yield writer
         finally:

@@ -25,6 +25,7 @@ from mrasfm_engine.mapping.placement import (
     positions_of_units,
     reassess_positions,
 )
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.types import Bools, Floats, Ints
 
 LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adjustment, that take part in it
@@ -56,6 +57,15 @@ class AbsolutePriors:
     rough_rotations: RotationPrior | None = None
     placed_by_rough_poses: bool = False
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
+
+    @staticmethod
+    def from_trajectory(known: PriorTrajectory) -> AbsolutePriors:
+        """Absolute poses that the manifest knows; nothing is compared with them yet."""
+        return AbsolutePriors(
+            gnss=known.gnss,
+            antenna_in_rig_m=known.antenna_in_rig_m,
+            rough_world_from_rig=known.rough_world_from_rig,
+        )
 
     @property
     def positions(self) -> ReceiverPositions | None:

@@ -105,25 +105,109 @@ def map_drive(
     CancelledError
         Where `cancel` answers True.
     """
+    growth = begin_growth(drive, keypoints, pairs, prior_world_from_rig, config, absolute, progress, cancel)
+    growth.grow()
+    return growth.finish()
+
+
+def begin_growth(
+    drive: Drive,
+    keypoints: Keypoints,
+    pairs: Sequence[PairMatches],
+    prior_world_from_rig: Floats | None,
+    config: EngineConfig,
+    absolute: AbsolutePriors | None = None,
+    progress: CountProgress | None = None,
+    cancel: Cancel | None = None,
+) -> Growth:
+    """Growth of a drive of which nothing has a pose yet."""
     near, far = split_pairs(pairs)
-    absolute = AbsolutePriors() if absolute is None else absolute
     mapper, still = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
-    sound = without_keypoints(near, keypoints.first, still) if still.any() else near
-    log = run_incremental_mapping(
-        mapper, sound, prior_world_from_rig, absolute=absolute, progress=progress, cancel=cancel
+    return Growth(
+        mapper=mapper,
+        still=still,
+        near=near,
+        far=far,
+        sound=without_keypoints(near, keypoints.first, still) if still.any() else near,
+        prior_world_from_rig=prior_world_from_rig,
+        absolute=AbsolutePriors() if absolute is None else absolute,
+        progress=progress,
+        cancel=cancel,
     )
-    grown = [Component(mapper=mapper, log=log)]
-    if config.mapping.camera_set_registration:
-        _grow_others(grown, sound, prior_world_from_rig, absolute, progress, cancel)
-    together = _put_together(grown, sound, far, prior_world_from_rig, progress, cancel)
-    result, taken = list[Component](), np.zeros(len(drive.manifest.frames), dtype=np.bool_)
-    for part in sorted(together, key=lambda part: -part.size):
-        part.mapper = cleaned_and_closed(part.mapper, part.log, near, far, still, progress=progress, cancel=cancel)
-        part.mapper.forget(np.flatnonzero(part.mapper.registered & taken))
-        if not result or part.size >= MIN_UNITS:
-            taken |= part.mapper.registered
-            result.append(part)
-    return result
+
+
+@dataclass(kw_only=True)
+class Growth:
+    """Parts of a drive while they grow, and what they grow from.
+
+    Attributes
+    ----------
+    mapper
+        The drive without poses.
+    still
+        Keypoints (k,) that stand still in the image while the car moves.
+    near, far
+        Pairs of units that follow one another, and of those that may be revisits.
+    sound
+        Those of `near` without the keypoints that stand still.
+    parts
+        What has grown so far.
+    """
+
+    mapper: Mapper
+    still: Bools
+    near: Sequence[PairMatches]
+    far: Sequence[PairMatches]
+    sound: Sequence[PairMatches]
+    prior_world_from_rig: Floats | None
+    absolute: AbsolutePriors
+    progress: CountProgress | None
+    cancel: Cancel | None
+    parts: list[Component] = field(default_factory=list)
+
+    def grow(self) -> None:
+        """Grow a part from the best seed, and others of what it does not reach.
+
+        Raises
+        ------
+        ReconstructionError
+            Where not even the first can begin.
+        """
+        log = run_incremental_mapping(
+            self.mapper,
+            self.sound,
+            self.prior_world_from_rig,
+            absolute=self.absolute,
+            progress=self.progress,
+            cancel=self.cancel,
+        )
+        self.parts.append(Component(mapper=self.mapper, log=log))
+        self.grow_others()
+
+    def grow_others(self) -> None:
+        """Grow parts of units that have no pose yet, as far as they hold together."""
+        if self.mapper.config.mapping.camera_set_registration:
+            _grow_others(self.parts, self.sound, self.prior_world_from_rig, self.absolute, self.progress, self.cancel)
+
+    def put_together(self) -> list[Component]:
+        """The parts, of which those that anything links are one; the one with most units first."""
+        together = _put_together(
+            self.parts, self.sound, self.far, self.prior_world_from_rig, self.progress, self.cancel
+        )
+        return sorted(together, key=lambda part: -part.size)
+
+    def finish(self) -> list[Component]:
+        """The parts as `put_together` gives them, cleaned of what moves along, and with their loops closed."""
+        result, taken = list[Component](), np.zeros(len(self.mapper.registered), dtype=np.bool_)
+        for part in self.put_together():
+            part.mapper = cleaned_and_closed(
+                part.mapper, part.log, self.near, self.far, self.still, progress=self.progress, cancel=self.cancel
+            )
+            part.mapper.forget(np.flatnonzero(part.mapper.registered & taken))
+            if not result or part.size >= MIN_UNITS:
+                taken |= part.mapper.registered
+                result.append(part)
+        return result
 
 
 def _grow_others(

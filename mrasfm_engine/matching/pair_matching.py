@@ -118,6 +118,9 @@ def match_pairs(
     with threadpool_limits(1, "blas"):
         while True:
             images, following = PreparedImages(drive, features, matcher, batch, threads=threads), batch[:0]
+            if not len(batch) and further is not None:
+                following, further = in_order_of_drive(further(found, inlier_rays_of)), None
+                total = len(following)
             with closing(in_order(threads, one, batch)) as results:
                 for number, (result, across) in enumerate(results, 1):
                     done, across_classes = done + 1, across_classes + across

@@ -76,6 +76,8 @@ def images_at_once(pairs: Ints, unit: Ints, threads: int) -> int:
     unit
         Of each image.
     """
+    if not len(pairs):
+        return 2 * IN_FLIGHT * threads
     by_unit = pairs[np.argsort(unit[pairs[:, 0]], kind="stable")]
     _, first = np.unique(unit[by_unit[:, 0]], return_index=True)
     images = [np.unique(part) for part in np.split(by_unit, first[1:])]

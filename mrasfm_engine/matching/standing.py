@@ -272,9 +272,3 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
         else:
             result[block] = np.hypot(solution[0], solution[1])
     return result
-
-
-def without_standing(drive: Drive, included: Bools) -> Drive:
-    """The drive of the units that are included (units,)."""
-    frames = [frame for frame, is_included in zip(drive.manifest.frames, included.tolist(), strict=True) if is_included]
-    return Drive(drive.root, drive.manifest.model_copy(update={"frames": frames}))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Bools, Floats, Ints
 from schemas import Camera, DriveManifest, Pose
 
 
@@ -59,6 +59,11 @@ class Drive:
     def cameras(self) -> list[Camera]:
         """The rig's cameras, in manifest order."""
         return self.manifest.rig.cameras
+
+    def restricted_to(self, units: Bools) -> Drive:
+        """The drive of some of its units (units,) alone."""
+        frames = [frame for frame, is_wanted in zip(self.manifest.frames, units.tolist(), strict=True) if is_wanted]
+        return Drive(self.root, self.manifest.model_copy(update={"frames": frames}))
 
     @cached_property
     def images(self) -> list[DriveImage]:

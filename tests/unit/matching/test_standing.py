@@ -11,7 +11,7 @@ import pytest
 
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.matching.standing import Standing, find_standing, moving_by_prior, without_standing
+from mrasfm_engine.matching.standing import Standing, find_standing, moving_by_prior
 from mrasfm_engine.scene.drive import Drive
 from tests.helpers.simulated_drive import make_drive
 
@@ -167,6 +167,6 @@ def test_images_that_stay_while_the_prior_moves_on_are_something_that_moves_alon
 def test_the_drive_without_them(tmp_path: Path) -> None:
     drive = write(tmp_path, 11, lambda unit, camera: view(camera, stop_px(unit)), cameras=1)
     found = standing_of(drive)
-    left = without_standing(drive, found.included)
+    left = drive.restricted_to(found.included)
     assert [frame.source_frame for frame in left.manifest.frames] == [0, 1, 2, 7, 8, 9, 10]
     assert [image.unit for image in left.images] == list(range(7))

@@ -1,0 +1,42 @@
+"""The stages of a reconstruction.
+
+Each takes its input, leaves its result and a report in the store, and is skipped where both are there already.
+"""
+
+from __future__ import annotations
+
+from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
+from mrasfm_engine.stages._features import features
+from mrasfm_engine.stages._mapping import mapping
+from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
+from mrasfm_engine.stages._own_car import own_cars
+from mrasfm_engine.stages._run import VERSIONS, Run, store_of
+from mrasfm_engine.stages._scene import components, pictures, scene
+from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
+from mrasfm_engine.stages._submaps import SubmapRun, cut_drive, join_submaps, run_submaps
+
+__all__ = [
+    "VERSIONS",
+    "Run",
+    "SubmapRun",
+    "all_units",
+    "components",
+    "cut_drive",
+    "features",
+    "in_units",
+    "join_submaps",
+    "leave_out_standing",
+    "load_models",
+    "mapping",
+    "matches",
+    "own_cars",
+    "pack_pairs",
+    "pictures",
+    "preflight",
+    "prior",
+    "probe",
+    "run_submaps",
+    "scene",
+    "store_of",
+    "unpack_pairs",
+]

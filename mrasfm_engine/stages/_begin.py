@@ -1,0 +1,61 @@
+"""What comes before the long work: models, the check of the drive, its prior trajectory, a probe of the calibration."""
+
+from __future__ import annotations
+
+from mrasfm_engine.features.extraction import extract_features
+from mrasfm_engine.matching.calibration_check import require_calibration_direction
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
+from mrasfm_engine.preflight.drive_check import require_sound
+from mrasfm_engine.preflight.image_content import inspect_drive
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.stages._run import Run
+from schemas.artifacts import Stage
+from schemas.findings import as_json
+
+PROBE_UNITS = 5
+
+
+def load_models(run: Run) -> None:
+    """Read the models that the settings name; refuse what does not go together before any work."""
+    run.report["models"] = run.components.describe()
+
+
+def preflight(run: Run) -> None:
+    """Check manifest, files and a sample of the images; refuse what cannot work before any long work."""
+    run.begin(Stage.PREFLIGHT)
+    findings = inspect_drive(
+        run.drive, use_gnss=run.config.use_gnss, progress=run.step(Stage.PREFLIGHT), cancel=run.cancel
+    )
+    run.report["findings"] = [as_json(finding) for finding in findings]
+    require_sound(findings)
+    run.progress(Stage.PREFLIGHT, 1, 1)
+
+
+def prior(run: Run) -> PriorTrajectory:
+    """Read the prior trajectory of the units."""
+    result = prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
+    run.report["prior"] = {
+        "source": result.source,
+        "gnss_samples": 0 if result.gnss is None else len(result.gnss.good),
+        "gnss_gross_errors": 0 if result.gnss is None else int((~result.gnss.good).sum()),
+    }
+    return result
+
+
+def probe(run: Run) -> None:
+    """Check on the first units that the calibration is the right way round."""
+    images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
+    known = run.store.has("features", run.next_key(Stage.FEATURES, run.feature_settings))
+    if len(run.drive.cameras) < 2 or known:
+        return
+    first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
+    features = extract_features(
+        Drive(run.drive.root, first),
+        run.components.extractor,
+        threads=run.config.threads,
+        segmenter=run.components.segmenter,
+        cancel=run.cancel,
+    )
+    if all(f.left_out for f in features):
+        return  # the extraction says whether there are others
+    require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)

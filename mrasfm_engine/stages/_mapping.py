@@ -1,0 +1,94 @@
+"""Units registered, points triangulated, everything adjusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.io.stage_store import Arrays
+from mrasfm_engine.mapping import gaps, mapping_report
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.components import Component, Growth, begin_growth
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.scene.row_bands import RowBands
+from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.stages._run import Run
+from mrasfm_engine.triangulation.tracks import Keypoints
+from schemas.artifacts import Stage
+from schemas.findings import as_json
+
+
+def mapping(
+    run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
+) -> list[Mapper]:
+    """Units registered one by one, points triangulated, everything adjusted; of every component, the largest first."""
+    keypoints = keypoints_of(run, found)
+
+    def work() -> tuple[Arrays, dict[str, Any]]:
+        growth = growth_of(run, keypoints, pairs, known)
+        growth.grow()
+        return packed(growth.finish(), found)
+
+    return mappers(run, keypoints, known, work)
+
+
+def keypoints_of(run: Run, found: Sequence[ImageFeatures]) -> Keypoints:
+    """The keypoints of all images in one row of arrays."""
+    bands = RowBands.from_drive(run.drive, compensate=run.config.mapping.motion_compensation)
+    return Keypoints.from_features(run.drive, found, bands)
+
+
+def growth_of(run: Run, keypoints: Keypoints, pairs: Sequence[PairMatches], known: PriorTrajectory) -> Growth:
+    """Growth of the run's drive."""
+    return begin_growth(
+        run.drive,
+        keypoints,
+        pairs,
+        known.world_from_rig,
+        run.config,
+        absolute=AbsolutePriors.from_trajectory(known),
+        progress=run.step(Stage.MAPPING),
+        cancel=run.cancel,
+    )
+
+
+def packed(parts: Sequence[Component], found: Sequence[ImageFeatures]) -> tuple[Arrays, dict[str, Any]]:
+    """Components as arrays, and the report of the stage."""
+    for part in parts:
+        part.mapper.missing |= np.array([features.left_out is not None for features in found])
+    arrays = {
+        f"{number}.{name}": array
+        for number, part in enumerate(parts)
+        for name, array in part.mapper.to_arrays().items()
+    }
+    return arrays, {
+        **mapping_report.describe(parts[0].mapper, parts[0].log, [part.mapper for part in parts[1:]]),
+        **gaps.describe(parts),
+        "findings": [as_json(finding) for finding in gaps.findings(parts)],
+    }
+
+
+def mapping_settings(run: Run) -> object:
+    """Dependencies of mapping besides the matches."""
+    sections = (run.config.mapping, run.config.bundle_adjustment, run.config.gnss)
+    return [*(section.model_dump() for section in sections), run.config.seed, run.config.use_gnss]
+
+
+def mappers(
+    run: Run, keypoints: Keypoints, known: PriorTrajectory, work: Callable[[], tuple[Arrays, dict[str, Any]]]
+) -> list[Mapper]:
+    """The stage of mapping by some work, or from the store."""
+    arrays, report = run.stage(Stage.MAPPING, mapping_settings(run), work)
+    run.report["findings"] += report["findings"]
+    return [
+        Mapper.from_arrays(run.drive, keypoints, run.config, known.world_from_rig, numbered(arrays, number))
+        for number in range(len(report["components"]))
+    ]
+
+
+def numbered(arrays: Arrays, number: int) -> Arrays:
+    """The arrays of one of several parts, by their names in it."""
+    return {name.partition(".")[2]: array for name, array in arrays.items() if name.startswith(f"{number}.")}

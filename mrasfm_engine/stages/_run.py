@@ -1,0 +1,143 @@
+"""One run: settings, store, report, and who watches; stages that are done, or found in the store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mrasfm_engine import __version__
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import CancelledError, StorageError
+from mrasfm_engine.io.stage_store import Arrays, StageStore, StageWriter, StoredStage, drive_fingerprint, fingerprint
+from mrasfm_engine.matching.standing import Standing
+from mrasfm_engine.registry import Components, load_components
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.types import Bools, CountProgress, StageProgress
+from schemas.artifacts import CHECKPOINT_FOLDER, Stage
+
+Result = TypeVar("Result")
+
+# Raise a stage's version with every change after which the same input and settings give another result: what was
+# finished under an older version is done again, with all that follows from it.
+VERSIONS = {Stage.FEATURES: 5, Stage.MATCHES: 6, Stage.MAPPING: 9}
+
+
+@dataclass
+class Run:
+    """One reconstruction under way: settings, store, report, and who watches."""
+
+    drive: Drive
+    config: EngineConfig
+    store: StageStore
+    progress: StageProgress
+    cancel: Callable[[], bool]
+    content_sha256: Mapping[str, str] | None = None  # of the drive's files by name, where the caller knows them
+    report: dict[str, Any] = field(
+        default_factory=lambda: {"engine_version": __version__, "findings": [], "stages": []}
+    )
+    own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once images were looked at
+    key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
+    standing: Standing | None = None  # where units are left out: which, and the drive with all of them
+    whole_drive: Drive | None = None
+
+    @cached_property
+    def components(self) -> Components:
+        """Extractor, matcher and segmenter; their models are loaded at the first use, once."""
+        return load_components(self.config, self.drive.manifest.label_map)
+
+    def share_models(self, other: Run) -> None:
+        """Use the models that another run with the same settings has loaded, or will load."""
+        self.__dict__["components"] = other.components
+
+    @property
+    def feature_settings(self) -> object:
+        """Dependencies of the features: settings, and the models by their hashes."""
+        config = self.config
+        models = self.components.fingerprint_of("extractor", "segmenter")
+        return [config.features.model_dump(), config.semantics.model_dump(), models]
+
+    def step(self, stage: Stage) -> CountProgress:
+        """The progress callback of a stage."""
+        return lambda done, total: self.progress(stage, done, total)
+
+    def begin(self, stage: Stage) -> None:
+        """Tell that a stage begins, of which nothing is done yet."""
+        self.progress(stage, 0, 0)
+
+    @cached_property
+    def drive_key(self) -> str:
+        """Fingerprint of the drive's manifest and files."""
+        return drive_fingerprint(self.drive, self.content_sha256, threads=self.config.threads)
+
+    def next_key(self, stage: Stage, settings: object) -> str:
+        """The fingerprint of a stage that follows those done so far."""
+        return fingerprint(self.key or self.drive_key, stage, settings, VERSIONS[stage])
+
+    def stage(
+        self, name: Stage, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]
+    ) -> tuple[Arrays, dict[str, Any]]:
+        """Do a stage, or take its result from the store.
+
+        A stage's fingerprint covers the one before it, its own settings and its version.
+        """
+
+        def done() -> tuple[Arrays, dict[str, Any]]:
+            found = work()
+            self.store.save(name, self.key, *found)
+            return found
+
+        return self._found_or_done(
+            name, settings, lambda: self.store.load(name, self.key), done, lambda found: found[1]
+        )
+
+    def large_stage(
+        self, name: Stage, settings: object, work: Callable[[StageWriter], dict[str, Any]]
+    ) -> tuple[StoredStage, dict[str, Any]]:
+        """Do a stage whose arrays are written as they come, or find its file in the store; `work` gives its report."""
+
+        def done() -> StoredStage:
+            with self.store.writing(name, self.key) as writer:
+                writer.finish(work(writer))
+            written = self.store.open(name, self.key)
+            if written is None:
+                raise StorageError(
+                    f"what was written of the stage {name} does not come back from the disk",
+                    remedy="Check the disk that the scene is written to.",
+                )
+            return written
+
+        found = self._found_or_done(
+            name, settings, lambda: self.store.open(name, self.key), done, lambda found: found.report
+        )
+        return found, found.report
+
+    def _found_or_done(
+        self,
+        name: Stage,
+        settings: object,
+        find: Callable[[], Result | None],
+        do: Callable[[], Result],
+        report_of: Callable[[Result], dict[str, Any]],
+    ) -> Result:
+        if self.cancel():
+            raise CancelledError
+        self.key = self.next_key(name, settings)
+        started = time.perf_counter()
+        found = find()
+        reused = found is not None
+        if found is None:
+            self.begin(name)
+            found = do()
+        seconds = round(time.perf_counter() - started, 3)
+        self.report["stages"].append({"stage": name, "seconds": seconds, "reused": reused, **report_of(found)})
+        self.progress(name, 1, 1)
+        return found
+
+
+def store_of(out: Path) -> StageStore:
+    """Store of finished stages in a scene's folder."""
+    return StageStore(out / CHECKPOINT_FOLDER)

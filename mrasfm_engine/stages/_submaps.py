@@ -1,0 +1,325 @@
+"""Sub-maps of a long drive: each is extracted, matched and mapped by itself, and then all are joined."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.errors import ReconstructionError
+from mrasfm_engine.features.stored_features import JoinedFeatures, StoredFeatures
+from mrasfm_engine.io.stage_store import Arrays, StageWriter, StoredStage, fingerprint
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.submaps import Part, join, part_arrays, part_from_arrays
+from mrasfm_engine.matching.pair_choice import PairChoice
+from mrasfm_engine.matching.pair_matching import match_pairs
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.scene.drive import Incomplete
+from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.scene.semantics import count_classes
+from mrasfm_engine.scene.submaps import Span, count_for_memory, cut, share_a_submap
+from mrasfm_engine.stages._begin import prior
+from mrasfm_engine.stages._features import describe_features, extract, left_out_of, require_features
+from mrasfm_engine.stages._mapping import growth_of, keypoints_of, mappers, mapping_settings, numbered, packed
+from mrasfm_engine.stages._matches import (
+    describe_matches,
+    match,
+    match_settings,
+    read_pairs,
+    require_matches,
+    write_pairs,
+)
+from mrasfm_engine.stages._run import Run
+from mrasfm_engine.stages._standing import in_units
+from mrasfm_engine.types import Bools, Ints, StageProgress
+from schemas.artifacts import Stage, submap_checkpoint
+
+SUBMAPS, SUBMAPS_VERSION = "submaps", 1
+BYTES_PER_MB = 1_000_000
+
+
+def cut_drive(run: Run, workers: int = 1) -> list[Span]:
+    """The sub-maps of the run's drive, along its way; none where it is one piece.
+
+    A cut that is in the store stays, whatever number of workers there are now.
+    """
+    settings = run.config.submaps
+    key = fingerprint(run.key or run.drive_key, SUBMAPS, settings.model_dump(), SUBMAPS_VERSION)
+    stored = run.store.load(SUBMAPS, key)
+    if stored is not None:
+        ends = enumerate(stored[0]["ends"].tolist(), 1)
+        return [Span(number=number, first=first, last=last) for number, (first, last) in ends]
+    least = count_for_memory(
+        run.drive,
+        keypoints_per_image=run.config.features.max_keypoints,
+        memory_bytes=settings.memory_mb * BYTES_PER_MB,
+    )
+    spans = cut(len(run.drive.manifest.frames), settings.count or max(workers, least), settings.overlap_units)
+    if len(spans) < 2:
+        return []
+    run.store.save(SUBMAPS, key, {"ends": np.array([(span.first, span.last) for span in spans])}, {})
+    return spans
+
+
+class SubmapRun:
+    """The stages of one sub-map: done, or found in the store, as soon as their results are asked for.
+
+    Parameters
+    ----------
+    run
+        Of the whole drive, whose own car is known.
+    progress
+        Of the sub-map's stages; by default the run's.
+    """
+
+    def __init__(self, run: Run, span: Span, progress: StageProgress | None = None) -> None:
+        self.span = span
+        units = np.zeros(len(run.drive.manifest.frames), dtype=np.bool_)
+        units[span.units] = True
+        self.images = span.images_of(run.drive)
+        self.run = Run(
+            run.drive.restricted_to(units),
+            run.config,
+            run.store.with_prefix(submap_checkpoint(span.number, "")),
+            run.progress if progress is None else progress,
+            run.cancel,
+            own_cars=run.own_cars,
+            key=fingerprint(run.key or run.drive_key, SUBMAPS, span.first, span.last),
+        )
+        self.run.share_models(run)
+
+    @cached_property
+    def is_finished(self) -> bool:
+        """Whether its last stage is in the store."""
+        last = replace(self.run)
+        last.share_models(self.run)
+        last.key = last.next_key(Stage.FEATURES, last.feature_settings)
+        last.key = last.next_key(Stage.MATCHES, match_settings(last))
+        return last.store.has(Stage.MAPPING, last.next_key(Stage.MAPPING, mapping_settings(last)))
+
+    @cached_property
+    def known(self) -> PriorTrajectory:
+        """The prior trajectory of its units."""
+        return prior(self.run)
+
+    @cached_property
+    def features(self) -> StoredFeatures:
+        """Features of its images."""
+        return extract(self.run)[0]
+
+    @cached_property
+    def matches(self) -> StoredStage:
+        """Matches among its images."""
+        return match(self.run, self.features, self.known)[0]
+
+    @cached_property
+    def mapped(self) -> Arrays:
+        """Its components as arrays, see `part_arrays`, and its keyframes."""
+        features, matches = self.features, self.matches  # in their order
+
+        def work() -> tuple[Arrays, dict[str, Any]]:
+            keypoints = keypoints_of(self.run, features)
+            growth = growth_of(self.run, keypoints, read_pairs(matches), self.known)
+            arrays: Arrays = {"keyframe": growth.mapper.keyframe}
+            try:
+                growth.grow()
+            except ReconstructionError as problem:
+                return arrays, {"components": [], "reason": str(problem)}
+            parts = growth.put_together()
+            for number, part in enumerate(parts):
+                arrays |= {f"{number}.{name}": array for name, array in part_arrays(part).items()}
+            report = packed(parts, features)[1]
+            return arrays, {**report, "findings": []}  # what they find, the joined scene finds as well
+
+        return self.run.stage(Stage.MAPPING, mapping_settings(self.run), work)[0]
+
+    def finish(self) -> None:
+        """Do all of its stages that are not in the store."""
+        _ = self.mapped
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Its entry in the drive's report, in the drive's units."""
+        stages = in_units(self.run.report["stages"], self.span.units)
+        return {"number": self.span.number, "spans": [[self.span.first, self.span.last]], "stages": stages}
+
+    def parts(self) -> list[Part]:
+        """Its components in the whole drive's units."""
+        count = len({name.partition(".")[0] for name in self.mapped if "." in name})
+        return [part_from_arrays(numbered(self.mapped, k), self.span.units, self.images) for k in range(count)]
+
+    def pairs(self) -> list[PairMatches]:
+        """Its pairs in the whole drive's images."""
+        return [
+            replace(pair, image_a=int(self.images[pair.image_a]), image_b=int(self.images[pair.image_b]))
+            for pair in read_pairs(self.matches)
+        ]
+
+
+def run_submaps(run: Run, spans: Sequence[Span]) -> list[SubmapRun]:
+    """Do every stage of all sub-maps, stage by stage."""
+    tally = _Tally(run.progress, len(spans))
+    submaps = [SubmapRun(run, span, tally.step(position)) for position, span in enumerate(spans)]
+    works: dict[Stage, Callable[[SubmapRun], object]] = {
+        Stage.FEATURES: lambda submap: submap.features,
+        Stage.MATCHES: lambda submap: submap.matches,
+        Stage.MAPPING: lambda submap: submap.mapped,
+    }
+    for stage, work in works.items():
+        run.begin(stage)
+        for submap in submaps:
+            work(submap)
+    return submaps
+
+
+class _Tally:
+    """Progress of a stage over all sub-maps: those to come are taken to be as long as the present one."""
+
+    def __init__(self, progress: StageProgress, count: int) -> None:
+        self._progress, self._count = progress, count
+        self._before: Counter[str] = Counter()
+        self._total: Counter[str] = Counter()
+
+    def step(self, position: int) -> StageProgress:
+        """The progress callback of a sub-map, of which so many come before."""
+
+        def progress(stage: str, done: int, total: int) -> None:
+            if (done, total) == (1, 1):
+                self._before[stage] += self._total.pop(stage, 0)
+            elif total:
+                self._total[stage] = total
+                before = self._before[stage]
+                self._progress(stage, before + done, before + total * (self._count - position))
+
+        return progress
+
+
+def join_submaps(
+    run: Run, submaps: Sequence[SubmapRun], known: PriorTrajectory
+) -> tuple[JoinedFeatures, list[PairMatches], list[Mapper]]:
+    """Features, matches and mapped components of the whole drive, from those of its sub-maps.
+
+    Raises
+    ------
+    InputError, ReconstructionError
+        Where no image can be read, none has a keypoint, nothing matches or no sub-map could begin.
+    """
+    run.report["submaps"] = [submap.report for submap in submaps]
+    run.key = fingerprint(run.key or run.drive_key, [submap.run.key for submap in submaps])
+    found = _joined_features(run, submaps)
+    pairs = _joined_matches(run, submaps, found, known)
+    keypoints = keypoints_of(run, found)
+    parts = [part for submap in submaps for part in submap.parts()]
+    keyframe = _keyframes(run, submaps)
+
+    def work() -> tuple[Arrays, dict[str, Any]]:
+        return packed(join(growth_of(run, keypoints, pairs, known), parts, keyframe), found)
+
+    return found, pairs, mappers(run, keypoints, known, work)
+
+
+def _joined_features(run: Run, submaps: Sequence[SubmapRun]) -> JoinedFeatures:
+    """Features of all images, and what the stage says of them."""
+    found = JoinedFeatures([(submap.features, submap.images) for submap in submaps])
+    reports = [_entry(submap, Stage.FEATURES) for submap in submaps]
+    left_out: dict[str, Incomplete] = {}
+    for report in reports:
+        left_out |= left_out_of(report)
+    by_class: Counter[str] = Counter()
+    for features in found:
+        by_class.update(count_classes([features.classes]))
+    made = sum(features.made_mask is not None for features in found)
+    described = describe_features(run.drive, found.counts, by_class, made, left_out)
+    run.report["stages"].append({"stage": Stage.FEATURES, **_times(reports), **described})
+    run.progress(Stage.FEATURES, 1, 1)
+    require_features(run, found, left_out)
+    return found
+
+
+def _joined_matches(
+    run: Run, submaps: Sequence[SubmapRun], found: JoinedFeatures, known: PriorTrajectory
+) -> list[PairMatches]:
+    """Matches of all sub-maps, and of pairs of images that no sub-map has both of."""
+    spans = [submap.span for submap in submaps]
+    unit = np.array([image.unit for image in run.drive.images], dtype=np.int64)
+
+    def across(pairs: Ints) -> Ints:
+        result: Ints = pairs[~share_a_submap(spans, unit[pairs[:, 0]], unit[pairs[:, 1]])]
+        return result
+
+    def work(stage: StageWriter) -> dict[str, Any]:
+        inside = {(pair.image_a, pair.image_b): pair for submap in reversed(submaps) for pair in submap.pairs()}
+        chosen = PairChoice(run.drive, found, known, run.config)
+        further = chosen.further
+        result = match_pairs(
+            run.drive,
+            found,
+            across(chosen.first),
+            run.components.matcher,
+            run.config.matching,
+            run.config.bundle_adjustment,
+            threads=run.config.threads,
+            prior=known,
+            further=None
+            if further is None
+            else lambda pairs, rays_of: across(further([*inside.values(), *pairs], rays_of)),
+            progress=run.step(Stage.MATCHES),
+            cancel=run.cancel,
+        )
+        every = sorted([*inside.values(), *result.pairs], key=lambda pair: (pair.image_a, pair.image_b))
+        write_pairs(stage, chosen.with_revisits(every))
+        reports = [describe_matches(run.drive, result), *(_entry(submap, Stage.MATCHES) for submap in submaps)]
+        return _joined_match_report(reports, every)
+
+    settings = [match_settings(run), [(span.first, span.last) for span in spans]]
+    stage, report = run.large_stage(Stage.MATCHES, settings, work)
+    require_matches(run, report)
+    return read_pairs(stage)
+
+
+def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[PairMatches]) -> dict[str, Any]:
+    """Report of pairs across sub-maps and of those within each; pairs that two of them share were tried in both."""
+    by_matches = max(reports, key=lambda report: int(report["simultaneous"]["matches"]))
+    summed = _summed([{name: report[name] for name in _COUNTED} for report in reports])
+    return {
+        **summed,
+        "verified_pairs": sum(bool(pair.inliers.any()) for pair in pairs),
+        "matches": sum(len(pair.matches) for pair in pairs),
+        "verified_matches": sum(int(pair.inliers.sum()) for pair in pairs),
+        "simultaneous": by_matches["simultaneous"],
+        "contradiction": by_matches["contradiction"],
+    }
+
+
+_COUNTED = ("candidate_pairs", "rejected_pairs", "prior", "dropped_between_classes")
+
+
+def _summed(reports: Sequence[Any]) -> Any:
+    """Reports of one form with their counts added up."""
+    if isinstance(reports[0], dict):
+        return {name: _summed([report[name] for report in reports]) for name in reports[0]}
+    return sum(reports)
+
+
+def _entry(submap: SubmapRun, stage: Stage) -> dict[str, Any]:
+    """Report of one of a sub-map's stages."""
+    return next(entry for entry in submap.run.report["stages"] if entry["stage"] == stage)
+
+
+def _times(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "seconds": round(sum(report["seconds"] for report in reports), 3),
+        "reused": all(report["reused"] for report in reports),
+    }
+
+
+def _keyframes(run: Run, submaps: Sequence[SubmapRun]) -> Bools:
+    """Units (u,) that any sub-map used."""
+    result = np.zeros(len(run.drive.manifest.frames), dtype=np.bool_)
+    for submap in submaps:
+        result[submap.span.units] |= submap.mapped["keyframe"]
+    return result
