@@ -105,12 +105,12 @@ def map_drive(
     CancelledError
         Where `cancel` answers True.
     """
-    growth = begin_growth(drive, keypoints, pairs, prior_world_from_rig, config, absolute, progress, cancel)
-    growth.grow()
-    return growth.finish()
+    begun = begin_mapping(drive, keypoints, pairs, prior_world_from_rig, config, absolute, progress, cancel)
+    begun.map_from_seeds()
+    return begun.finish()
 
 
-def begin_growth(
+def begin_mapping(
     drive: Drive,
     keypoints: Keypoints,
     pairs: Sequence[PairMatches],
@@ -119,11 +119,11 @@ def begin_growth(
     absolute: AbsolutePriors | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
-) -> Growth:
-    """Growth of a drive of which nothing has a pose yet."""
+) -> DriveMapping:
+    """Mapping of a drive of which nothing has a pose yet."""
     near, far = split_pairs(pairs)
     mapper, still = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
-    return Growth(
+    return DriveMapping(
         mapper=mapper,
         still=still,
         near=near,
@@ -137,7 +137,7 @@ def begin_growth(
 
 
 @dataclass(kw_only=True)
-class Growth:
+class DriveMapping:
     """Parts of a drive while they grow, and what they grow from.
 
     Attributes
@@ -165,7 +165,7 @@ class Growth:
     cancel: Cancel | None
     parts: list[Component] = field(default_factory=list)
 
-    def grow(self) -> None:
+    def map_from_seeds(self) -> None:
         """Grow a part from the best seed, and others of what it does not reach.
 
         Raises
@@ -182,9 +182,9 @@ class Growth:
             cancel=self.cancel,
         )
         self.parts.append(Component(mapper=self.mapper, log=log))
-        self.grow_others()
+        self.map_others()
 
-    def grow_others(self) -> None:
+    def map_others(self) -> None:
         """Grow parts of units that have no pose yet, as far as they hold together."""
         if self.mapper.config.mapping.camera_set_registration:
             _grow_others(self.parts, self.sound, self.prior_world_from_rig, self.absolute, self.progress, self.cancel)

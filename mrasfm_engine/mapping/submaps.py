@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
-from mrasfm_engine.mapping.components import MIN_UNITS, Component, Growth
+from mrasfm_engine.mapping.components import MIN_UNITS, Component, DriveMapping
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, adjust_globally, register_remaining
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -102,13 +102,13 @@ def part_from_arrays(arrays: Mapping[str, NDArray[Any]], units: Ints, images: In
     )
 
 
-def join(growth: Growth, parts: Sequence[Part], keyframe: Bools) -> list[Component]:
+def join(begun: DriveMapping, parts: Sequence[Part], keyframe: Bools) -> list[Component]:
     """One scene of the parts of sub-maps, as far as shared units or anything else links them.
 
     Parameters
     ----------
-    growth
-        Of the whole drive, with nothing grown.
+    begun
+        Mapping of the whole drive, of which nothing has a pose yet.
     parts
         Of all sub-maps.
     keyframe
@@ -127,16 +127,16 @@ def join(growth: Growth, parts: Sequence[Part], keyframe: Bools) -> list[Compone
             remedy="Check that consecutive frames show the same scene, and that images are sharp and not mixed up.",
             code="no-initial-units",
         )
-    growth.mapper.keyframe = keyframe
+    begun.mapper.keyframe = keyframe
     for group in in_common_frames(parts):
-        mapper = _mapper_of(growth.mapper, group)
-        component = Component(mapper=mapper, log=MappingLog(absolute=replace(growth.absolute)))
-        adjust_globally(mapper, component.log, growth.cancel)
-        register_remaining(mapper, component.log, progress=growth.progress, cancel=growth.cancel)
-        growth.parts.append(component)
-    growth.parts.sort(key=lambda part: -part.size)
-    growth.grow_others()
-    return growth.finish()
+        mapper = _mapper_of(begun.mapper, group)
+        component = Component(mapper=mapper, log=MappingLog(absolute=replace(begun.absolute)))
+        adjust_globally(mapper, component.log, begun.cancel)
+        register_remaining(mapper, component.log, progress=begun.progress, cancel=begun.cancel)
+        begun.parts.append(component)
+    begun.parts.sort(key=lambda part: -part.size)
+    begun.map_others()
+    return begun.finish()
 
 
 def in_common_frames(parts: Sequence[Part]) -> list[list[Part]]:

@@ -71,19 +71,26 @@ def count_for_memory(drive: Drive, *, keypoints_per_image: int, memory_bytes: fl
     return math.ceil(len(drive.images) * keypoints_per_image * KEYPOINT_BYTES / memory_bytes)
 
 
+def count_for_workers(units: int, workers: int, overlap: int) -> int:
+    """Number of sub-maps that keep some workers busy without doing much twice."""
+    return max(1, min(workers, (units - overlap) // ((LEAST_OVERLAPS - 1) * overlap)))
+
+
 def cut(units: int, count: int, overlap: int) -> list[Span]:
     """Cut a drive into sub-maps of nearly equal length, of which neighbours share some units.
 
-    There are fewer than asked for where they would be shorter than a few times what they share.
+    There are fewer than asked for where a unit would else be in more than two of them.
     """
-    step_least = (LEAST_OVERLAPS - 1) * overlap
-    count = max(1, min(count, (units - overlap) // step_least))
+    count = max(1, min(count, (units - overlap) // overlap))
     ends = np.linspace(0, units - overlap, count + 1).round().astype(int).tolist()
-    return [Span(number=k + 1, first=first, last=last + overlap - 1) for k, (first, last) in enumerate(pairwise(ends))]
+    return [
+        Span(number=number, first=first, last=last + overlap - 1)
+        for number, (first, last) in enumerate(pairwise(ends), 1)
+    ]
 
 
 def share_a_submap(spans: list[Span], unit_a: Ints, unit_b: Ints) -> Bools:
-    """Which pairs of units (n,), (n,) are in one sub-map."""
+    """Pairs of units (n,), (n,) that are both in one sub-map."""
     low, high = np.minimum(unit_a, unit_b), np.maximum(unit_a, unit_b)
     result = np.zeros(len(low), dtype=np.bool_)
     for span in spans:

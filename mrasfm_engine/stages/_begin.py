@@ -1,4 +1,4 @@
-"""What comes before the long work: models, the check of the drive, its prior trajectory, a probe of the calibration."""
+"""The beginning of a reconstruction: models, the check of the drive, its prior trajectory, a probe of the calibration."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import numpy as np
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.mapping import gaps, mapping_report
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
-from mrasfm_engine.mapping.components import Component, Growth, begin_growth
+from mrasfm_engine.mapping.components import Component, DriveMapping, begin_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.row_bands import RowBands
@@ -28,9 +28,9 @@ def mapping(
     keypoints = keypoints_of(run, found)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        growth = growth_of(run, keypoints, pairs, known)
-        growth.grow()
-        return packed(growth.finish(), found)
+        begun = mapping_of(run, keypoints, pairs, known)
+        begun.map_from_seeds()
+        return packed(begun.finish(), found)
 
     return mappers(run, keypoints, known, work)
 
@@ -41,9 +41,9 @@ def keypoints_of(run: Run, found: Sequence[ImageFeatures]) -> Keypoints:
     return Keypoints.from_features(run.drive, found, bands)
 
 
-def growth_of(run: Run, keypoints: Keypoints, pairs: Sequence[PairMatches], known: PriorTrajectory) -> Growth:
-    """Growth of the run's drive."""
-    return begin_growth(
+def mapping_of(run: Run, keypoints: Keypoints, pairs: Sequence[PairMatches], known: PriorTrajectory) -> DriveMapping:
+    """Mapping of the run's drive, of which nothing has a pose yet."""
+    return begin_mapping(
         run.drive,
         keypoints,
         pairs,

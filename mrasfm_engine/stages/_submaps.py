@@ -21,10 +21,10 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.drive import Incomplete
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.semantics import count_classes
-from mrasfm_engine.scene.submaps import Span, count_for_memory, cut, share_a_submap
+from mrasfm_engine.scene.submaps import Span, count_for_memory, count_for_workers, cut, share_a_submap
 from mrasfm_engine.stages._begin import prior
 from mrasfm_engine.stages._features import describe_features, extract, left_out_of, require_features
-from mrasfm_engine.stages._mapping import growth_of, keypoints_of, mappers, mapping_settings, numbered, packed
+from mrasfm_engine.stages._mapping import keypoints_of, mappers, mapping_of, mapping_settings, numbered, packed
 from mrasfm_engine.stages._matches import (
     describe_matches,
     match,
@@ -53,12 +53,14 @@ def cut_drive(run: Run, workers: int = 1) -> list[Span]:
     if stored is not None:
         ends = enumerate(stored[0]["ends"].tolist(), 1)
         return [Span(number=number, first=first, last=last) for number, (first, last) in ends]
-    least = count_for_memory(
+    units, overlap = len(run.drive.manifest.frames), settings.overlap_units
+    for_memory = count_for_memory(
         run.drive,
         keypoints_per_image=run.config.features.max_keypoints,
         memory_bytes=settings.memory_mb * BYTES_PER_MB,
     )
-    spans = cut(len(run.drive.manifest.frames), settings.count or max(workers, least), settings.overlap_units)
+    count = settings.count or max(for_memory, count_for_workers(units, workers, overlap))
+    spans = cut(units, count, overlap)
     if len(spans) < 2:
         return []
     run.store.save(SUBMAPS, key, {"ends": np.array([(span.first, span.last) for span in spans])}, {})
@@ -94,7 +96,7 @@ class SubmapRun:
 
     @cached_property
     def is_finished(self) -> bool:
-        """Whether its last stage is in the store."""
+        """True where its last stage is in the store."""
         last = replace(self.run)
         last.share_models(self.run)
         last.key = last.next_key(Stage.FEATURES, last.feature_settings)
@@ -123,13 +125,13 @@ class SubmapRun:
 
         def work() -> tuple[Arrays, dict[str, Any]]:
             keypoints = keypoints_of(self.run, features)
-            growth = growth_of(self.run, keypoints, read_pairs(matches), self.known)
-            arrays: Arrays = {"keyframe": growth.mapper.keyframe}
+            begun = mapping_of(self.run, keypoints, read_pairs(matches), self.known)
+            arrays: Arrays = {"keyframe": begun.mapper.keyframe}
             try:
-                growth.grow()
+                begun.map_from_seeds()
             except ReconstructionError as problem:
                 return arrays, {"components": [], "reason": str(problem)}
-            parts = growth.put_together()
+            parts = begun.put_together()
             for number, part in enumerate(parts):
                 arrays |= {f"{number}.{name}": array for name, array in part_arrays(part).items()}
             report = packed(parts, features)[1]
@@ -173,6 +175,8 @@ def run_submaps(run: Run, spans: Sequence[Span]) -> list[SubmapRun]:
         run.begin(stage)
         for submap in submaps:
             work(submap)
+        if stage is Stage.FEATURES:  # the others go on with what no sub-map has
+            run.progress(stage, 1, 1)
     return submaps
 
 
@@ -217,7 +221,7 @@ def join_submaps(
     keyframe = _keyframes(run, submaps)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        return packed(join(growth_of(run, keypoints, pairs, known), parts, keyframe), found)
+        return packed(join(mapping_of(run, keypoints, pairs, known), parts, keyframe), found)
 
     return found, pairs, mappers(run, keypoints, known, work)
 
@@ -235,7 +239,6 @@ def _joined_features(run: Run, submaps: Sequence[SubmapRun]) -> JoinedFeatures:
     made = sum(features.made_mask is not None for features in found)
     described = describe_features(run.drive, found.counts, by_class, made, left_out)
     run.report["stages"].append({"stage": Stage.FEATURES, **_times(reports), **described})
-    run.progress(Stage.FEATURES, 1, 1)
     require_features(run, found, left_out)
     return found
 

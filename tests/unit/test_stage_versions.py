@@ -49,7 +49,7 @@ def test_a_comment_invalidates_nothing(
         folder = Path(str(package.__file__)).parent
         shutil.copytree(folder, packages / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
     before = key_in(packages, drive)
-    for module in ("stages.py", "features/extraction.py", "features/sift.py", "scene/drive.py"):
+    for module in ("stages/_features.py", "features/extraction.py", "features/sift.py", "scene/drive.py"):
         with (packages / "mrasfm_engine" / module).open("a", encoding="utf-8") as file:
             file.write("# A comment.\n")
     assert key_in(packages, drive) == before
