@@ -121,6 +121,11 @@ class SubmapConfig(_Section):
     overlap_units: Annotated[int, Field(ge=3)] = Field(
         10, description="units that two neighbouring sub-maps share, which say how one lies to the other"
     )
+    processes: Count | None = Field(
+        None,
+        description="sub-maps that are done at one time, each in a process with its share of the threads; by default "
+        "one for every four threads",
+    )
 
 
 class MappingConfig(_Section):

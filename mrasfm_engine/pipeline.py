@@ -176,7 +176,7 @@ def reconstruct_submap(
                 f"the plan of sub-map {number} is not there any more", remedy="Ask for the reconstruction again."
             )
         stages.own_cars(run)
-        stages.SubmapRun(run, span).finish()
+        stages.SubmapRun(run, span).do(Stage.MAPPING)
 
 
 def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Span]]:

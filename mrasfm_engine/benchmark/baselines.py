@@ -16,9 +16,9 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.evaluation.subprocess_run import memory_bytes, run_in_subprocess
 from mrasfm_engine.evaluation.trajectory import TrajectoryErrors, compare_known
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.subprocess_run import memory_bytes, run_in_subprocess
 from mrasfm_engine.types import Bools, Floats, StageProgress
 
 # Of the pair that the incremental mapper begins with. Cameras that look ahead have few that reach COLMAP's 16 deg, and

@@ -12,13 +12,13 @@ from mrasfm_engine.ablation import warm_up
 from mrasfm_engine.benchmark import simulated_drive
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import storage_error
-from mrasfm_engine.evaluation.subprocess_run import memory_bytes
 from mrasfm_engine.export.feature_database import write_matches
 from mrasfm_engine.io.stage_store import Arrays, StageStore, fingerprint
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.subprocess_run import memory_bytes
 from mrasfm_engine.types import Floats, StageProgress
 
 

@@ -16,11 +16,11 @@ from mrasfm_engine.benchmark.mapping import Mapped, Prepared
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError, ReconstructionError
 from mrasfm_engine.evaluation.pose_errors import TOLERANCE_US
-from mrasfm_engine.evaluation.subprocess_run import ProcessResult, run_in_subprocess
 from mrasfm_engine.evaluation.trajectory import MIN_POSES, TrajectoryErrors, compare_known, match_timestamps
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.subprocess_run import ProcessResult, run_in_subprocess
 from mrasfm_engine.types import Floats
 
 Progress = Callable[[str, str, int, int], None]  # row, stage, done, total

@@ -1,4 +1,4 @@
-"""The beginning of a reconstruction: models, the check of the drive, its prior trajectory, a probe of the calibration."""
+"""The beginning of a reconstruction: models, the check of the drive, its prior trajectory, a probe of calibration."""
 
 from __future__ import annotations
 

@@ -26,6 +26,11 @@ Result = TypeVar("Result")
 VERSIONS = {Stage.FEATURES: 5, Stage.MATCHES: 6, Stage.MAPPING: 9}
 
 
+def new_report() -> dict[str, Any]:
+    """The report of a run that has done nothing."""
+    return {"engine_version": __version__, "findings": [], "stages": []}
+
+
 @dataclass
 class Run:
     """One reconstruction under way: settings, store, report, and who watches."""
@@ -36,9 +41,7 @@ class Run:
     progress: StageProgress
     cancel: Callable[[], bool]
     content_sha256: Mapping[str, str] | None = None  # of the drive's files by name, where the caller knows them
-    report: dict[str, Any] = field(
-        default_factory=lambda: {"engine_version": __version__, "findings": [], "stages": []}
-    )
+    report: dict[str, Any] = field(default_factory=new_report)
     own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once images were looked at
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
     standing: Standing | None = None  # where units are left out: which, and the drive with all of them

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.features.stored_features import JoinedFeatures, StoredFeatures
 from mrasfm_engine.io.stage_store import Arrays, StageWriter, StoredStage, fingerprint
@@ -33,12 +36,15 @@ from mrasfm_engine.stages._matches import (
     require_matches,
     write_pairs,
 )
-from mrasfm_engine.stages._run import Run
+from mrasfm_engine.stages._run import Run, new_report
 from mrasfm_engine.stages._standing import in_units
+from mrasfm_engine.subprocess_run import run_in_subprocess
 from mrasfm_engine.types import Bools, Ints, StageProgress
 from schemas.artifacts import Stage, submap_checkpoint
 
 SUBMAPS, SUBMAPS_VERSION = "submaps", 1
+STAGES = (Stage.FEATURES, Stage.MATCHES, Stage.MAPPING)
+THREADS_A_PROCESS = 4  # one process has not enough to do for more all of the time: units are registered one by one
 BYTES_PER_MB = 1_000_000
 
 
@@ -74,11 +80,9 @@ class SubmapRun:
     ----------
     run
         Of the whole drive, whose own car is known.
-    progress
-        Of the sub-map's stages; by default the run's.
     """
 
-    def __init__(self, run: Run, span: Span, progress: StageProgress | None = None) -> None:
+    def __init__(self, run: Run, span: Span) -> None:
         self.span = span
         units = np.zeros(len(run.drive.manifest.frames), dtype=np.bool_)
         units[span.units] = True
@@ -87,7 +91,7 @@ class SubmapRun:
             run.drive.restricted_to(units),
             run.config,
             run.store.with_prefix(submap_checkpoint(span.number, "")),
-            run.progress if progress is None else progress,
+            run.progress,
             run.cancel,
             own_cars=run.own_cars,
             key=fingerprint(run.key or run.drive_key, SUBMAPS, span.first, span.last),
@@ -139,9 +143,15 @@ class SubmapRun:
 
         return self.run.stage(Stage.MAPPING, mapping_settings(self.run), work)[0]
 
-    def finish(self) -> None:
-        """Do all of its stages that are not in the store."""
-        _ = self.mapped
+    def do(self, stage: Stage) -> None:
+        """Do a stage and those before it, as far as they are not in the store."""
+        match stage:
+            case Stage.FEATURES:
+                _ = self.features
+            case Stage.MATCHES:
+                _ = self.matches
+            case _:
+                _ = self.mapped
 
     @property
     def report(self) -> dict[str, Any]:
@@ -163,41 +173,112 @@ class SubmapRun:
 
 
 def run_submaps(run: Run, spans: Sequence[Span]) -> list[SubmapRun]:
-    """Do every stage of all sub-maps, stage by stage."""
-    tally = _Tally(run.progress, len(spans))
-    submaps = [SubmapRun(run, span, tally.step(position)) for position, span in enumerate(spans)]
-    works: dict[Stage, Callable[[SubmapRun], object]] = {
-        Stage.FEATURES: lambda submap: submap.features,
-        Stage.MATCHES: lambda submap: submap.matches,
-        Stage.MAPPING: lambda submap: submap.mapped,
-    }
-    for stage, work in works.items():
+    """Do all sub-maps stage by stage, several at one time where the settings have processes for it.
+
+    Raises
+    ------
+    ReconstructionError
+        Where a process ended before its sub-map's stage was finished.
+    """
+    submaps = [SubmapRun(run, span) for span in spans]
+    processes = min(_processes(run.config), len(submaps))
+    for stage in STAGES:
         run.begin(stage)
+        tally = _Tally(run.progress, len(submaps))
+        if processes > 1:
+            _do_in_processes(run, stage, [submap.span for submap in submaps], processes, tally)
         for submap in submaps:
-            work(submap)
+            submap.run.progress = tally.step(submap.span.number)
+            submap.do(stage)
         if stage is Stage.FEATURES:  # the others go on with what no sub-map has
             run.progress(stage, 1, 1)
     return submaps
 
 
+def _processes(config: EngineConfig) -> int:
+    return config.submaps.processes or max(1, config.threads // THREADS_A_PROCESS)
+
+
+def _do_in_processes(run: Run, stage: Stage, spans: Sequence[Span], processes: int, tally: _Tally) -> None:
+    """Do a stage of all sub-maps that are not finished, each in a process of its own that leaves it in the store."""
+    config = run.config.model_copy(update={"threads": max(1, run.config.threads // processes)})
+    sent = replace(
+        run,
+        config=config,
+        key=run.key or run.drive_key,
+        progress=_tell_nobody,
+        cancel=_is_never_cancelled,
+        report=new_report(),
+    )
+    failed = threading.Event()
+
+    def one(span: Span) -> None:
+        ended = run_in_subprocess(
+            _do,
+            sent,
+            stage,
+            span,
+            progress=tally.step(span.number),
+            cancel=lambda: failed.is_set() or run.cancel(),
+        )
+        if ended.result is None:
+            raise ReconstructionError(
+                f"the process of sub-map {span.number} ended early in stage {stage}: {ended.failure}",
+                remedy="Run it again with fewer submaps.processes or less submaps.memory_mb: finished stages are "
+                "reused.",
+                code="submap-process",
+            )
+
+    with ThreadPoolExecutor(processes) as pool:
+        futures = [pool.submit(one, span) for span in spans if not SubmapRun(run, span).is_finished]
+        try:
+            for future in as_completed(futures):
+                future.result()
+        except BaseException:
+            failed.set()
+            for future in futures:
+                future.cancel()
+            raise
+
+
+def _do(progress: StageProgress, run: Run, stage: Stage, span: Span) -> bool:
+    """Do a stage of a sub-map, in this process."""
+    SubmapRun(replace(run, progress=progress), span).do(stage)
+    return True
+
+
+def _tell_nobody(stage: str, done: int, total: int) -> None:
+    """Progress of a run that is sent to other processes, which have their own."""
+
+
+def _is_never_cancelled() -> bool:
+    """Answer in other processes: who cancels the run kills them."""
+    return False
+
+
 class _Tally:
-    """Progress of a stage over all sub-maps: those to come are taken to be as long as the present one."""
+    """Progress of a stage over all sub-maps: those that have not begun are taken to be as long as the others."""
 
     def __init__(self, progress: StageProgress, count: int) -> None:
-        self._progress, self._count = progress, count
-        self._before: Counter[str] = Counter()
-        self._total: Counter[str] = Counter()
+        self._progress, self._count, self._lock = progress, count, threading.Lock()
+        self._counts: dict[int, tuple[int, int]] = {}
 
-    def step(self, position: int) -> StageProgress:
-        """The progress callback of a sub-map, of which so many come before."""
+    def step(self, number: int) -> StageProgress:
+        """The progress callback of a sub-map."""
 
         def progress(stage: str, done: int, total: int) -> None:
-            if (done, total) == (1, 1):
-                self._before[stage] += self._total.pop(stage, 0)
-            elif total:
-                self._total[stage] = total
-                before = self._before[stage]
-                self._progress(stage, before + done, before + total * (self._count - position))
+            with self._lock:
+                if (done, total) == (1, 1):
+                    most = self._counts.get(number, (1, 1))[1]
+                    self._counts[number] = (most, most)
+                elif total:
+                    self._counts[number] = (done, total)
+                    every = sum(total for _, total in self._counts.values())
+                    self._progress(
+                        stage,
+                        sum(done for done, _ in self._counts.values()),
+                        every * self._count // len(self._counts),
+                    )
 
         return progress
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.evaluation.subprocess_run import memory_bytes, peak_memory_bytes, run_in_subprocess
+from mrasfm_engine.subprocess_run import memory_bytes, peak_memory_bytes, run_in_subprocess
 
 MEGABYTE = 1_000_000
 linux = pytest.mark.skipif(sys.platform != "linux", reason="/proc tells the memory of a process")
