@@ -182,7 +182,10 @@ def _link(in_group: Floats, part: Part, rows: Ints) -> tuple[Floats, float] | No
 
     None where the two shapes are not the same.
     """
-    factor = _extent(in_group[:, :3, 3]) / _extent(part.world_from_rig[rows, :3, 3])
+    # Of the places that scaling keeps in the rig: about them, lengths scale exactly.
+    mean_m = part.rig_from_cam[:, :3, 3].mean(axis=0)
+    in_group_m, own_m = (poses[:, :3, :3] @ mean_m + poses[:, :3, 3] for poses in (in_group, part.world_from_rig[rows]))
+    factor = _extent(in_group_m) / _extent(own_m)
     own = part.scaled(factor).world_from_rig[rows]
     rotation = robust_mean_rotation(in_group[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2))
     a_from_b = se3.transform(rotation, geometric_median(in_group[:, :3, 3] - own[:, :3, 3] @ rotation.T))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.features import stored_features
-from mrasfm_engine.features.stored_features import FeatureWriter, StoredFeatures
+from mrasfm_engine.features.stored_features import FeatureWriter, JoinedFeatures, StoredFeatures
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.scene.drive import Incomplete
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -86,3 +86,33 @@ def test_all_images_left_out(tmp_path: Path) -> None:
     assert opened is not None
     (found,) = StoredFeatures(opened, [Incomplete.CORRUPT])
     assert found.descriptors.shape == (0, 128)
+
+
+def stored(folder: Path, given: list[ImageFeatures | Incomplete], name: str) -> StoredFeatures:
+    store = StageStore(folder)
+    with store.writing(name, "key") as stage:
+        writer = FeatureWriter(stage)
+        for found in given:
+            writer.add(found)
+        writer.finish()
+        stage.finish({})
+    opened = store.open(name, "key")
+    assert opened is not None
+    return StoredFeatures(opened, [found if isinstance(found, Incomplete) else None for found in given])
+
+
+def test_features_of_sub_maps_are_those_of_the_drive(tmp_path: Path) -> None:
+    """Images 3 and 4 are in both, image 7 was left out, and the third file has no keypoint at all."""
+    rng = np.random.default_rng(1)
+    images = [an_image(n, rng, network=True, mask=False) for n in (5, 0, 7, 9, 3, 8, 1)]
+    first, second = images[:5], [*images[3:], Incomplete.CORRUPT]
+    parts = [stored(tmp_path, first, "a"), stored(tmp_path, second, "b"), stored(tmp_path, [Incomplete.CORRUPT], "c")]
+    joined = JoinedFeatures([(parts[0], np.arange(5)), (parts[1], np.arange(3, 8)), (parts[2], np.array([8]))])
+    assert len(joined) == 9
+    assert joined.counts.tolist() == [5, 0, 7, 9, 3, 8, 1, 0, 0]
+    for found, expected in zip(joined[:7], images, strict=True):
+        np.testing.assert_array_equal(found.xy_px, expected.xy_px)
+        np.testing.assert_array_equal(found.descriptors, expected.descriptors)
+    assert [found.left_out for found in joined][6:] == [None, Incomplete.CORRUPT, Incomplete.CORRUPT]
+    assert {found.descriptors.shape[1] for found in joined} == {64}
+    assert {found.descriptors.dtype for found in joined} == {np.dtype(np.float32)}
