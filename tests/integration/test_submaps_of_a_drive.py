@@ -1,0 +1,137 @@
+"""A drive that is cut into sub-maps gives the scene that it gives in one piece."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import EngineConfig, SubmapConfig
+from mrasfm_engine.errors import StorageError
+from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
+from mrasfm_engine.preflight.drive_reader import read_drive
+from schemas.artifacts import PLAN_CHECKPOINTS, checkpoint_file, submap_checkpoint
+from tests.integration.conftest import CommandResult, Variant, read_report, synth
+
+Run = Callable[..., CommandResult]
+
+UNITS = 15
+CONFIG = EngineConfig(use_gnss=False, submaps=SubmapConfig(count=3, overlap_units=3))
+STAGES = ("features", "matches", "mapping")
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synth(tmp_path_factory.mktemp("cut") / "drive", "--cameras", 2, "--units", UNITS, "--seed", 4, "--no-masks")
+
+
+@pytest.fixture(scope="module")
+def scene(drive: Path) -> Path:
+    out = drive.parent / "scene"
+    reconstruct(drive, out, CONFIG)
+    return out
+
+
+def names_of(scene: Path) -> set[str]:
+    return {path.name for path in (scene / ".stages").iterdir()}
+
+
+def positions_m(scene: Path) -> np.ndarray:  # type: ignore[type-arg]
+    units = json.loads((scene / "poses.json").read_text())["units"]
+    return np.array([unit["world_from_rig"]["translation_m"] for unit in units])
+
+
+def errors(mrasfm: Run, scene: Path, drive: Path) -> dict:  # type: ignore[type-arg]
+    evaluated = mrasfm("evaluate", scene, "--truth", drive / "truth.tum", "--json")
+    result: dict = json.loads(evaluated.out)  # type: ignore[type-arg]
+    return result
+
+
+def test_the_scene_is_as_good_as_in_one_piece(drive: Path, scene: Path, tmp_path: Path, mrasfm: Run) -> None:
+    assert mrasfm("reconstruct", drive, "--no-gnss", "--out", tmp_path / "one").code == 0
+    cut, one = (errors(mrasfm, out, drive) for out in (scene, tmp_path / "one"))
+    assert cut["registered_units"] == one["registered_units"] == UNITS
+    assert 0 < cut["similarity"]["rmse_m"] < 1.2 * one["similarity"]["rmse_m"] + 1e-3
+    assert 0 < cut["metric"]["rmse_m"] < 1.2 * one["metric"]["rmse_m"] + 0.02  # metres of way tell little of scale
+
+
+def test_the_report_has_every_sub_map(drive: Path, scene: Path) -> None:
+    report = read_report(scene)
+    assert [part["spans"] for part in report["submaps"]] == [[[0, 6]], [[4, 10]], [[8, 14]]]
+    for part in report["submaps"]:
+        assert [stage["stage"] for stage in part["stages"]] == list(STAGES)
+        assert part["stages"][2]["registered_units"] == 7
+        assert part["stages"][2]["initial_units"][0] in range(part["spans"][0][0], part["spans"][0][1] + 1)
+    assert report["by_stage"]["features"]["images"] == len(read_drive(drive).images)
+    assert report["by_stage"]["features"]["keypoints"] > 0
+    assert report["by_stage"]["matches"]["verified_pairs"] > 0
+    assert {f"{stage}" for stage in report["by_stage"]} >= set(STAGES)
+
+
+def test_sub_maps_that_others_have_done_are_not_done_again(drive: Path, scene: Path, tmp_path: Path) -> None:
+    """As workers do them: each has its own files alone, and what the plan left."""
+    out, seen = tmp_path / "scene", list[tuple[str, int, int]]()
+    contents = dict.fromkeys((file for image in read_drive(drive).images for file in (image.file,)), "sha")
+    planned = plan_submaps(drive, out, CONFIG, workers=3, content_sha256=contents)
+    assert [(one.number, one.first_unit, one.last_unit) for one in planned] == [(1, 0, 6), (2, 4, 10), (3, 8, 14)]
+    assert not any(one.is_finished for one in planned)
+    # Without stops nothing is left out.
+    assert names_of(out) == {checkpoint_file(name) for name in PLAN_CHECKPOINTS} - {"standing.npz"}
+    plan = {name: (out / ".stages" / name).read_bytes() for name in names_of(out)}
+    for one in planned:
+        part, worker = tmp_path / f"drive {one.number}", tmp_path / f"worker {one.number}"
+        (worker / ".stages").mkdir(parents=True)
+        for name, data in plan.items():
+            (worker / ".stages" / name).write_bytes(data)
+        for file in ("drive.json", *one.files):
+            (part / file).parent.mkdir(parents=True, exist_ok=True)
+            (part / file).write_bytes((drive / file).read_bytes())
+        reconstruct_submap(part, worker, CONFIG, one.number, content_sha256=contents)
+        made = {checkpoint_file(submap_checkpoint(one.number, stage)) for stage in STAGES}
+        assert names_of(worker) == made | set(plan)
+        for name in made:
+            (worker / ".stages" / name).rename(out / ".stages" / name)
+    assert all(one.is_finished for one in plan_submaps(drive, out, CONFIG, workers=3, content_sha256=contents))
+    reconstruct(drive, out, CONFIG, content_sha256=contents, progress=lambda *step: seen.append(step))
+    for part in read_report(out)["submaps"]:
+        assert all(stage["reused"] for stage in part["stages"])
+    assert not [step for step in seen if step[0] == "features" and step[2] > 1]
+    np.testing.assert_allclose(positions_m(out), positions_m(scene), atol=1e-6)
+
+
+def test_a_sub_map_without_its_plan_is_not_done(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="plan of sub-map 7"):
+        reconstruct_submap(drive, tmp_path / "scene", CONFIG, 7)
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_scene(drive: Path, scene: Path, tmp_path: Path, mrasfm: Run) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text("use_gnss = false\n[submaps]\ncount = 3\noverlap_units = 3\nprocesses = 2\n")
+    result = mrasfm("reconstruct", drive, "--config", settings, "--out", tmp_path / "scene")
+    assert result.code == 0, result.err
+    np.testing.assert_allclose(positions_m(tmp_path / "scene"), positions_m(scene), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_sub_map_that_sees_nothing_is_a_gap(drive: Path, variant_of: Callable[[Path], Variant]) -> None:
+    """A tunnel of the length of the middle one; the ends share neither images nor positions."""
+    variant = variant_of(drive)
+    for unit, frame in enumerate(variant.document["frames"]):
+        for image in frame["images"].values():
+            if 4 <= unit <= 10:
+                shape = cv2.imread(str(variant.root / image["file"])).shape
+                suffix = Path(image["file"]).suffix
+                variant.write(image["file"], cv2.imencode(suffix, np.full(shape, 90, np.uint8))[1].tobytes())
+    variant.save()
+    reconstruct(variant.root, variant.scene, CONFIG)
+    report = read_report(variant.scene)
+    middle = report["submaps"][1]["stages"][2]
+    assert middle["components"] == []
+    assert middle["reason"]
+    assert {"drive-in-components", "units-without-pose"} <= {finding["code"] for finding in report["findings"]}
+    assert (variant.scene / "components" / "1" / "poses.json").exists()
