@@ -13,18 +13,19 @@ from mrasfm_engine.aggregation import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
 from mrasfm_engine.learned.model_folder import default_folder
-from mrasfm_engine.pipeline import reconstruct
+from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
 from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage
 from schemas.findings import as_json, error
-from worker.child_protocol import ChildError, ChildRequest, ChildResult, Work
+from worker.child_protocol import ChildError, ChildRequest, ChildResult, SubmapPlan, Work
 from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter
 
 CANCEL_INTERVAL_S = 0.2
+_AT_ONE_TIME = 2  # a single sub-map is mapped by the process that goes on with it
 
 # Other errors than these are a disk's, or a scene that contradicts itself or does not read back as it was written.
 _FINAL = (InputError, ReconstructionError, CancelledError)
@@ -36,6 +37,9 @@ def work(request: ChildRequest) -> ChildResult:
     cancelled = CancelFile(request.cancel_file)
     try:
         config = engine_config(request.settings, threads=request.threads)
+        plan = _plan(request, config, progress, cancelled)
+        if plan is not None:
+            return ChildResult(plan=plan)
         return ChildResult(report=_WORK[request.work](request, config, progress, cancelled))
     except MrasfmError as problem:
         return ChildResult(error=described(problem, request))
@@ -59,6 +63,40 @@ class CancelFile:
             self._look_at_s = now_s + CANCEL_INTERVAL_S
             self._found = self._path.exists()
         return self._found
+
+
+def _plan(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> SubmapPlan | None:
+    """The sub-maps of a long drive that others can map at one time; None where this process does all that is left."""
+    if request.submap_workers < _AT_ONE_TIME:
+        return None
+    submaps = plan_submaps(
+        _drive_of(request),
+        request.out,
+        config,
+        workers=request.submap_workers,
+        progress=progress,
+        cancel=cancelled,
+        content_sha256=request.content_sha256,
+    )
+    unfinished = [(s.number, s.first_unit, s.last_unit) for s in submaps if not s.is_finished]
+    return SubmapPlan(total=len(submaps), unfinished=unfinished) if len(unfinished) >= _AT_ONE_TIME else None
+
+
+def _map_submap(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    reconstruct_submap(
+        _drive_of(request),
+        request.out,
+        config,
+        request.submap,
+        progress=progress,
+        cancel=cancelled,
+        content_sha256=request.content_sha256,
+    )
+    return {}
 
 
 def _reconstruct(
@@ -155,7 +193,12 @@ def _preflight(
     return {"findings": [as_json(finding) for finding in findings], "sound": is_sound(findings)}
 
 
-_WORK = {Work.RECONSTRUCTION: _reconstruct, Work.PREFLIGHT: _preflight, Work.AGGREGATION: _aggregate}
+_WORK = {
+    Work.RECONSTRUCTION: _reconstruct,
+    Work.PREFLIGHT: _preflight,
+    Work.AGGREGATION: _aggregate,
+    Work.SUBMAP: _map_submap,
+}
 
 
 def described(problem: MrasfmError, request: ChildRequest) -> ChildError:

@@ -24,7 +24,7 @@ def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> 
         job_id="job_1", fence=1, attempt=1, project_id="prj_1", kind=JobKind.AGGREGATION, drive_id=None, map_id="map_1",
         settings={},
     )  # fmt: skip
-    handler = handler_of(database, held)
+    handler = handler_of(database, held, settings)
     with pytest.raises(OperationalError):
         _ = handler.shelf
     database.close()

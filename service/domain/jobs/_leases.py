@@ -14,7 +14,6 @@ from service.database.connections import clock_us
 from service.database.tables import Job, JobAttempt, JobState
 from service.domain.jobs._blame import LESS_MEMORY, RetryLimits, blame_of_loss
 from service.domain.jobs._completion import end, fail
-from service.domain.jobs._dependencies import tell_parents
 from service.domain.jobs._queries import (
     Claim,
     FencedError,
@@ -25,6 +24,7 @@ from service.domain.jobs._queries import (
     tell_progress,
     tell_state,
 )
+from service.domain.jobs._submaps import tell_parents
 
 
 @dataclass(frozen=True, kw_only=True)
