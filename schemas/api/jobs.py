@@ -37,6 +37,9 @@ class ReconstructionSettings(RequestBody):
         None, description="name of a model on the workers that makes masks for images that come without"
     )
     semantic_triangulation: bool | None = Field(None, description="drop points of the road that are off its surface")
+    submaps: Annotated[int, Field(ge=1, le=1000)] | None = Field(
+        None, description="number of pieces that a long drive is cut into; null: as its length and the workers ask for"
+    )
     motion_compensation: bool | None = Field(None, description="pose every image at its own time")
 
 
