@@ -87,16 +87,26 @@ def _plan(
 def _map_submap(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
+    under_way, reused = "", []
+
+    def watch(stage: str, done: int, total: int) -> None:
+        """Note stages that end and have not begun: they were finished before."""
+        nonlocal under_way
+        if stage != under_way and done == total == 1:
+            reused.append(stage)
+        under_way = stage
+        progress(stage, done, total)
+
     reconstruct_submap(
         _drive_of(request),
         request.out,
         config,
         request.submap,
-        progress=progress,
+        progress=watch,
         cancel=cancelled,
         content_sha256=request.content_sha256,
     )
-    return {}
+    return {"reused": reused}
 
 
 def _reconstruct(

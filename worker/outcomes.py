@@ -30,7 +30,7 @@ class Succeeded:
     ----------
     report
         Of a reconstruction or aggregation, what `report.json` says, and of the latter what the version's record has of
-        `map.json` as `map`; of a preflight, `findings` and `sound`; of a sub-map, nothing.
+        `map.json` as `map`; of a preflight, `findings` and `sound`; of a sub-map, `reused`.
     out
         Folder of the scene.
     """

@@ -12,7 +12,7 @@ from schemas.api.drives import DriveState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.connections import Database
-from service.database.tables import Blob, Drive, Job, JobEvent, JobMember, JobState, Project, new_id
+from service.database.tables import Blob, Drive, Job, JobEvent, JobMember, JobState, Project, WorkerSeen, new_id
 from service.domain import aggregations, drives, job_trees, jobs, scenes, workers
 from service.errors import JobOfTree, TooManyJobs
 from tests.helpers.live_api import LIMITS, SUMMARY, Client, problem_of, wait_until
@@ -355,7 +355,7 @@ def test_processes_that_take_sub_maps(database: Database) -> None:
         workers.report(session, name="c", queues=["checks"], concurrency=4)
     with database.write() as session:
         assert workers.count_processes(session, "reconstructions") == 5
-        session.execute(update(workers.WorkerSeen).where(workers.WorkerSeen.name == "b").values(seen_us=1))
+        session.execute(update(WorkerSeen).where(WorkerSeen.name == "b").values(seen_us=1))
         assert workers.count_processes(session, "reconstructions") == 2
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ from mrasfm_engine.pipeline import reconstruct
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.artifacts import checkpoint_file, submap_checkpoint
-from service.database.tables import Blob, Checkpoint, Job, SceneFile
+from service.database.tables import Blob, Checkpoint, Job, SceneFile, now_us
+from service.domain.jobs import number_of
 from tests.helpers.service_world import FAST, World, is_gone, wait_until
 from worker.engine_settings import engine_config
 from worker.job_execution import Runner
+from worker.job_handlers import SUBMAP_STAGES
 
 SUBMAPS = 3
 
@@ -33,7 +36,7 @@ def long_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def submaps_of(world: World, job_id: str) -> list[Job]:
     with world.database.read() as session:
         found = session.scalars(select(Job).where(Job.parent_id == job_id)).all()
-    return sorted(found, key=lambda job: (job.request or {})["number"])
+    return sorted(found, key=number_of)
 
 
 def report_of(world: World) -> dict[str, Any]:
@@ -46,6 +49,10 @@ def report_of(world: World) -> dict[str, Any]:
 def checkpoints(world: World) -> set[str]:
     with world.database.read() as session:
         return set(session.scalars(select(Checkpoint.name)))
+
+
+def own_stages(submap: Job) -> set[str]:
+    return {checkpoint_file(submap_checkpoint(number_of(submap), stage)) for stage in SUBMAP_STAGES}
 
 
 def stages_run(report: dict[str, Any]) -> list[str]:
@@ -84,15 +91,13 @@ def test_a_tree_of_jobs(make_world: Callable[..., World], long_drive: Path, tmp_
     parent = world.job(job_id)
     assert (parent.state, parent.waiting_for, parent.stage, parent.blame) == ("QUEUED", SUBMAPS, "submaps", 0)
     found = submaps_of(world, job_id)
-    assert [job.request["number"] for job in found if job.request] == [1, 2, 3]
+    assert [number_of(job) for job in found] == [1, 2, 3]
     for submap in reversed(found):
         assert world.job(job_id).waiting_for > 0
         Runner(world.settings).run(submap.id)
         ended = world.job(submap.id)
         assert (ended.state, ended.percent) == ("SUCCEEDED", 100.0), ended.problem
-        number = (submap.request or {})["number"]
-        own = {checkpoint_file(submap_checkpoint(number, stage)) for stage in ("features", "matches", "mapping")}
-        assert own <= checkpoints(world)
+        assert own_stages(submap) <= checkpoints(world)
     Runner(world.settings).run(job_id)
     parent = world.job(job_id)
     assert parent.state == "SUCCEEDED", parent.problem
@@ -116,8 +121,11 @@ def test_a_worker_is_killed_in_a_sub_map(make_world: Callable[..., World], long_
     def extracted() -> list[Job]:
         """Sub-maps whose features are safe, and which go on."""
         kept = checkpoints(world)
-        name = lambda job: checkpoint_file(submap_checkpoint((job.request or {})["number"], "features"))  # noqa: E731
-        return [job for job in submaps_of(world, job_id) if job.state == "RUNNING" and name(job) in kept]
+        return [
+            job
+            for job in submaps_of(world, job_id)
+            if job.state == "RUNNING" and checkpoint_file(submap_checkpoint(number_of(job), "features")) in kept
+        ]
 
     wait_until(lambda: extracted() != [], lambda: f"a finished stage\n{world.log()}")
     victim = extracted()[0]
@@ -137,3 +145,29 @@ def test_a_worker_is_killed_in_a_sub_map(make_world: Callable[..., World], long_
     assert list(outcomes.values()) == [["succeeded"]] * (SUBMAPS - 1)
     assert "features" in world.job(victim.id).reused
     assert_same_scene(world, job, in_one_piece(long_drive, tmp_path / "whole"))
+
+
+@pytest.mark.slow
+def test_a_store_that_is_away_as_a_sub_map_ends(make_world: Callable[..., World], long_drive: Path) -> None:
+    """What others would not find is not finished: the attempt failed, and the next one ends the job."""
+    world = make_world(submap_workers=2)
+    job_id = world.ask(world.add_drive(long_drive), wake=False, submaps=SUBMAPS)
+    Runner(world.settings).run(job_id)
+    submap = submaps_of(world, job_id)[0]
+    thread = threading.Thread(target=Runner(world.settings).run, args=(submap.id,))
+    thread.start()
+    child = world.hold(submap.id)
+    store = world.settings.data_dir / "artifacts"
+    store.rename(store.with_name("away"))
+    store.touch()
+    child.resume()
+    thread.join()
+    assert (world.job(submap.id).state, world.outcomes(submap.id)) == ("QUEUED", ["storage"])
+    assert own_stages(submap) & checkpoints(world) == set()
+    assert world.job(job_id).state == "QUEUED"
+    store.unlink()
+    store.with_name("away").rename(store)
+    wait_until(lambda: world.job(submap.id).not_before_us < now_us(), "its turn")
+    Runner(world.settings).run(submap.id)
+    assert world.outcomes(submap.id) == ["storage", "succeeded"]
+    assert own_stages(submap) <= checkpoints(world)
