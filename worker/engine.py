@@ -29,6 +29,7 @@ _AT_ONE_TIME = 2  # a single sub-map is mapped by the process that goes on with 
 
 # Other errors than these are a disk's, or a scene that contradicts itself or does not read back as it was written.
 _FINAL = (InputError, ReconstructionError, CancelledError)
+_PASSING = {"submap-process"}  # a process of the engine's own was killed
 
 
 def work(request: ChildRequest) -> ChildResult:
@@ -218,7 +219,7 @@ def described(problem: MrasfmError, request: ChildRequest) -> ChildError:
         code=problem.code,
         what=_without_paths(problem.what, request),
         remedy=problem.remedy,
-        retryable=not isinstance(problem, _FINAL),
+        retryable=not isinstance(problem, _FINAL) or problem.code in _PASSING,
         is_storage=isinstance(problem, StorageError),
         findings=[as_json(finding) for finding in findings],
     )
