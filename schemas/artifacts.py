@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 
 
@@ -55,6 +56,12 @@ PLAN_CHECKPOINTS = ("standing", "own-car", "submaps")
 def submap_checkpoint(number: int, stage: str) -> str:
     """Name the checkpoint of a stage of a sub-map, counted from 1."""
     return f"submap-{number}-{stage}"
+
+
+def submap_number(name: str) -> int | None:
+    """Number of the sub-map that a checkpoint, or its file, belongs to; None where it belongs to none."""
+    found = re.match(r"submap-(\d+)-", name)
+    return None if found is None else int(found[1])
 
 
 def component_folder(number: int) -> str:

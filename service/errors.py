@@ -352,6 +352,10 @@ class JobNotFailed(ServiceError, status=409):
     """The job did not fail."""
 
 
+class JobOfTree(ServiceError, status=409):
+    """The job is a part of another."""
+
+
 class CheckActive(ServiceError, status=409):
     """The drive has its check."""
 

@@ -25,6 +25,7 @@ QUEUES = {
     JobKind.PREFLIGHT: "checks",
     JobKind.RECONSTRUCTION: "reconstructions",
     JobKind.AGGREGATION: "reconstructions",
+    JobKind.SUBMAP: "reconstructions",
 }
 _ANSWER_WITHIN_S = 2
 _NOTICE_WITHIN_S = 10  # that the broker has vanished: a worker's main process waits for its answers

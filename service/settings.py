@@ -140,6 +140,11 @@ class Settings(BaseSettings):
     engine_threads: Annotated[int, Field(ge=0, le=1024)] = Field(
         0, description="threads of one reconstruction; 0: all cores"
     )
+    submap_workers: Annotated[int, Field(ge=0, le=1024)] | None = Field(
+        None,
+        description="number of workers that a long drive is cut for; 0 or 1: a reconstruction is one job; by default "
+        "as many as there are worker processes when it begins",
+    )
 
     # Retention
     drive_retention_days: Days | None = Field(None, description="drives are deleted after this time; by default never")
@@ -152,7 +157,7 @@ class Settings(BaseSettings):
     )
     idempotency_hours: Hours = Field(24.0, description="answers to an `Idempotency-Key` are kept for this time")
 
-    @field_validator("metrics_token", mode="before")
+    @field_validator("metrics_token", "submap_workers", mode="before")
     @classmethod
     def _is_given(cls, value: object) -> object:
         """Compose passes what nobody has set as an empty text."""

@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,15 +55,34 @@ class CheckpointKeeper:
         self._spare = spare
         self._kept: dict[str, _Identity] = {}
         self._troubles: dict[str, _Trouble] = {}
+        self._lock = threading.Lock()  # held while a file is stored
         self._ended = threading.Event()
         self._thread = threading.Thread(
             target=contextvars.copy_context().run, args=(self._run,), name="checkpoints", daemon=True
         )
 
-    def restore(self, fetch: Fetch) -> None:
-        """Bring what earlier attempts and jobs have finished into the folder."""
-        for name in checkpoints.restore(self._database, self._shelf, self._folder, fetch=fetch):
+    def restore(self, fetch: Fetch, is_wanted: Callable[[str], bool] = lambda name: True) -> None:
+        """Bring what earlier attempts and jobs have finished into the folder, where the name of its file is wanted."""
+        for name in checkpoints.restore(self._database, self._shelf, self._folder, fetch=fetch, is_wanted=is_wanted):
             self._kept[name] = _identity(self._folder / name)
+
+    def keep_all(self) -> None:
+        """Store every finished stage that is not stored yet.
+
+        Raises
+        ------
+        Exception
+            Where database or artifact store do not take one; it may be tried again.
+        """
+        for path in self._finished():
+            with self._lock:
+                identity = _identity(path)
+                if self._kept.get(path.name) != identity:
+                    self._keep(path, _Trouble(identity))
+                    self._kept[path.name] = identity
+
+    def _finished(self) -> list[Path]:
+        return sorted(self._folder.glob("*.npz"))
 
     def __enter__(self) -> CheckpointKeeper:
         self._spare.mkdir(mode=0o700)
@@ -79,8 +99,8 @@ class CheckpointKeeper:
         self._poll(is_last=True)
 
     def _poll(self, *, is_last: bool = False) -> None:
-        for path in sorted(self._folder.glob("*.npz")):
-            with suppress(FileNotFoundError):  # the attempt's folder is being removed
+        for path in self._finished():
+            with self._lock, suppress(FileNotFoundError):  # the attempt's folder is being removed
                 identity = _identity(path)
                 if self._kept.get(path.name) != identity:
                     self._try(path, identity, is_last=is_last)

@@ -20,6 +20,7 @@ class Work(StrEnum):
     RECONSTRUCTION = "reconstruction"
     PREFLIGHT = "preflight"
     AGGREGATION = "aggregation"
+    SUBMAP = "submap"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +42,11 @@ class Attempt:
         Of an aggregation: drives that have no scene, for its report, and what that calls those that have one, by name.
     leave_out
         Of an aggregation: whether a scene that fits into no map does not take the others with it.
+    submap_workers
+        Of a reconstruction: number of workers that a long drive is cut for. With less than 2 it is not cut: the child
+        does all of it.
+    submap
+        Number of the sub-map that is mapped.
     """
 
     work: Work
@@ -53,6 +59,8 @@ class Attempt:
     failed: Sequence[Mapping[str, Any]] = field(default_factory=list)
     members: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     leave_out: bool = False
+    submap_workers: int = 0
+    submap: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,10 +126,27 @@ class ChildError:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SubmapPlan:
+    """Plan of a drive that was cut into sub-maps.
+
+    Attributes
+    ----------
+    total
+        Sub-maps of the drive.
+    unfinished
+        Number, first and last unit of those that are still to be mapped.
+    """
+
+    total: int
+    unfinished: list[tuple[int, int, int]]
+
+
+@dataclass(frozen=True, kw_only=True)
 class ChildResult:
-    """The end of a child's work: a report or an error."""
+    """The end of a child's work: a report, a plan of what others have to do first, or an error."""
 
     report: dict[str, Any] | None = None
+    plan: SubmapPlan | None = None
     error: ChildError | None = None
 
     def write(self, path: Path) -> None:
@@ -140,5 +165,9 @@ class ChildResult:
             values = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        error = values["error"]
-        return cls(report=values["report"], error=None if error is None else ChildError(**error))
+        plan, error = values["plan"], values["error"]
+        return cls(
+            report=values["report"],
+            plan=None if plan is None else SubmapPlan(**plan),
+            error=None if error is None else ChildError(**error),
+        )

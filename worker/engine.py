@@ -13,21 +13,23 @@ from mrasfm_engine.aggregation import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
 from mrasfm_engine.learned.model_folder import default_folder
-from mrasfm_engine.pipeline import reconstruct
+from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
 from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage
 from schemas.findings import as_json, error
-from worker.child_protocol import ChildError, ChildRequest, ChildResult, Work
+from worker.child_protocol import ChildError, ChildRequest, ChildResult, SubmapPlan, Work
 from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter
 
 CANCEL_INTERVAL_S = 0.2
+_AT_ONE_TIME = 2  # a single sub-map is mapped by the process that goes on with it
 
 # Other errors than these are a disk's, or a scene that contradicts itself or does not read back as it was written.
 _FINAL = (InputError, ReconstructionError, CancelledError)
+_PASSING = {"submap-process"}  # a process of the engine's own was killed
 
 
 def work(request: ChildRequest) -> ChildResult:
@@ -36,6 +38,9 @@ def work(request: ChildRequest) -> ChildResult:
     cancelled = CancelFile(request.cancel_file)
     try:
         config = engine_config(request.settings, threads=request.threads)
+        plan = _plan(request, config, progress, cancelled)
+        if plan is not None:
+            return ChildResult(plan=plan)
         return ChildResult(report=_WORK[request.work](request, config, progress, cancelled))
     except MrasfmError as problem:
         return ChildResult(error=described(problem, request))
@@ -59,6 +64,50 @@ class CancelFile:
             self._look_at_s = now_s + CANCEL_INTERVAL_S
             self._found = self._path.exists()
         return self._found
+
+
+def _plan(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> SubmapPlan | None:
+    """The sub-maps of a long drive that others can map at one time; None where this process does all that is left."""
+    if request.submap_workers < _AT_ONE_TIME:
+        return None
+    submaps = plan_submaps(
+        _drive_of(request),
+        request.out,
+        config,
+        workers=request.submap_workers,
+        progress=progress,
+        cancel=cancelled,
+        content_sha256=request.content_sha256,
+    )
+    unfinished = [(s.number, s.first_unit, s.last_unit) for s in submaps if not s.is_finished]
+    return SubmapPlan(total=len(submaps), unfinished=unfinished) if len(unfinished) >= _AT_ONE_TIME else None
+
+
+def _map_submap(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    under_way, reused = "", []
+
+    def watch(stage: str, done: int, total: int) -> None:
+        """Note stages that end and have not begun: they were finished before."""
+        nonlocal under_way
+        if stage != under_way and done == total == 1:
+            reused.append(stage)
+        under_way = stage
+        progress(stage, done, total)
+
+    reconstruct_submap(
+        _drive_of(request),
+        request.out,
+        config,
+        request.submap,
+        progress=watch,
+        cancel=cancelled,
+        content_sha256=request.content_sha256,
+    )
+    return {"reused": reused}
 
 
 def _reconstruct(
@@ -155,7 +204,12 @@ def _preflight(
     return {"findings": [as_json(finding) for finding in findings], "sound": is_sound(findings)}
 
 
-_WORK = {Work.RECONSTRUCTION: _reconstruct, Work.PREFLIGHT: _preflight, Work.AGGREGATION: _aggregate}
+_WORK = {
+    Work.RECONSTRUCTION: _reconstruct,
+    Work.PREFLIGHT: _preflight,
+    Work.AGGREGATION: _aggregate,
+    Work.SUBMAP: _map_submap,
+}
 
 
 def described(problem: MrasfmError, request: ChildRequest) -> ChildError:
@@ -165,7 +219,7 @@ def described(problem: MrasfmError, request: ChildRequest) -> ChildError:
         code=problem.code,
         what=_without_paths(problem.what, request),
         remedy=problem.remedy,
-        retryable=not isinstance(problem, _FINAL),
+        retryable=not isinstance(problem, _FINAL) or problem.code in _PASSING,
         is_storage=isinstance(problem, StorageError),
         findings=[as_json(finding) for finding in findings],
     )

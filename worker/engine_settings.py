@@ -22,6 +22,7 @@ _PLACES: dict[str, tuple[str | None, str]] = {
     "matcher": ("matching", "matcher"),
     "segmentation_model": ("semantics", "model"),
     "semantic_triangulation": ("mapping", "semantic_triangulation"),
+    "submaps": ("submaps", "count"),
     "motion_compensation": ("mapping", "motion_compensation"),
 }
 

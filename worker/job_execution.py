@@ -29,12 +29,12 @@ from service.storage.blob_writer import StoredFile, file_sha256, store_file
 from service.storage.process_folder import process_folder, sweep
 from worker.attempt import AttemptFolder, run_attempt
 from worker.checkpoints import CheckpointKeeper
-from worker.child_protocol import Work
+from worker.child_protocol import SubmapPlan, Work
 from worker.commit_with_retry import commit_with_retry
 from worker.heartbeat import Heartbeat
-from worker.job_handlers import handler_of
+from worker.job_handlers import ReconstructionHandler, handler_of
 from worker.oom import MemoryKills, kills_since, memory_kills
-from worker.outcomes import Failed, Outcome, Succeeded, failed_here
+from worker.outcomes import Failed, Outcome, Planned, Succeeded, failed_here
 from worker.progress import ProgressMeter
 from worker.retry import RETRY_BUDGET_S, retry, watched
 from worker.termination import StopReason, StopRequest
@@ -54,6 +54,7 @@ _FAILED = {
     JobKind.PREFLIGHT: "The drive could not be checked",
     JobKind.RECONSTRUCTION: "The drive could not be reconstructed",
     JobKind.AGGREGATION: "No map could be made",
+    JobKind.SUBMAP: "A part of the drive could not be mapped",
 }
 
 _PARTING_BUDGET_S = 5.0  # a process that was told to end does not wait long for the database
@@ -126,7 +127,7 @@ class _Execution:
         self._artifacts = artifacts
         self._held = held
         self._shutting_down = shutting_down
-        self._handler = handler_of(database, held)
+        self._handler = handler_of(database, held, settings)
         self._meter = meter = ProgressMeter(Work(held.kind.lower()), started_s=time.monotonic())
         self._heartbeat = Heartbeat(
             database, held, settings, progress=lambda: meter.at(time.monotonic()), shutting_down=shutting_down
@@ -178,12 +179,19 @@ class _Execution:
                 retryable=False,
                 stage=Stage.FETCH,
             )
-        with self._finished_stages(folder):
-            return run_attempt(
+        with self._finished_stages(folder) as keeper:
+            outcome = run_attempt(
                 attempt, scratch=folder.root, check_stop=check_stop, meter=self._meter, settings=self._settings
             )
+            if keeper is not None and self._leaves_stages(outcome):
+                self._retry(lambda: watched(keeper.keep_all, check_stop))
+        return outcome
 
-    def _finished_stages(self, folder: AttemptFolder) -> AbstractContextManager[object]:
+    def _leaves_stages(self, outcome: Outcome) -> bool:
+        """Return whether finished stages are all that the attempt was for: then none may be missing."""
+        return isinstance(outcome, Planned) or (self._held.kind is JobKind.SUBMAP and isinstance(outcome, Succeeded))
+
+    def _finished_stages(self, folder: AttemptFolder) -> AbstractContextManager[CheckpointKeeper | None]:
         """Bring finished stages, and keep those that are finished in the block."""
         shelf = self._handler.shelf
         if shelf is None:
@@ -196,7 +204,7 @@ class _Execution:
             folder=folder.finished_stages,
             spare=folder.root / "checkpoints",
         )
-        watched(lambda: keeper.restore(self._fetch), self._check_stop)
+        watched(lambda: keeper.restore(self._fetch, self._handler.is_wanted), self._check_stop)
         return keeper
 
     def _fetch(self, key: str, target: Path) -> None:
@@ -212,12 +220,16 @@ class _Execution:
         match outcome:
             case Failed():
                 self._fail(outcome)
-            case Succeeded(report=report) if self._held.kind is JobKind.PREFLIGHT:
-                sound = report["sound"]
-                self._commit(lambda s: jobs.record_findings(s, self._held, report["findings"], sound=sound))
-                log.info("checked", extra={"fields": {"sound": sound}})
+            case Planned(plan=plan):
+                self._wait_for_submaps(plan)
             case Succeeded():
                 self._publish(outcome)
+
+    def _wait_for_submaps(self, plan: SubmapPlan) -> None:
+        handler = self._handler
+        assert isinstance(handler, ReconstructionHandler), "no other is planned"
+        made = self._commit(lambda session: handler.wait_for_submaps(session, plan))
+        log.info("planned", extra={"fields": {"submaps": plan.total, "jobs": made}})
 
     def _give_up(self, reason: StopReason) -> None:
         match reason:

@@ -5,7 +5,8 @@ The shelf is known once the inputs are laid out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -14,33 +15,36 @@ from sqlalchemy.orm import Session
 from schemas.api.jobs import JobKind
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
+from schemas.artifacts import PLAN_CHECKPOINTS, Stage, checkpoint_file, submap_checkpoint, submap_number
 from service.database.connections import Database
 from service.database.tables import now_us
-from service.domain import jobs, maps, scenes
+from service.domain import checkpoints, jobs, maps, scenes, workers
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.domain.drive_checkout import materialise
 from service.domain.map_inputs import MapInputs, inputs_of
+from service.job_queue import QUEUES
 from service.settings import Settings
 from service.storage.artifacts import Fetch
 from service.storage.blob_writer import StoredFile
 from worker.attempt import AttemptFolder
-from worker.child_protocol import Attempt, Work
+from worker.child_protocol import Attempt, SubmapPlan, Work
 from worker.outcomes import Succeeded
 
+SUBMAP_STAGES = (Stage.FEATURES, Stage.MATCHES, Stage.MAPPING)
 
-class DriveHandler:
-    """The check of a drive, or its reconstruction."""
+
+class PreflightHandler:
+    """The check of a drive."""
+
+    shelf: Shelf | None = None  # it shares no stages
 
     def __init__(self, database: Database, held: jobs.Claim) -> None:
         self._database, self._held = database, held
         self._drive_id = held.drive_id or ""
 
-    @property
-    def shelf(self) -> Shelf | None:
-        """The shelf of the drive under these settings; a check shares no stages."""
-        if self._held.kind is not JobKind.RECONSTRUCTION:
-            return None
-        return DriveShelf(self._drive_id, settings_sha256(self._held.settings))
+    def is_wanted(self, name: str) -> bool:
+        """Return whether a finished stage of the shelf is brought, by the name of its file."""
+        return True
 
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
         """The drive as a folder.
@@ -50,10 +54,80 @@ class DriveHandler:
         DriveGoneError
             Where the drive was deleted.
         """
+        return self._attempt(folder, fetch, progress)
+
+    def _attempt(
+        self,
+        folder: AttemptFolder,
+        fetch: Fetch,
+        progress: Callable[[int, int], None],
+        *,
+        units: range | None = None,
+    ) -> Attempt:
         drive = folder.root / "drive"
-        contents = materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress)
+        contents = materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress, units=units)
         work, settings = Work(self._held.kind.lower()), self._held.settings
         return Attempt(work=work, drive=drive, content_sha256=contents, settings=settings)
+
+    def publish(
+        self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
+    ) -> dict[str, Any]:
+        """Record the findings and end the job; what was found, for the log."""
+        sound = bool(done.report["sound"])
+        jobs.record_findings(session, self._held, done.report["findings"], sound=sound)
+        return {"sound": sound}
+
+
+class _StagesHandler(PreflightHandler):
+    """A job whose finished stages lie on the shelf of its drive under its settings."""
+
+    def __init__(self, database: Database, held: jobs.Claim) -> None:
+        super().__init__(database, held)
+        self._stages = DriveShelf(self._drive_id, settings_sha256(held.settings))
+        self.shelf = self._stages
+
+    def _require_stored(self, session: Session, names: Iterable[str]) -> None:
+        """Refuse to go on where others would not find what was finished here.
+
+        Raises
+        ------
+        FileNotFoundError
+            Where a stage is not on the shelf.
+        """
+        missing = checkpoints.missing(session, self._stages, [checkpoint_file(name) for name in names])
+        if missing:
+            raise FileNotFoundError(f"finished stages are not in the artifact store: {', '.join(missing)}")
+
+
+class ReconstructionHandler(_StagesHandler):
+    """The reconstruction of a drive: at first its plan, where the drive may be cut into sub-maps."""
+
+    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
+        super().__init__(database, held)
+        self._settings = settings
+
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
+        """The drive as a folder, likewise."""
+        return replace(self._attempt(folder, fetch, progress), submap_workers=self._submap_workers())
+
+    def _submap_workers(self) -> int:
+        """Number of workers that the drive is cut for; 0 where its sub-maps were made already."""
+        if self._held.has_submaps:
+            return 0
+        if self._settings.submap_workers is not None:
+            return self._settings.submap_workers
+        with self._database.read() as session:
+            return workers.count_processes(session, QUEUES[JobKind.SUBMAP])
+
+    def wait_for_submaps(self, session: Session, plan: SubmapPlan) -> list[str]:
+        """Record jobs for the sub-maps and give the reconstruction back until they have ended; ids of the jobs."""
+        self._require_stored(session, [PLAN_CHECKPOINTS[-1]])
+        checkpoints.drop_submaps(session, self._stages, after=plan.total)
+        places = [
+            jobs.SubmapPlace(number=number, total=plan.total, first_unit=first, last_unit=last)
+            for number, first, last in plan.unfinished
+        ]
+        return jobs.wait_for_submaps(session, self._held, places)
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
@@ -70,11 +144,41 @@ class DriveHandler:
         return {"scene_id": scene_id}
 
 
+class SubmapHandler(_StagesHandler):
+    """A sub-map of a long drive, which needs a part of the drive and leaves finished stages alone."""
+
+    @property
+    def _number(self) -> int:
+        return int(self._held.request["number"])
+
+    def is_wanted(self, name: str) -> bool:
+        """Return whether a finished stage of the shelf is brought: those of the plan and its own."""
+        return name in map(checkpoint_file, PLAN_CHECKPOINTS) or submap_number(name) == self._number
+
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
+        """The part of the drive as a folder, likewise."""
+        place = self._held.request
+        units = range(place["first_unit"], place["last_unit"] + 1)
+        return replace(self._attempt(folder, fetch, progress, units=units), submap=self._number)
+
+    def publish(
+        self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
+    ) -> dict[str, Any]:
+        """End the job, whose stages are stored."""
+        self._require_stored(session, [submap_checkpoint(self._number, stage) for stage in SUBMAP_STAGES])
+        jobs.succeed(session, self._held, reused=done.report["reused"])
+        return {"submap": self._number}
+
+
 class AggregationHandler:
     """An aggregation."""
 
     def __init__(self, database: Database, held: jobs.Claim) -> None:
         self._database, self._held = database, held
+
+    def is_wanted(self, name: str) -> bool:
+        """Return whether a finished stage is brought, likewise."""
+        return True
 
     @cached_property
     def _inputs(self) -> MapInputs:
@@ -127,12 +231,20 @@ class AggregationHandler:
         return {"map_id": self._held.map_id, "version": number}
 
 
-JobHandler = DriveHandler | AggregationHandler
+JobHandler = PreflightHandler | ReconstructionHandler | SubmapHandler | AggregationHandler
 
 
-def handler_of(database: Database, held: jobs.Claim) -> JobHandler:
+def handler_of(database: Database, held: jobs.Claim, settings: Settings) -> JobHandler:
     """The handler for a job's kind."""
-    return (AggregationHandler if held.kind is JobKind.AGGREGATION else DriveHandler)(database, held)
+    match held.kind:
+        case JobKind.AGGREGATION:
+            return AggregationHandler(database, held)
+        case JobKind.RECONSTRUCTION:
+            return ReconstructionHandler(database, held, settings)
+        case JobKind.SUBMAP:
+            return SubmapHandler(database, held)
+        case _:
+            return PreflightHandler(database, held)
 
 
 def _expires_us(days: float | None) -> int | None:

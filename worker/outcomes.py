@@ -13,7 +13,7 @@ from obstore.exceptions import BaseError as StoreError
 
 from service.domain import jobs
 from worker.child import EXIT_DONE, EXIT_OUT_OF_MEMORY
-from worker.child_protocol import ChildError, ChildResult
+from worker.child_protocol import ChildError, ChildResult, SubmapPlan
 
 _KILLED = (
     "Retry the job: finished stages are reused. If it happens again in one stage, a program that watches memory may "
@@ -30,13 +30,20 @@ class Succeeded:
     ----------
     report
         Of a reconstruction or aggregation, what `report.json` says, and of the latter what the version's record has of
-        `map.json` as `map`; of a preflight, `findings` and `sound`.
+        `map.json` as `map`; of a preflight, `findings` and `sound`; of a sub-map, `reused`.
     out
         Folder of the scene.
     """
 
     report: dict[str, Any]
     out: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """The drive was cut, and its sub-maps come first."""
+
+    plan: SubmapPlan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +69,7 @@ class Failed(ChildError):
     blame: float = jobs.FULL_BLAME
 
 
-Outcome = Succeeded | Failed
+Outcome = Succeeded | Planned | Failed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +104,8 @@ def outcome_of(ending: Ending) -> Outcome:
     result = ending.result or ChildResult()
     if result.report is not None:
         return Succeeded(report=result.report, out=ending.out)
+    if result.plan is not None:
+        return Planned(plan=result.plan)
     failed = partial(Failed, stage=ending.stage, log_tail=ending.log_tail)
     where = f"in stage {ending.stage!r}" if ending.stage else "before its first stage"
     if ending.timeout_s is not None:

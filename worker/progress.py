@@ -36,6 +36,13 @@ WEIGHTS: Mapping[Work, Mapping[str, float]] = MappingProxyType(
             Stage.EXPORT: 6.0,
             Stage.PUBLISH: 4.0,
         },
+        Work.SUBMAP: {
+            Stage.FETCH: 4.0,
+            Stage.FEATURES: 39.0,
+            Stage.MATCHES: 31.0,
+            Stage.MAPPING: 25.0,
+            Stage.PUBLISH: 1.0,
+        },
         Work.PREFLIGHT: {Stage.FETCH: 20.0, Stage.PREFLIGHT: 30.0, Stage.CALIBRATION: 50.0},
     }
 )

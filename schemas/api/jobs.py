@@ -37,6 +37,9 @@ class ReconstructionSettings(RequestBody):
         None, description="name of a model on the workers that makes masks for images that come without"
     )
     semantic_triangulation: bool | None = Field(None, description="drop points of the road that are off its surface")
+    submaps: Annotated[int, Field(ge=1, le=1000)] | None = Field(
+        None, description="number of pieces that a long drive is cut into; null: as its length and the workers ask for"
+    )
     motion_compensation: bool | None = Field(None, description="pose every image at its own time")
 
 
@@ -57,6 +60,7 @@ class JobKind(StrEnum):
     PREFLIGHT = "PREFLIGHT"
     RECONSTRUCTION = "RECONSTRUCTION"
     AGGREGATION = "AGGREGATION"
+    SUBMAP = "SUBMAP"
 
 
 class JobState(StrEnum):
@@ -100,7 +104,7 @@ class JobProgress(Resource):
     total: int | None = Field(None, description="of the stage")
     unit: str | None = Field(None, description="what done and total count")
     percent: float = Field(
-        description="of the whole job, with what an aggregation waits for; never falls within an attempt",
+        description="of the whole job, with the jobs that it waits for; never falls within an attempt",
         ge=0,
         le=100,
     )
@@ -118,7 +122,9 @@ class JobAttempt(Resource):
     worker: str = Field(description="machine and process")
     started_at: datetime
     finished_at: datetime | None = Field(None, description="null while it runs")
-    outcome: str | None = Field(None, description="succeeded, cancelled, released, or the code of a problem")
+    outcome: str | None = Field(
+        None, description="succeeded, cancelled, released, planned (sub-maps go on), or the code of a problem"
+    )
     problem: Problem | None = Field(None, description="why it failed")
 
 
@@ -150,6 +156,34 @@ class JobMember(Resource):
     problem: Problem | None = Field(None, description="why there will be none")
 
 
+class JobSubmap(Resource):
+    """A sub-map of a long drive, which a job of its own maps."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "number": 3,
+                    "job_id": EXAMPLE_JOB,
+                    "first_unit": 4100,
+                    "last_unit": 6200,
+                    "state": "RUNNING",
+                    "percent": 33.5,
+                    "problem": None,
+                }
+            ]
+        }
+    )
+
+    number: int = Field(description="along the drive, from 1")
+    job_id: str = Field(description="the job that maps it")
+    first_unit: int = Field(description="index of its first frame in the manifest")
+    last_unit: int = Field(description="index of its last frame in the manifest")
+    state: JobState = Field(description="of that job")
+    percent: float = Field(description="of that job", ge=0, le=100)
+    problem: Problem | None = Field(None, description="why that job failed")
+
+
 class JobResource(Times):
     """A job as the API shows it."""
 
@@ -171,6 +205,9 @@ class JobResource(Times):
                     "map_id": None,
                     "map_version": None,
                     "members": [],
+                    "parent_id": None,
+                    "submap": None,
+                    "submaps": [],
                     "retry_of": None,
                     "created_at": "2026-05-04T09:31:00Z",
                     "started_at": "2026-05-04T09:31:02Z",
@@ -182,11 +219,15 @@ class JobResource(Times):
     )
 
     id: str
-    kind: JobKind = Field(description="PREFLIGHT is the check of a drive's images, which its commit starts")
+    kind: JobKind = Field(
+        description="PREFLIGHT is the check of a drive's images, which its commit starts; SUBMAP is a piece of a long "
+        "drive, which its reconstruction starts"
+    )
     drive_id: str | None = Field(None, description="null for an aggregation, which has members")
     state: JobState = Field(
         description="STALLED is RUNNING without a recent heartbeat: another worker will take over. An aggregation is "
-        "QUEUED, in stage 'reconstructions', while its drives are reconstructed"
+        "QUEUED, in stage 'reconstructions', while its drives are reconstructed, and the reconstruction of a long "
+        "drive, in stage 'submaps', while its sub-maps are mapped"
     )
     settings: dict[str, Any] = Field(description="as asked")
     progress: JobProgress
@@ -198,6 +239,11 @@ class JobResource(Times):
     map_id: str | None = Field(None, description="of which an aggregation makes a version")
     map_version: int | None = Field(None, description="the version that it made")
     members: list[JobMember] = Field(default_factory=list, description="what an aggregation brings into its map")
+    parent_id: str | None = Field(None, description="the reconstruction that a sub-map is a piece of")
+    submap: int | None = Field(None, description="number of a SUBMAP's sub-map along the drive, from 1")
+    submaps: list[JobSubmap] = Field(
+        default_factory=list, description="jobs that a reconstruction started for the sub-maps of its drive"
+    )
     retry_of: str | None = Field(None, description="the job that this one repeats")
     started_at: datetime | None = Field(None, description="of the first attempt")
     finished_at: datetime | None = Field(None, description="when it succeeded, failed or was cancelled")

@@ -14,9 +14,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.database.connections import Database
 from service.database.tables import Job, JobState, Project, WorkerSeen, now_us
+from service.domain.workers import ONLINE_US
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-ONLINE_US = 60_000_000  # a worker that reported within this time is online
 
 
 class Metrics:

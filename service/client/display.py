@@ -23,6 +23,7 @@ from service.client.job_watcher import ENDED, JobNews
 
 _LINE_EVERY_S = 10.0
 _NAME = "{task.description:<9}"
+_CHILDREN = ("reconstructions", "submaps")  # stages of a job that waits for others
 
 
 def _byte_columns() -> tuple[ProgressColumn, ...]:
@@ -152,7 +153,7 @@ def described(news: JobNews) -> str:
     >>> described(JobNews("RUNNING", 1, 33.5, "matches", 410, 1902, "pairs", 120.0, 260.0))
     'RUNNING, 33.5 %, matches 410/1902 pairs, 2 to 5 min to go'
     """
-    if news.state == "QUEUED":
+    if news.state == "QUEUED" and news.stage not in _CHILDREN:
         return "QUEUED" if news.attempt == 0 else f"QUEUED again after attempt {news.attempt}"
     if news.state in ENDED:
         return news.state

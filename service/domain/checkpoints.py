@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from schemas.artifacts import checkpoint_file, seam_checkpoint
+from schemas.artifacts import checkpoint_file, seam_checkpoint, submap_number
 from service.database.connections import Database
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
@@ -72,13 +72,20 @@ _SHELVES_A_DRIVE = 3
 _KEPT = (Blob.id, Blob.key)
 
 
-def restore(database: Database, shelf: Shelf, folder: Path, *, fetch: Fetch) -> list[str]:
+def restore(
+    database: Database,
+    shelf: Shelf,
+    folder: Path,
+    *,
+    fetch: Fetch,
+    is_wanted: Callable[[str], bool] = lambda name: True,
+) -> list[str]:
     """Bring finished stages into a folder; the names of the files brought.
 
     They save time and nothing else: one whose bytes are lost is forgotten, and the stage is done again.
     """
     with database.read() as session:
-        found = _shelved(session, shelf)
+        found = {name: kept for name, kept in _shelved(session, shelf).items() if is_wanted(name)}
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     brought = []
     for name, kept in found.items():
@@ -155,6 +162,20 @@ def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> bo
     if isinstance(shelf, DriveShelf):
         _clear_old_shelves(session, shelf)
     return kept
+
+
+def missing(session: Session, shelf: DriveShelf, names: Collection[str]) -> list[str]:
+    """Names of checkpoints that a later attempt would not find."""
+    return sorted(set(names) - _shelved(session, shelf).keys())
+
+
+def drop_submaps(session: Session, shelf: DriveShelf, *, after: int) -> None:
+    """Drop the stages of sub-maps with higher numbers: the drive was cut into more pieces once, which are large."""
+    mine = (Checkpoint.drive_id == shelf.drive_id) & (Checkpoint.settings_sha256 == shelf.settings_sha256)
+    names = session.scalars(select(Checkpoint.name).where(mine)).all()
+    old = [name for name in names if (number := submap_number(name)) is not None and number > after]
+    dropped = delete(Checkpoint).where(mine, Checkpoint.name.in_(old))
+    session.execute(dropped.execution_options(synchronize_session=False))
 
 
 def _clear_old_shelves(session: Session, shelf: DriveShelf) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Container
 from pathlib import Path
 
 from sqlalchemy import select
@@ -24,6 +25,7 @@ def materialise(
     *,
     fetch: Fetch,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    units: range | None = None,
 ) -> dict[str, str]:
     """Lay a drive out as a folder that the engine reads: `drive.json` and the files under the names it gives them.
 
@@ -33,11 +35,13 @@ def materialise(
         Brings one file.
     progress
         Called as progress(done, total) with each file.
+    units
+        Indices of the frames whose files are brought; by default all are.
 
     Returns
     -------
     dict
-        SHA-256 of the files by their names in the manifest.
+        SHA-256 of all the drive's files by their names in the manifest.
 
     Raises
     ------
@@ -54,9 +58,18 @@ def materialise(
         files = session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
     folder.mkdir(parents=True, mode=0o700)
     fetch(manifest.key, folder / MANIFEST_NAME)
-    for i, (path, key, _) in enumerate(files):
+    wanted = None if units is None else _files_of_units(folder / MANIFEST_NAME, units)
+    brought = [(path, key) for path, key, _ in files if wanted is None or path in wanted]
+    for i, (path, key) in enumerate(brought):
         target = folder / path  # checked when the manifest came: relative, without '..'
         target.parent.mkdir(parents=True, exist_ok=True)
         fetch(key, target)
-        progress(i + 1, len(files))
+        progress(i + 1, len(brought))
     return {path: sha256 for path, _, sha256 in files}
+
+
+def _files_of_units(manifest: Path, units: range) -> Container[str]:
+    """Images and masks of some frames. The manifest was checked when it came."""
+    frames = json.loads(manifest.read_bytes())["frames"][units.start : units.stop]
+    images = [image for frame in frames for image in frame["images"].values()]
+    return {name for image in images for name in (image["file"], image.get("mask")) if name is not None}

@@ -254,7 +254,8 @@ def remove(session: Session, drive: Drive) -> None:
         409 where a job or a map needs it.
     """
     active = session.scalars(jobs.active_of_drive(drive.id)).all()
-    needing = [job.id for job in active if job.kind != JobKind.PREFLIGHT]
+    # Sub-maps end with their reconstruction, or have nobody any more who waits for them.
+    needing = [job.id for job in active if job.kind not in (JobKind.PREFLIGHT, JobKind.SUBMAP)]
     if needing:
         raise DriveInUse(
             f"drive {drive.id} is needed by {len(needing)} jobs: {', '.join(needing[:3])}",

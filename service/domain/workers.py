@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import delete
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from service.database.tables import WorkerSeen, now_us
+
+ONLINE_US = 60_000_000  # a worker that reported within this time is online
+
+
+def count_processes(session: Session, queue: str) -> int:
+    """Processes of the workers that are online and take jobs from a queue."""
+    online = session.scalars(select(WorkerSeen).where(WorkerSeen.seen_us > now_us() - ONLINE_US))
+    return sum(worker.concurrency for worker in online if queue in worker.queues.split(","))
 
 
 def report(session: Session, *, name: str, queues: Sequence[str], concurrency: int) -> None:

@@ -175,7 +175,7 @@ def test_every_setting_of_a_request_reaches_the_engine() -> None:
     asked = ReconstructionSettings(
         use_gnss=False, max_keypoints=500, max_side_px=800, refine_calibration=False, refine_focal=True, seed=7,
         extractor="xfeat", matcher="lighterglue", segmentation_model="streets",
-        semantic_triangulation=False, motion_compensation=False,
+        semantic_triangulation=False, motion_compensation=False, submaps=4,
     )  # fmt: skip
     assert None not in asked.model_dump().values()
     config = engine_config(asked.model_dump(), threads=3)
@@ -184,5 +184,6 @@ def test_every_setting_of_a_request_reaches_the_engine() -> None:
     assert (config.bundle_adjustment.refine_calibration, config.bundle_adjustment.refine_focal) == (False, True)
     assert (config.features.extractor, config.matching.matcher) == ("xfeat", "lighterglue")
     assert config.semantics.model == "streets"
+    assert config.submaps.count == 4
     assert (config.mapping.semantic_triangulation, config.mapping.motion_compensation) == (False, False)
     assert (plain.use_gnss, plain.features.max_keypoints, plain.bundle_adjustment.refine_focal) == (True, 2048, False)

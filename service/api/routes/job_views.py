@@ -12,6 +12,7 @@ from schemas.api.jobs import JobAttempt as AttemptResource
 from schemas.api.jobs import JobKind, JobProgress, JobResource
 from schemas.api.jobs import JobMember as MemberResource
 from schemas.api.jobs import JobState as ShownState
+from schemas.api.jobs import JobSubmap as SubmapResource
 from service.api.dependencies import moment
 from service.database.tables import Job, JobAttempt, JobMember, JobState, now_us
 from service.domain import jobs
@@ -29,10 +30,10 @@ def shown_state(job: Job, settings: Settings) -> ShownState:
 
 
 def etag_of(job: Job, shown: JobResource) -> str:
-    """Changes with everything that a reader can see; also with members, which go on after an aggregation has ended."""
-    members = "".join(member.model_dump_json() for member in shown.members)
-    of_members = f"-{hashlib.sha256(members.encode()).hexdigest()[:16]}" if members else ""
-    return f'"{job.revision}-{shown.state.lower()}{of_members}"'
+    """Changes with everything that a reader can see; also with children, which go on after their parent has ended."""
+    children = "".join(child.model_dump_json() for child in (*shown.members, *shown.submaps))
+    of_children = f"-{hashlib.sha256(children.encode()).hexdigest()[:16]}" if children else ""
+    return f'"{job.revision}-{shown.state.lower()}{of_children}"'
 
 
 def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list[JobResource]:
@@ -43,7 +44,12 @@ def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list
         attempts.setdefault(attempt.job_id, []).append(attempt)
     trees = [job.id for job in found if job.kind == JobKind.AGGREGATION]
     members = jobs.members_of(session, trees) if trees else {}
-    return [_shown(job, attempts.get(job.id, ()), members.get(job.id, ()), settings) for job in found]
+    planned = [job.id for job in found if job.kind == JobKind.RECONSTRUCTION and job.children_percent]
+    submaps = jobs.submaps_of(session, planned) if planned else {}
+    return [
+        _shown(job, attempts.get(job.id, ()), members.get(job.id, ()), submaps.get(job.id, ()), settings)
+        for job in found
+    ]
 
 
 def view_of(session: Session, job: Job, settings: Settings) -> JobResource:
@@ -52,7 +58,11 @@ def view_of(session: Session, job: Job, settings: Settings) -> JobResource:
 
 
 def _shown(
-    job: Job, attempts: Sequence[JobAttempt], members: Sequence[tuple[JobMember, Job | None]], settings: Settings
+    job: Job,
+    attempts: Sequence[JobAttempt],
+    members: Sequence[tuple[JobMember, Job | None]],
+    submaps: Sequence[Job],
+    settings: Settings,
 ) -> JobResource:
     return JobResource.model_validate(
         {
@@ -79,6 +89,9 @@ def _shown(
             "map_id": job.map_id,
             "map_version": job.map_version,
             "members": [_shown_member(member, child, settings) for member, child in members],
+            "parent_id": job.parent_id,
+            "submap": None if job.parent_id is None else jobs.number_of(job),
+            "submaps": [_shown_submap(submap, settings) for submap in submaps],
             "retry_of": job.retry_of,
             "created_at": moment(job.created_us),
             "started_at": moment(job.started_us),
@@ -112,5 +125,20 @@ def _shown_member(member: JobMember, child: Job | None, settings: Settings) -> M
             "percent": 100.0 if is_there or child is None else child.percent,
             "scene_id": member.scene_id,
             "problem": member.problem,
+        }
+    )
+
+
+def _shown_submap(submap: Job, settings: Settings) -> SubmapResource:
+    place = submap.request or {}
+    return SubmapResource.model_validate(
+        {
+            "number": place["number"],
+            "job_id": submap.id,
+            "first_unit": place["first_unit"],
+            "last_unit": place["last_unit"],
+            "state": shown_state(submap, settings),
+            "percent": submap.percent,
+            "problem": submap.problem,
         }
     )

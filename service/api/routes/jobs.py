@@ -97,7 +97,8 @@ def cancel_job(
 ) -> Response:
     """Ask for a job's end. One that waits ends at once; one that runs is told to stop, and killed if it does not.
 
-    With an aggregation, the reconstructions end that were made for it and that nobody else waits for.
+    With an aggregation, the reconstructions end that were made for it and that nobody else waits for; with a
+    reconstruction, its sub-maps. A sub-map that is cancelled fails its reconstruction.
     """
 
     def effect(session: Session) -> Answer:
@@ -118,7 +119,10 @@ def cancel_job(
     responses={**ACCEPTED, **problems(401, 404, 409, 413, 422, 429)},
 )
 def retry_job(job_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep) -> Response:
-    """Do again what failed or was cancelled, as a new job. Finished stages are reused."""
+    """Do again what failed or was cancelled, as a new job. Finished stages are reused.
+
+    A sub-map is not retried alone: the retry of its reconstruction maps those again that are not finished.
+    """
 
     def effect(session: Session) -> Answer:
         expires_us = expiry_us(now_us(), context.settings.job_retention_days)

@@ -17,9 +17,10 @@ from schemas.api.status import DiskStatus, Health, QueueStatus, Ready, ServiceSt
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, moment
 from service.api.http.responses import gives, problems
-from service.api.metrics import CONTENT_TYPE, ONLINE_US, Metrics
+from service.api.metrics import CONTENT_TYPE, Metrics
 from service.api.readiness import Readiness
 from service.database.tables import Job, JobState, WorkerSeen, now_us
+from service.domain.workers import ONLINE_US
 from service.errors import Unauthorized
 from service.job_queue import QUEUES, BrokerError
 

@@ -39,7 +39,7 @@ class Job(Base):
     # No foreign keys: a job's record outlives the drive and the map. An aggregation has no drive, only it has a map.
     drive_id: Mapped[str | None] = mapped_column(Id, index=True)
     map_id: Mapped[str | None] = mapped_column(Id, index=True)
-    request: Mapped[dict[str, Any] | None]  # of an aggregation, as asked
+    request: Mapped[dict[str, Any] | None]  # of an aggregation, as asked; of a sub-map, its place in the drive
     settings: Mapped[dict[str, Any]] = mapped_column(default=dict)
     state: Mapped[str] = mapped_column(String(16), default=JobState.QUEUED)
     revision: Mapped[int] = mapped_column(default=1)  # rises with every change that a reader can see
@@ -66,7 +66,9 @@ class Job(Base):
     problem: Mapped[dict[str, Any] | None]
     scene_id: Mapped[str | None] = mapped_column(Id)
     map_version: Mapped[int | None]
-    is_child: Mapped[bool] = mapped_column(default=False)  # made for an aggregation, and ends when none needs it
+    is_child: Mapped[bool] = mapped_column(default=False)  # made for another job, and ends when none needs it
+    # The reconstruction that a sub-map is a piece of. No foreign key: its record may be deleted first.
+    parent_id: Mapped[str | None] = mapped_column(Id, index=True)
     waiting_for: Mapped[int] = mapped_column(default=0)  # other jobs that have to end before this one can begin
     children_percent: Mapped[float] = mapped_column(default=0.0)  # of the whole, what these are worth
     retry_of: Mapped[str | None] = mapped_column(Id)

@@ -24,6 +24,7 @@ from service.domain.jobs._leases import (
     heartbeat,
     note_finished_stage,
 )
+from service.domain.jobs._planning import SubmapPlace, wait_for_submaps
 from service.domain.jobs._queries import Claim, FencedError, active_of_drive, events_after
 from service.domain.jobs._queue import all_due, due, mark_enqueued
 from service.domain.jobs._requests import (
@@ -35,6 +36,7 @@ from service.domain.jobs._requests import (
     require_places,
     retry,
 )
+from service.domain.jobs._submaps import look_at_submaps, number_of, submaps_of, untold_parents
 
 __all__ = [
     "FULL_BLAME",
@@ -47,6 +49,7 @@ __all__ = [
     "OfTree",
     "ProgressNote",
     "RetryLimits",
+    "SubmapPlace",
     "active_of_drive",
     "all_due",
     "blame_of_loss",
@@ -64,9 +67,11 @@ __all__ = [
     "has_succeeded",
     "heartbeat",
     "look_at",
+    "look_at_submaps",
     "mark_enqueued",
     "members_of",
     "note_finished_stage",
+    "number_of",
     "orphans",
     "record_findings",
     "release",
@@ -74,6 +79,9 @@ __all__ = [
     "require_failed",
     "require_places",
     "retry",
+    "submaps_of",
     "succeed",
     "tend",
+    "untold_parents",
+    "wait_for_submaps",
 ]

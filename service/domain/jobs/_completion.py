@@ -16,6 +16,7 @@ from service.database.tables import Drive, Job, JobState, now_us
 from service.domain.jobs._blame import FULL_BLAME, NO_BLAME, RetryLimits
 from service.domain.jobs._dependencies import resolve_child
 from service.domain.jobs._queries import Claim, change, close_attempts, held_by, locked, require, tell_state
+from service.domain.jobs._submaps import look_at_submaps
 
 
 def succeed(
@@ -83,7 +84,7 @@ def fail(
     counts = _counts(job, blame)
     if problem.retryable and limits.allow(**counts):
         not_before_us = clock_us(session) + retry_delay_us
-        requeue(session, held, outcome, described, not_before_us=not_before_us, counts=counts)
+        requeue(session, held, outcome, described, not_before_us=not_before_us, values=counts)
         return JobState.QUEUED
     end(session, held, JobState.FAILED, outcome, {"problem": described, **counts}, problem=described)
     return JobState.FAILED
@@ -120,7 +121,7 @@ def release(session: Session, held: Claim) -> None:
     if locked(session, held.job_id).cancel_requested_us is not None:
         cancelled(session, held)
         return
-    requeue(session, held, "released", None, not_before_us=0, counts={})
+    requeue(session, held, "released", None, not_before_us=0, values={})
 
 
 def record_findings(session: Session, held: Claim, findings: Sequence[Mapping[str, Any]], *, sound: bool) -> None:
@@ -162,6 +163,8 @@ def after_end(session: Session, job_id: str) -> None:
     job = session.get_one(Job, job_id, populate_existing=True)
     if job.kind == JobKind.RECONSTRUCTION:
         resolve_child(session, job)
+    if job.kind == JobKind.SUBMAP and job.parent_id is not None:
+        look_at_submaps(session, job.parent_id)
     if job.kind == JobKind.PREFLIGHT and job.state != JobState.SUCCEEDED:
         pending = (Drive.preflight_job_id == job_id) & (Drive.preflight_state == PreflightState.PENDING)
         session.execute(update(Drive).where(pending).values(preflight_state=PreflightState.UNKNOWN))
@@ -174,16 +177,17 @@ def requeue(
     problem: Mapping[str, Any] | None,
     *,
     not_before_us: int,
-    counts: Mapping[str, Any],
+    values: Mapping[str, Any],
 ) -> None:
-    values: dict[str, Any] = {
+    """Give the job back to the queue, with more values of its row."""
+    queued: dict[str, Any] = {
         "state": JobState.QUEUED,
         "owner": None,
         "lease_until_us": None,
         "not_before_us": not_before_us,
         "enqueued_us": None,
-        **counts,
+        **values,
     }
-    require(change(session, held.job_id, held_by(held), values))
+    require(change(session, held.job_id, held_by(held), queued))
     close_attempts(session, held.job_id, outcome, problem)
     tell_state(session, held.job_id)

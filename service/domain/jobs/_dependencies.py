@@ -1,4 +1,4 @@
-"""Aggregations and the reconstructions that they wait for.
+"""Aggregations and the reconstructions that they wait for; `_submaps` is the same for reconstructions.
 
 Everything is decided from the database: by the transaction in which a child ends, and once more by the reconciler.
 A transaction that holds a child's row may go on to its parents' rows, and none goes the other way: no two can wait for
@@ -13,6 +13,7 @@ from typing import Any
 from sqlalchemy import and_, exists, func, or_, select
 from sqlalchemy.orm import Session
 
+from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.tables import TERMINAL, Job, JobMember, JobState, now_us
 from service.domain.jobs._queries import ACTIVE, change, tell_progress, tell_state
@@ -21,7 +22,7 @@ MIN_SCENES = 2
 CHILDREN_STAGE = "reconstructions"
 
 _OPEN = JobMember.child_id.is_not(None) & JobMember.scene_id.is_(None) & JobMember.problem.is_(None)
-_WAITS = (Job.state == JobState.QUEUED) & (Job.waiting_for > 0)
+WAITS = (Job.state == JobState.QUEUED) & (Job.waiting_for > 0)
 
 
 def resolve_child(session: Session, child: Job) -> None:
@@ -54,10 +55,10 @@ def look_at(session: Session, parent_id: str) -> None:
     problem = _hopeless(session, parent, left)
     if problem is not None:
         ended = {"state": JobState.FAILED, "finished_us": now_us(), "problem": problem, "waiting_for": left}
-        if change(session, parent_id, _WAITS, ended):
+        if change(session, parent_id, WAITS, ended):
             tell_state(session, parent_id)
         return
-    if change(session, parent_id, _WAITS, {"waiting_for": left}):
+    if change(session, parent_id, WAITS, {"waiting_for": left}):
         _tell(session, parent_id)
 
 
@@ -102,7 +103,7 @@ def _problem(code: str, detail: str, *, remedy: str = "Retry it.") -> dict[str, 
     return problem.model_dump(mode="json", exclude_none=True)
 
 
-def tell_parents(session: Session, child: Job) -> None:
+def tell_aggregations(session: Session, child: Job) -> None:
     """Pass a child's progress on to the aggregations that wait for it."""
     waiting = select(JobMember.job_id).where(JobMember.child_id == child.id, _OPEN).order_by(JobMember.job_id)
     for parent_id in session.scalars(waiting).all():
@@ -136,7 +137,8 @@ def _tell(session: Session, parent_id: str) -> None:
 
 def tend(session: Session) -> None:
     """Find children that ended without their parents being told: their records may have gone meanwhile."""
-    waiting = session.scalars(select(Job.id).where(_WAITS).order_by(Job.id)).all()
+    aggregations = WAITS & (Job.kind == JobKind.AGGREGATION)
+    waiting = session.scalars(select(Job.id).where(aggregations).order_by(Job.id)).all()
     if not waiting:
         return
     ended = or_(Job.id.is_(None), Job.state.in_(TERMINAL))
@@ -150,14 +152,17 @@ def tend(session: Session) -> None:
 
 
 def orphans(session: Session, *, among: Sequence[str] | None = None) -> list[str]:
-    """Jobs under way that were made for aggregations, none of which waits for them any more."""
+    """Jobs under way that were made for others, none of which waits for them any more."""
     parent = Job.__table__.alias("parent")
-    needed = (
+    is_active = parent.c.state.in_(ACTIVE)
+    by_aggregation = (
         select(JobMember.job_id)
         .join(parent, parent.c.id == JobMember.job_id)
-        .where(JobMember.child_id == Job.id, parent.c.state.in_(ACTIVE))
+        .where(JobMember.child_id == Job.id, is_active)
     )
-    wanted = and_(Job.is_child, Job.state.in_(ACTIVE), Job.cancel_requested_us.is_(None), ~needed.exists())
+    by_reconstruction = select(parent.c.id).where(parent.c.id == Job.parent_id, is_active)
+    needed = or_(by_aggregation.exists(), by_reconstruction.exists())
+    wanted = and_(Job.is_child, Job.state.in_(ACTIVE), Job.cancel_requested_us.is_(None), ~needed)
     if among is not None:
         wanted = wanted & Job.id.in_(among)
     return list(session.scalars(select(Job.id).where(wanted).order_by(Job.id)))

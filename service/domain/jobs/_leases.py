@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import case, func, select, update
+from sqlalchemy import case, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -14,7 +14,6 @@ from service.database.connections import clock_us
 from service.database.tables import Job, JobAttempt, JobState
 from service.domain.jobs._blame import LESS_MEMORY, RetryLimits, blame_of_loss
 from service.domain.jobs._completion import end, fail
-from service.domain.jobs._dependencies import tell_parents
 from service.domain.jobs._queries import (
     Claim,
     FencedError,
@@ -25,6 +24,7 @@ from service.domain.jobs._queries import (
     tell_progress,
     tell_state,
 )
+from service.domain.jobs._submaps import tell_parents
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,8 +148,9 @@ def cancel_requested(session: Session, held: Claim) -> bool:
 
 
 def has_succeeded(session: Session, held: Claim) -> bool:
-    """Return whether this holder, and no other, has ended the job as succeeded."""
-    by_holder = (Job.state == JobState.SUCCEEDED) & (Job.fence == held.fence)
+    """Return whether this holder, and no other, has ended the job as succeeded, or left it to its sub-maps."""
+    is_done = or_(Job.state == JobState.SUCCEEDED, (Job.state == JobState.QUEUED) & (Job.waiting_for > 0))
+    by_holder = is_done & (Job.fence == held.fence)
     return session.scalar(select(Job.id).where(Job.id == held.job_id, by_holder)) is not None
 
 

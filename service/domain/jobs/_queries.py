@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, delete, select, update
@@ -33,6 +33,12 @@ class Claim:
     settings: dict[str, Any]
     children_percent: float = 0.0
     blame: float = 0.0  # of the attempts before
+    request: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def has_submaps(self) -> bool:
+        """Return whether the sub-maps of a reconstruction were made, by jobs of their own."""
+        return self.kind is JobKind.RECONSTRUCTION and self.children_percent > 0.0
 
 
 def claim_of(job: Job) -> Claim:
@@ -47,6 +53,7 @@ def claim_of(job: Job) -> Claim:
         settings=job.settings,
         children_percent=job.children_percent,
         blame=job.blame,
+        request=job.request or {},
     )
 
 

@@ -15,15 +15,19 @@ from service.database.tables import Drive, Job, JobState, Project, new_id
 from service.domain.jobs._completion import after_end
 from service.domain.jobs._dependencies import orphans
 from service.domain.jobs._queries import ACTIVE, active_of_drive, change, close_attempts, locked, tell_state
-from service.errors import CheckActive, DriveDeleted, JobEnded, JobNotFailed, QuotaFull, TooManyJobs
+from service.errors import CheckActive, DriveDeleted, JobEnded, JobNotFailed, JobOfTree, QuotaFull, TooManyJobs
+
+# A drive's check is part of committing it, and a sub-map of its reconstruction.
+_UNCOUNTED = (JobKind.PREFLIGHT, JobKind.SUBMAP)
 
 
 class OfTree(TypedDict, total=False):
-    """Fields of a job in an aggregation's tree."""
+    """Fields of a job in a tree."""
 
     map_id: str
     request: dict[str, Any]
     is_child: bool
+    parent_id: str
     waiting_for: int
 
 
@@ -45,14 +49,14 @@ def create(
     drive_id
         None for an aggregation, which has a map.
     of_tree
-        Of an aggregation, and of a job that one needs.
+        Of a job that waits for others, and of a job that another one needs.
 
     Raises
     ------
     ServiceError
         429 where the project has as many active jobs as its quota allows, 413 where it has no space left.
     """
-    if kind is not JobKind.PREFLIGHT:  # a drive's check is part of committing it
+    if kind not in _UNCOUNTED:
         require_places(session, project_id, 1)
     job = Job(
         id=new_id("job"),
@@ -91,7 +95,7 @@ def require_places(session: Session, project_id: str, count: int) -> None:
             remedy="Delete drives, scenes or maps that are not needed any more (their space is free within about an "
             "hour), or ask the operator for a larger quota.",
         )
-    mine = (Job.project_id == project_id) & (Job.kind != JobKind.PREFLIGHT) & Job.state.in_(ACTIVE)
+    mine = (Job.project_id == project_id) & Job.kind.not_in(_UNCOUNTED) & Job.state.in_(ACTIVE)
     active = session.scalar(select(func.count()).select_from(Job).where(mine)) or 0
     if active + count > project.max_active_jobs:
         wanted = f", and this needs {count} more at one time" if count > 1 else ""
@@ -133,7 +137,7 @@ def request_cancel(session: Session, job_id: str) -> None:
 
 
 def cancel_orphan(session: Session, job_id: str) -> bool:
-    """End a job that was made for an aggregation, unless another one has come to wait for it; whether it was ended."""
+    """End a job that was made for another one, unless one has come to wait for it; whether it was ended."""
     locked(session, job_id)  # who begins to wait for it holds this row, too
     if not orphans(session, among=[job_id]):
         return False
@@ -147,10 +151,15 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     Raises
     ------
     ServiceError
-        409 where the job has not ended, has succeeded, its drive was deleted or needs no other check; 413
-        and 429 as `create`.
+        409 where the job has not ended, has succeeded, is a sub-map's, its drive was deleted or needs no other
+        check; 413 and 429 as `create`.
     """
     require_failed(job)
+    if job.parent_id is not None:
+        raise JobOfTree(
+            f"job {job.id} maps a piece of a drive for reconstruction {job.parent_id}, which has ended with it",
+            remedy=f"Retry that one, POST /v1/jobs/{job.parent_id}:retry: finished stages are reused.",
+        )
     drive = session.get(Drive, job.drive_id or "", with_for_update=True, populate_existing=True)
     if drive is None:
         raise DriveDeleted(

@@ -159,6 +159,7 @@ def test_event_streams_are_read_however_they_are_cut(size: int) -> None:
     [
         (JobNews("QUEUED"), "QUEUED"),
         (JobNews("QUEUED", attempt=1), "QUEUED again after attempt 1"),
+        (JobNews("QUEUED", 1, 30.0, "submaps", 3, 8, "sub-maps"), "QUEUED, 30.0 %, submaps 3/8 sub-maps"),
         (
             JobNews("RUNNING", 1, 33.5, "matches", 4, 19, "pairs", 120, 260),
             "RUNNING, 33.5 %, matches 4/19 pairs, 2 to 5 min to go",
