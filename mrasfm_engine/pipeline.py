@@ -126,8 +126,9 @@ def plan_submaps(
     """
     drive = read_drive(drive_folder)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
+    if stages.count_of_submaps(run, workers) == 1:
+        return []  # all of this is left to `reconstruct`
     _, spans = _begun(run, workers)
-    stages.own_cars(run)
     unit_of = np.arange(len(drive.manifest.frames)) if run.standing is None else np.flatnonzero(run.standing.included)
     result = []
     for span in spans:

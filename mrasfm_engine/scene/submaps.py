@@ -16,6 +16,9 @@ from mrasfm_engine.types import Bools, Ints
 KEYPOINT_BYTES = 100
 # A sub-map is at least so many times as long as what it shares with a neighbour: less would be done twice too often.
 LEAST_OVERLAPS = 4
+# And it has so many images at least: to hand a sub-map to a worker and to join it takes ten to twenty seconds, as long
+# as some fifty images take.
+LEAST_IMAGES = 250
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +74,10 @@ def count_for_memory(drive: Drive, *, keypoints_per_image: int, memory_bytes: fl
     return math.ceil(len(drive.images) * keypoints_per_image * KEYPOINT_BYTES / memory_bytes)
 
 
-def count_for_workers(units: int, workers: int, overlap: int) -> int:
+def count_for_workers(drive: Drive, workers: int, overlap: int) -> int:
     """Number of sub-maps that keep some workers busy without doing much twice."""
-    return max(1, min(workers, (units - overlap) // ((LEAST_OVERLAPS - 1) * overlap)))
+    by_length = (len(drive.manifest.frames) - overlap) // ((LEAST_OVERLAPS - 1) * overlap)
+    return max(1, min(workers, by_length, len(drive.images) // LEAST_IMAGES))
 
 
 def cut(units: int, count: int, overlap: int) -> list[Span]:

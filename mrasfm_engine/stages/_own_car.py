@@ -12,6 +12,7 @@ from mrasfm_engine.io.images import mask_of_png, mask_png
 from mrasfm_engine.io.stage_store import Arrays, fingerprint
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.types import Bools
+from schemas.artifacts import Stage
 from schemas.findings import as_json
 
 OWN_CAR, OWN_CAR_VERSION = "own-car", 1
@@ -35,6 +36,7 @@ def _found(run: Run) -> tuple[list[Bools | None], dict[str, Any]]:
     stored = run.store.load(OWN_CAR, key)
     if stored is not None:
         return _unpacked(stored[0]), stored[1]
+    run.begin(Stage.FEATURES)  # which are extracted next, without what is found here
     found = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
     report = {camera.name: car.report() for camera, car in zip(run.drive.cameras, found, strict=True)}
     run.store.save(OWN_CAR, key, _packed(found), report)

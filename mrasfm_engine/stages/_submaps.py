@@ -54,23 +54,27 @@ def cut_drive(run: Run, workers: int = 1) -> list[Span]:
     A cut that is in the store stays, whatever number of workers there are now.
     """
     settings = run.config.submaps
-    key = fingerprint(run.key or run.drive_key, SUBMAPS, settings.model_dump(), SUBMAPS_VERSION)
+    key = fingerprint(run.key or run.drive_key, SUBMAPS, settings.model_dump(exclude={"processes"}), SUBMAPS_VERSION)
     stored = run.store.load(SUBMAPS, key)
     if stored is not None:
         ends = enumerate(stored[0]["ends"].tolist(), 1)
         return [Span(number=number, first=first, last=last) for number, (first, last) in ends]
-    units, overlap = len(run.drive.manifest.frames), settings.overlap_units
+    spans = cut(len(run.drive.manifest.frames), count_of_submaps(run, workers), settings.overlap_units)
+    if len(spans) < 2:
+        return []
+    run.store.save(SUBMAPS, key, {"ends": np.array([(span.first, span.last) for span in spans])}, {})
+    return spans
+
+
+def count_of_submaps(run: Run, workers: int) -> int:
+    """Number of sub-maps that the settings, the expected memory and the workers ask for."""
+    settings = run.config.submaps
     for_memory = count_for_memory(
         run.drive,
         keypoints_per_image=run.config.features.max_keypoints,
         memory_bytes=settings.memory_mb * BYTES_PER_MB,
     )
-    count = settings.count or max(for_memory, count_for_workers(units, workers, overlap))
-    spans = cut(units, count, overlap)
-    if len(spans) < 2:
-        return []
-    run.store.save(SUBMAPS, key, {"ends": np.array([(span.first, span.last) for span in spans])}, {})
-    return spans
+    return settings.count or max(for_memory, count_for_workers(run.drive, workers, settings.overlap_units))
 
 
 class SubmapRun:

@@ -40,7 +40,7 @@ def names_of(scene: Path) -> set[str]:
     return {path.name for path in (scene / ".stages").iterdir()}
 
 
-def positions_m(scene: Path) -> np.ndarray:  # type: ignore[type-arg]
+def positions_m(scene: Path) -> np.ndarray:
     units = json.loads((scene / "poses.json").read_text())["units"]
     return np.array([unit["world_from_rig"]["translation_m"] for unit in units])
 

@@ -32,11 +32,19 @@ def test_a_drive_too_short_for_two_is_one_piece(units: int) -> None:
     assert len(span.units) == units
 
 
-def test_workers_get_sub_maps_that_are_worth_it() -> None:
-    assert count_for_workers(600, workers=2, overlap=10) == 2
-    assert count_for_workers(600, workers=100, overlap=10) == 19  # of 41 units, of which 10 are shared
-    assert count_for_workers(60, workers=8, overlap=10) == 1
-    assert count_for_workers(600, workers=0, overlap=10) == 1
+@pytest.mark.parametrize(
+    ("units", "workers", "count"),
+    [
+        (600, 2, 2),
+        (600, 100, 14),  # of at least 250 images
+        (600, 0, 1),
+        (69, 8, 1),
+        (190, 8, 4),
+    ],
+)
+def test_workers_get_sub_maps_that_are_worth_it(units: int, workers: int, count: int) -> None:
+    drive = make_simulated_drive(units=units, cameras=6, points=50).drive
+    assert count_for_workers(drive, workers, overlap=10) == count
 
 
 def test_memory_decides_in_how_many_parts_a_drive_is_cut() -> None:
