@@ -31,6 +31,7 @@
 | 27 | the road's picture of the best views: markings against the painted ones |
 | 28 | a real drive with grey images: parts that images, positions or nothing links |
 | 29 | a stop of a minute: what it costs, and where its units are |
+| 30 | drives cut into sub-maps, beside the same in one piece |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -80,6 +81,7 @@ from tests.benchmarks.sigmas import halves, simulated
 from tests.benchmarks.simulated_routes import simulated_routes
 from tests.benchmarks.speed import long_routes, speed, surround_speed
 from tests.benchmarks.stops import stops
+from tests.benchmarks.submaps import submaps
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
 from tests.benchmarks.wrong_manifests import wrong_manifests
@@ -128,6 +130,7 @@ LINES = {
     "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
     "28": Line(untimed=(gaps,)),
     "29": Line(timed=(stops,)),
+    "30": Line(untimed=(submaps,)),
 }
 
 

@@ -1,0 +1,72 @@
+"""Line 30: drives that are cut into sub-maps, beside the same drives in one piece, and the joins between sub-maps."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.trajectory_file import read_tum
+from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.real_drives import imported
+from tests.benchmarks.table import Figure, exactly
+
+CAMERAS, UNITS, SUBMAPS, SEED = 6, 150, 4, 1
+SIZE = ("--width", 640, "--height", 360)
+# A real drive has 51 units: in three parts they are so short that they may share only four.
+REAL, REAL_SUBMAPS, REAL_OVERLAP = "kitti06", 3, 4
+MOST_TIMES, JOIN_M, JOIN_DEG = 1.2, 0.01, 0.02
+
+
+def submaps(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 30."""
+    drive = work / "rendered, to be cut"
+    mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", SEED, *SIZE, "--no-masks", "--out", drive)
+    cut = _settings(work / "four.toml", count=SUBMAPS)
+    scene = yield from _both(f"rendered, {UNITS} units", drive, cut, SUBMAPS, work, "--no-gnss")
+    yield from _joins(f"rendered, {UNITS} units", scene, drive)
+    original = imported(data, REAL, work)
+    cut = _settings(work / "three.toml", count=REAL_SUBMAPS, overlap_units=REAL_OVERLAP)
+    for title, options in (("without GNSS", ("--no-gnss",)), ("with GNSS", ())):
+        yield from _both(f"{REAL} {title}", original, cut, REAL_SUBMAPS, work, *options)
+
+
+def _settings(path: Path, **values: int) -> Path:
+    lines = [f"{name} = {value}" for name, value in values.items()]
+    path.write_text("\n".join(["[output]", "pictures = false", "[submaps]", *lines, ""]))
+    return path
+
+
+def _both(what: str, drive: Path, cut: Path, count: int, work: Path, *options: str) -> Generator[Figure, None, Path]:
+    """Figures of a drive in one piece and cut; the cut one's scene is returned."""
+    one, several = work / f"{what}, in one piece", work / f"{what}, cut"
+    uncut = _settings(work / "one.toml", count=1)
+    mrasfm("reconstruct", drive, "--config", uncut, "--out", one, *options)
+    mrasfm("reconstruct", drive, "--config", cut, "--out", several, *options)
+    yield exactly("30", f"{what}: sub-maps", len(read_report(several)["submaps"]), count)
+    errors = {scene: evaluate(scene, drive) for scene in (one, several)}
+    for scene, found in errors.items():
+        title = "cut" if scene == several else "in one piece"
+        rmse_m = found["metric"]["rmse_m"]
+        yield Figure(line="30", what=f"{what}, {title}: metric RMSE", value=rmse_m, unit="m")
+    missing = [found["total_units"] - found["registered_units"] for found in errors.values()]
+    yield exactly("30", f"{what}: units without a pose, cut and in one piece", sum(missing), 0)
+    ratio = errors[several]["metric"]["rmse_m"] / errors[one]["metric"]["rmse_m"]
+    yield Figure(line="30", what=f"{what}: metric RMSE, cut, of that in one piece", value=ratio, most=MOST_TIMES)
+    return several
+
+
+def _joins(what: str, scene: Path, drive: Path) -> Iterator[Figure]:
+    """The worst error of the relative pose of the last unit before what two sub-maps share and the first one after."""
+    truth, found = (read_tum(path).world_from_rig for path in (drive / "truth.tum", scene / "poses.tum"))
+    spans = [part["spans"][0] for part in read_report(scene)["submaps"]]
+    ends = np.array([(after[0] - 1, before[1] + 1) for before, after in pairwise(spans)])
+    relative = [se3.inverse(poses[ends[:, 0]]) @ poses[ends[:, 1]] for poses in (truth, found)]
+    off = se3.inverse(relative[0]) @ relative[1]
+    off_m, off_deg = np.linalg.norm(off[:, :3, 3], axis=1), se3.rotation_angle_deg(off[:, :3, :3])
+    title = f"{what}: units on either side of what two sub-maps share, worst relative"
+    yield Figure(line="30", what=f"{title} position", value=float(off_m.max()), unit="m", most=JOIN_M)
+    yield Figure(line="30", what=f"{title} rotation", value=float(off_deg.max()), unit="deg", most=JOIN_DEG)
