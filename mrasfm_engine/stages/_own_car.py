@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_finding
+from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.io.images import mask_of_png, mask_png
 from mrasfm_engine.io.stage_store import Arrays, fingerprint
 from mrasfm_engine.stages._run import Run
@@ -38,6 +39,7 @@ def _found(run: Run) -> tuple[list[Bools | None], dict[str, Any]]:
         return _unpacked(stored[0]), stored[1]
     run.begin(Stage.FEATURES)  # which are extracted next, without what is found here
     found = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
+    return_freed_memory()
     report = {camera.name: car.report() for camera, car in zip(run.drive.cameras, found, strict=True)}
     run.store.save(OWN_CAR, key, _packed(found), report)
     return [car.mask for car in found], report

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, StorageError
+from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.io.stage_store import Arrays, StageStore, StageWriter, StoredStage, drive_fingerprint, fingerprint
 from mrasfm_engine.matching.standing import Standing
 from mrasfm_engine.registry import Components, load_components
@@ -135,6 +136,7 @@ class Run:
         if found is None:
             self.begin(name)
             found = do()
+            return_freed_memory()
         seconds = round(time.perf_counter() - started, 3)
         self.report["stages"].append({"stage": name, "seconds": seconds, "reused": reused, **report_of(found)})
         self.progress(name, 1, 1)

@@ -9,6 +9,7 @@ from typing import Any
 
 from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.export.picture_files import PictureFiles
+from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
@@ -29,6 +30,7 @@ def scene(
     """Georeferencing, the final adjustment with all priors, and how certain the result is."""
     run.begin(Stage.REFINEMENT)
     result, findings, report = _refined(run, mapper, found, pairs, known)
+    return_freed_memory()
     run.report["findings"] += findings
     run.report["stages"].append(report)
     run.progress(Stage.REFINEMENT, 1, 1)
@@ -131,6 +133,7 @@ def pictures(run: Run, result: Scene, scratch: Path) -> PictureFiles:
     started = time.perf_counter()
     run.begin(Stage.PICTURES)
     files, report = draw_pictures(result, scratch=scratch, seed=run.config.seed, progress=step)
+    return_freed_memory()
     seconds = round(time.perf_counter() - started, 3)
     run.report["stages"].append({"stage": Stage.PICTURES, "seconds": seconds, "reused": False, **report})
     run.progress(Stage.PICTURES, 1, 1)
