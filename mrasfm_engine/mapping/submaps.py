@@ -129,7 +129,7 @@ def join(begun: DriveMapping, parts: Sequence[Part], keyframe: Bools) -> list[Co
         )
     begun.mapper.keyframe = keyframe
     for group in in_common_frames(parts):
-        mapper = _mapper_of(begun.mapper, group)
+        mapper = _mapper_of(begun, group)
         component = Component(mapper=mapper, log=MappingLog(absolute=replace(begun.absolute)))
         adjust_globally(mapper, component.log, begun.cancel)
         register_remaining(mapper, component.log, progress=begun.progress, cancel=begun.cancel)
@@ -202,9 +202,12 @@ def _extent(position_m: Floats) -> float:
     return max(float(spread_m), float(np.finfo(np.float64).tiny))
 
 
-def _mapper_of(empty: Mapper, group: Sequence[Part]) -> Mapper:
+def _mapper_of(begun: DriveMapping, group: Sequence[Part]) -> Mapper:
     """A mapper of the whole drive with the poses of a group, the mean of its calibrations, and points from all."""
+    empty = begun.mapper
     mapper = Mapper(empty.drive, empty.keypoints, empty.tracks, empty.config)
+    if begun.prior_world_from_rig is not None:
+        mapper.motion.follow_prior(begun.prior_world_from_rig)
     mapper.keyframe, mapper.rig_as_begun = empty.keyframe, empty.rig_as_begun
     weights = np.array([part.observations for part in group], dtype=np.float64) + 1.0
     weights /= weights.sum()
