@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,32 +193,45 @@ def manifest(scene: Scene, found: DriveManifest) -> Rows:
         yield Row(f"{camera.name}'s pose", pose, other, POSE_TOLERANCE)
 
 
-def features(scene: Scene, select: Callable[[str], list[Any]]) -> Rows:
-    """Ids, rows and content of every table of `features.db`."""
+def features(scene: Scene, select: Callable[[str], Iterator[Any]]) -> Rows:
+    """Ids, rows and content of every table of `features.db`; one image's or pair's are in memory at one time."""
     images = scene.drive.images
     expected = [(i + 1, image.file, image.camera + 1) for i, image in enumerate(images)]
-    yield Row("its images", select("SELECT image_id, name, camera_id FROM images ORDER BY image_id"), expected)
+    found = select("SELECT image_id, name, camera_id FROM images ORDER BY image_id")
+    yield Row("its images", list(found), expected)
     frames = [(frame_of_image(scene, i), image.camera + 1, i + 1) for i, image in enumerate(images)]
-    yield Row("its frames", select("SELECT frame_id, sensor_id, data_id FROM frame_data ORDER BY data_id"), frames)
+    yield Row(
+        "its frames", list(select("SELECT frame_id, sensor_id, data_id FROM frame_data ORDER BY data_id")), frames
+    )
     params = [row[0] for row in select("SELECT params FROM cameras ORDER BY camera_id")]
     yield Row("its camera parameters", params, [camera.params.tobytes() for camera in scene.calibration])
+    by_image = dict(enumerate(scene.features, 1))
     for table, column in (("keypoints", "xy_px"), ("descriptors", "descriptors")):
-        by_image = {i + 1: getattr(f, column) for i, f in enumerate(scene.features)}
-        yield from _table(table, select(f"SELECT image_id, rows, data FROM {table}"), by_image)
-    matches = {(p.image_a + 1, p.image_b + 1): p.matches.astype("<u4") for p in scene.pairs}
-    inliers = {(p.image_a + 1, p.image_b + 1): p.matches[p.inliers].astype("<u4") for p in scene.pairs}
-    verified = {pair: rows for pair, rows in inliers.items() if len(rows)}
-    for table, by_pair in (("matches", matches), ("two_view_geometries", verified)):
+        rows = select(f"SELECT image_id, rows, data FROM {table}")
+        yield from _table(table, rows, by_image, attrgetter(column))
+    by_pair = {(pair.image_a + 1, pair.image_b + 1): pair for pair in scene.pairs}
+    verified = {ids: pair for ids, pair in by_pair.items() if pair.inliers.any()}
+    for table, pairs, matches_of in (
+        ("matches", by_pair, lambda pair: pair.matches.astype("<u4")),
+        ("two_view_geometries", verified, lambda pair: pair.matches[pair.inliers].astype("<u4")),
+    ):
         rows = select(f"SELECT pair_id, rows, data FROM {table}")
         # COLMAP's pair id is the smaller image id times 2^31 - 1 plus the larger.
-        yield from _table(table, [(divmod(pair_id, 2**31 - 1), *row) for pair_id, *row in rows], by_pair)
+        yield from _table(table, ((divmod(pair_id, 2**31 - 1), *row) for pair_id, *row in rows), pairs, matches_of)
 
 
-def _table(table: str, rows: list[Any], arrays: dict[Any, NDArray[Any]]) -> Rows:
-    yield Row(f"{table}: whose they are", sorted(row[0] for row in rows), sorted(arrays))
+def _table(
+    table: str, rows: Iterator[Any], expected: Mapping[Any, Any], array_of: Callable[[Any], NDArray[Any]]
+) -> Rows:
+    """Rows of (key, number, bytes) beside arrays of what has that key."""
+    missing = set(expected)
     for key, count, data in rows:
-        yield Row(f"{table}: the number of {key}", count, len(arrays[key]))
-        yield Row(f"{table}: those of {key}", data or b"", arrays[key].tobytes())
+        yield Row(f"{table}: the entry of {key}", key in missing, True)
+        missing.remove(key)
+        array = array_of(expected[key])
+        yield Row(f"{table}: the number of {key}", count, len(array))
+        yield Row(f"{table}: those of {key}", data or b"", array.tobytes())
+    yield Row(f"{table}: the entries that it lacks", sorted(missing), [])
 
 
 def frame(scene: Scene, document: dict[str, Any]) -> Rows:

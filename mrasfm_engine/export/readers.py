@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 import pycolmap
@@ -96,14 +96,14 @@ def ply(path: Path) -> NDArray[Any]:
     return rows
 
 
-def database(path: Path) -> Callable[[str], list[Any]]:
+def database(path: Path) -> Callable[[str], Iterator[Any]]:
     """The rows of a query, by its SQL."""
     return partial(_selected, path)
 
 
-def _selected(path: Path, sql: str) -> list[Any]:
+def _selected(path: Path, sql: str) -> Iterator[Any]:
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
-        return db.execute(sql).fetchall()
+        yield from db.execute(sql)
 
 
 def model_binary(folder: Path) -> pycolmap.Reconstruction:
@@ -131,28 +131,38 @@ def _require_files(folder: Path, names: tuple[str, ...]) -> None:
 
 def images_binary(path: Path) -> Iterator[ModelImage]:
     """All images of a binary model."""
-    data, at = path.read_bytes(), 8
-    for _ in range(struct.unpack_from("<Q", data)[0]):
-        image_id, *numbers = struct.unpack_from("<I7d", data, at)
-        name_end = data.index(b"\0", at + 64)
-        (count,) = struct.unpack_from("<Q", data, name_end + 1)
-        rows = np.frombuffer(data, dtype=[("xy", "<f8", 2), ("point", "<i8")], count=count, offset=name_end + 9)
-        name = data[at + 64 : name_end].decode("utf-8")
-        yield ModelImage(image_id, name, _pose(numbers), rows["xy"], rows["point"])
-        at = name_end + 9 + rows.nbytes
-    if at != len(data):
-        raise ValueError(f"{len(data) - at} bytes are left over")
+    with path.open("rb") as file:
+        (images,) = struct.unpack("<Q", _exactly(file, 8))
+        for _ in range(images):
+            image_id, *numbers = struct.unpack("<I7d", _exactly(file, 60))
+            _exactly(file, 4)  # the camera's id
+            name = b"".join(iter(partial(_exactly, file, 1), b"\0")).decode("utf-8")
+            (count,) = struct.unpack("<Q", _exactly(file, 8))
+            rows = np.frombuffer(_exactly(file, 24 * count), dtype=[("xy", "<f8", 2), ("point", "<i8")])
+            yield ModelImage(image_id, name, _pose(numbers), rows["xy"], rows["point"])
+        left = len(file.read(1))
+    if left:
+        raise ValueError("bytes are left over")
+
+
+def _exactly(file: BinaryIO, count: int) -> bytes:
+    data = file.read(count)
+    if len(data) != count:
+        raise ValueError("it ends early")
+    return data
 
 
 def images_text(path: Path) -> Iterator[ModelImage]:
     """All images of a text model."""
-    lines = [line for line in path.read_text(encoding="utf-8").split("\n") if not line.startswith("#")]
-    if len(lines) % 2 != 1 or lines[-1]:
-        raise ValueError(f"{len(lines)} lines")
-    for head, keypoints in zip(lines[:-1:2], lines[1::2], strict=True):
-        image_id, *numbers, _, name = head.split(" ", maxsplit=9)
-        rows = _numbers(keypoints).reshape(-1, 3)
-        yield ModelImage(int(image_id), name, _pose([float(v) for v in numbers]), rows[:, :2], rows[:, 2])
+    with path.open(encoding="utf-8", newline="\n") as file:
+        lines = (line for line in file if not line.startswith("#"))
+        for head in lines:
+            keypoints = next(lines, "")
+            if not keypoints.endswith("\n"):
+                raise ValueError("it ends early")
+            image_id, *numbers, _, name = head.removesuffix("\n").split(" ", maxsplit=9)
+            rows = _numbers(keypoints).reshape(-1, 3)
+            yield ModelImage(int(image_id), name, _pose([float(v) for v in numbers]), rows[:, :2], rows[:, 2])
 
 
 def points_text(path: Path) -> ModelPoints:
