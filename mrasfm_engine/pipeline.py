@@ -167,14 +167,14 @@ def reconstruct_submap(
         units may be those of a tunnel.
     """
     drive = read_drive(drive_folder)
-    run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
+    run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256, is_planned=True)
     with watched_compilation():
         stages.load_models(run)
         stages.leave_out_standing(run, stages.prior(run))
         span = next((span for span in stages.cut_drive(run) if span.number == number), None)
         if span is None:
             raise StorageError(
-                f"the plan of sub-map {number} is not there any more", remedy="Ask for the reconstruction again."
+                f"the plan of the drive has no sub-map {number}", remedy="Ask for the reconstruction again."
             )
         stages.own_cars(run)
         stages.SubmapRun(run, span).do(Stage.MAPPING)
@@ -185,7 +185,8 @@ def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Spa
     stages.load_models(run)
     stages.preflight(run)
     prior = stages.leave_out_standing(run, stages.prior(run))
-    stages.probe(run)
+    if not stages.is_cut(run):  # else the probe came before
+        stages.probe(run)
     spans = stages.cut_drive(run, workers)
     if spans:
         stages.own_cars(run)

@@ -155,6 +155,10 @@ class JoinedFeatures(Sequence[ImageFeatures]):
             if not part.counts.any():
                 part.with_empty_images_of(seen)
 
+    def is_from(self, image: int, part: StoredFeatures) -> bool:
+        """True where an image is read from a part's file."""
+        return self._parts[int(self._part[image])] is part
+
     def __len__(self) -> int:
         return len(self.counts)
 

@@ -201,6 +201,12 @@ class StageStore:
         """The store of other stages in the same folder."""
         return StageStore(self._folder, prefix)
 
+    def remove(self, pattern: str) -> None:
+        """Remove finished stages by a pattern of their names, as the shell's."""
+        for path in self._folder.glob(checkpoint_file(self._prefix + pattern)):
+            with suppress(OSError):  # what stays is found under no fingerprint any more
+                path.unlink()
+
     def has(self, name: str, key: str) -> bool:
         """Return whether a stage has been finished with this fingerprint, without reading its arrays."""
         return self._read(name, key, arrays=False) is not None

@@ -222,7 +222,7 @@ def _grow_others(
     mapper = grown[0].mapper
     ends = np.array([(pair.image_a, pair.image_b) for pair in pairs], dtype=np.int64).reshape(-1, 2)
     units = mapper.image_unit[ends]
-    left = mapper.keyframe & ~mapper.registered
+    left = mapper.keyframe & ~np.any([part.mapper.registered for part in grown], axis=0)
     while (group := _largest_group(units, left)) is not None:
         inside = np.asarray(group[units].all(axis=1))
         own = [pair for pair, chosen in zip(pairs, inside, strict=True) if chosen]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
+from mrasfm_engine.mapping.calibration import take_calibration
 from mrasfm_engine.mapping.components import MIN_UNITS, Component, DriveMapping
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, adjust_globally, register_remaining
 from mrasfm_engine.mapping.mapper import Mapper
@@ -128,11 +129,16 @@ def join(begun: DriveMapping, parts: Sequence[Part], keyframe: Bools) -> list[Co
             code="no-initial-units",
         )
     begun.mapper.keyframe = keyframe
-    for group in in_common_frames(parts):
+    groups = in_common_frames(parts)
+    of_group = [np.isin(np.arange(len(keyframe)), [unit for part in group for unit in part.units]) for group in groups]
+    for number, group in enumerate(groups):
         mapper = _mapper_of(begun, group)
         component = Component(mapper=mapper, log=MappingLog(absolute=replace(begun.absolute)))
         adjust_globally(mapper, component.log, begun.cancel)
+        # Units that another group has are linked with all of it, or not at all.
+        mapper.keyframe = keyframe & ~np.any([~keyframe, *of_group[:number], *of_group[number + 1 :]], axis=0)
         register_remaining(mapper, component.log, progress=begun.progress, cancel=begun.cancel)
+        mapper.keyframe = keyframe
         begun.parts.append(component)
     begun.parts.sort(key=lambda part: -part.size)
     begun.map_others()
@@ -223,9 +229,14 @@ def _mapper_of(begun: DriveMapping, group: Sequence[Part]) -> Mapper:
     for part in sorted(group, key=lambda part: len(part.units)):  # shared units have the larger part's pose
         for unit, pose in zip(part.units.tolist(), part.world_from_rig, strict=True):
             mapper.set_pose(unit, pose)
+        images = np.flatnonzero(np.isin(mapper.image_unit, part.units))
+        mapper.missing[images] = False
+        mapper.motion.forget_image_poses(images)
         mapper.missing[part.missing] = True
         if len(part.own):
             mapper.set_image_poses(part.own, part.unit_from_image)
     mapper.renew_motion()
+    if not mapper.config.bundle_adjustment.refine_calibration:
+        take_calibration(mapper, empty)
     mapper.triangulate()
     return mapper

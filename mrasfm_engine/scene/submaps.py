@@ -1,8 +1,9 @@
-"""The cut of a drive along its way into sub-maps, each a drive of its own that shares units with its neighbours."""
+"""The cut of a drive along its path into sub-maps, each a drive of its own that shares units with its neighbours."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -28,17 +29,29 @@ class Span:
     Attributes
     ----------
     number
-        Counts from 1 along the way.
+        Counts from 1 along the path.
+    shared_before, shared_after
+        Number of its units that the one before has as well, and the one after.
     """
 
     number: int
     first: int
     last: int
+    shared_before: int = 0
+    shared_after: int = 0
 
     @property
     def units(self) -> Ints:
         """The units (n,)."""
         return np.arange(self.first, self.last + 1)
+
+    @property
+    def is_shared(self) -> Bools:
+        """True for those of its units (n,) that a neighbour has as well."""
+        result = np.zeros(self.last - self.first + 1, dtype=np.bool_)
+        result[: self.shared_before] = True
+        result[len(result) - self.shared_after :] = True
+        return result
 
     def images_of(self, drive: Drive) -> Ints:
         """Images (n,) of the drive that are of its units."""
@@ -53,7 +66,7 @@ class Submap:
     Attributes
     ----------
     number
-        Counts from 1 along the way.
+        Counts from 1 along the path.
     first_unit, last_unit
         Of the drive's frames, both inclusive; units of a standing car between them take no part.
     files
@@ -87,13 +100,19 @@ def cut(units: int, count: int, overlap: int) -> list[Span]:
     """
     count = max(1, min(count, (units - overlap) // overlap))
     ends = np.linspace(0, units - overlap, count + 1).round().astype(int).tolist()
+    return spans_between([(first, last + overlap - 1) for first, last in pairwise(ends)])
+
+
+def spans_between(ends: Sequence[tuple[int, int]]) -> list[Span]:
+    """Sub-maps by their first and last units, along the path."""
+    shared = [0, *(max(0, before[1] - after[0] + 1) for before, after in pairwise(ends)), 0]
     return [
-        Span(number=number, first=first, last=last + overlap - 1)
-        for number, (first, last) in enumerate(pairwise(ends), 1)
+        Span(number=k + 1, first=first, last=last, shared_before=shared[k], shared_after=shared[k + 1])
+        for k, (first, last) in enumerate(ends)
     ]
 
 
-def share_a_submap(spans: list[Span], unit_a: Ints, unit_b: Ints) -> Bools:
+def share_a_submap(spans: Sequence[Span], unit_a: Ints, unit_b: Ints) -> Bools:
     """Pairs of units (n,), (n,) that are both in one sub-map."""
     low, high = np.minimum(unit_a, unit_b), np.maximum(unit_a, unit_b)
     result = np.zeros(len(low), dtype=np.bool_)

@@ -13,7 +13,7 @@ from mrasfm_engine.stages._own_car import own_cars
 from mrasfm_engine.stages._run import VERSIONS, Run, store_of
 from mrasfm_engine.stages._scene import components, pictures, scene
 from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
-from mrasfm_engine.stages._submaps import SubmapRun, count_of_submaps, cut_drive, join_submaps, run_submaps
+from mrasfm_engine.stages._submaps import SubmapRun, count_of_submaps, cut_drive, is_cut, join_submaps, run_submaps
 
 __all__ = [
     "VERSIONS",
@@ -25,6 +25,7 @@ __all__ = [
     "cut_drive",
     "features",
     "in_units",
+    "is_cut",
     "join_submaps",
     "leave_out_standing",
     "load_models",

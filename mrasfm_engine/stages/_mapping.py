@@ -64,7 +64,12 @@ def packed(parts: Sequence[Component], found: Sequence[ImageFeatures]) -> tuple[
         for number, part in enumerate(parts)
         for name, array in part.mapper.to_arrays().items()
     }
-    return arrays, {
+    return arrays, described(parts)
+
+
+def described(parts: Sequence[Component]) -> dict[str, Any]:
+    """The report of the stage."""
+    return {
         **mapping_report.describe(parts[0].mapper, parts[0].log, [part.mapper for part in parts[1:]]),
         **gaps.describe(parts),
         "findings": [as_json(finding) for finding in gaps.findings(parts)],

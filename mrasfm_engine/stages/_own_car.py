@@ -11,12 +11,12 @@ from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_fi
 from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.io.images import mask_of_png, mask_png
 from mrasfm_engine.io.stage_store import Arrays, fingerprint
-from mrasfm_engine.stages._run import Run
+from mrasfm_engine.stages._run import OWN_CAR_VERSION, Run
 from mrasfm_engine.types import Bools
 from schemas.artifacts import Stage
 from schemas.findings import as_json
 
-OWN_CAR, OWN_CAR_VERSION = "own-car", 1
+OWN_CAR = "own-car"
 
 
 def own_cars(run: Run) -> None:
@@ -37,6 +37,7 @@ def _found(run: Run) -> tuple[list[Bools | None], dict[str, Any]]:
     stored = run.store.load(OWN_CAR, key)
     if stored is not None:
         return _unpacked(stored[0]), stored[1]
+    run.require_unplanned()
     run.begin(Stage.FEATURES)  # which are extracted next, without what is found here
     found = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
     return_freed_memory()

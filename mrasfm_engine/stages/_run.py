@@ -24,6 +24,7 @@ Result = TypeVar("Result")
 
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
+OWN_CAR_VERSION = 1
 VERSIONS = {Stage.FEATURES: 5, Stage.MATCHES: 6, Stage.MAPPING: 9}
 
 
@@ -47,6 +48,7 @@ class Run:
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
     standing: Standing | None = None  # where units are left out: which, and the drive with all of them
     whole_drive: Drive | None = None
+    is_planned: bool = False  # whether what is found once for the whole drive is in the store, and in no other way
 
     @cached_property
     def components(self) -> Components:
@@ -62,7 +64,21 @@ class Run:
         """Dependencies of the features: settings, and the models by their hashes."""
         config = self.config
         models = self.components.fingerprint_of("extractor", "segmenter")
-        return [config.features.model_dump(), config.semantics.model_dump(), models]
+        own_car = OWN_CAR_VERSION if config.features.own_car else None
+        return [config.features.model_dump(), config.semantics.model_dump(), models, own_car]
+
+    def require_unplanned(self) -> None:
+        """Refuse to find anew what a plan has found for the whole drive: this run may have some of its files only.
+
+        Raises
+        ------
+        StorageError
+            Where the plan must be there, and is not.
+        """
+        if self.is_planned:
+            raise StorageError(
+                "the plan of the drive's sub-maps is not there any more", remedy="Ask for the reconstruction again."
+            )
 
     def step(self, stage: Stage) -> CountProgress:
         """The progress callback of a stage."""

@@ -31,6 +31,7 @@ def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
         included, moved_px, compared = (stored[0][name] for name in ("included", "moved_px", "compared"))
         standing = Standing(included=included, moved_px=moved_px, compared=int(compared))
     else:
+        run.require_unplanned()
         standing = find_standing(
             run.drive,
             known,
@@ -38,11 +39,10 @@ def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
             threads=run.config.threads,
             cancel=run.cancel,
         )
-    if standing.included.all():
-        return known
-    if stored is None:
         arrays = {"included": standing.included, "moved_px": standing.moved_px, "compared": np.array(standing.compared)}
         run.store.save(STANDING, key, arrays, {})
+    if standing.included.all():
+        return known
     run.standing, run.whole_drive = standing, run.drive
     run.key = fingerprint(run.drive_key, standing.included.tolist())
     run.drive = run.drive.restricted_to(standing.included)

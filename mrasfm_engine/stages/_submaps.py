@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,10 +24,18 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.drive import Incomplete
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.semantics import count_classes
-from mrasfm_engine.scene.submaps import Span, count_for_memory, count_for_workers, cut, share_a_submap
+from mrasfm_engine.scene.submaps import Span, count_for_memory, count_for_workers, cut, share_a_submap, spans_between
 from mrasfm_engine.stages._begin import prior
 from mrasfm_engine.stages._features import describe_features, extract, left_out_of, require_features
-from mrasfm_engine.stages._mapping import keypoints_of, mappers, mapping_of, mapping_settings, numbered, packed
+from mrasfm_engine.stages._mapping import (
+    described,
+    keypoints_of,
+    mappers,
+    mapping_of,
+    mapping_settings,
+    numbered,
+    packed,
+)
 from mrasfm_engine.stages._matches import (
     describe_matches,
     match,
@@ -49,21 +57,39 @@ BYTES_PER_MB = 1_000_000
 
 
 def cut_drive(run: Run, workers: int = 1) -> list[Span]:
-    """The sub-maps of the run's drive, along its way; none where it is one piece.
+    """The sub-maps of the run's drive, along its path; none where it is one piece.
 
     A cut that is in the store stays, whatever number of workers there are now.
     """
-    settings = run.config.submaps
-    key = fingerprint(run.key or run.drive_key, SUBMAPS, settings.model_dump(exclude={"processes"}), SUBMAPS_VERSION)
-    stored = run.store.load(SUBMAPS, key)
+    stored = _stored_cut(run)
     if stored is not None:
-        ends = enumerate(stored[0]["ends"].tolist(), 1)
-        return [Span(number=number, first=first, last=last) for number, (first, last) in ends]
-    spans = cut(len(run.drive.manifest.frames), count_of_submaps(run, workers), settings.overlap_units)
+        return stored
+    run.require_unplanned()
+    overlap = run.config.submaps.overlap_units
+    spans = cut(len(run.drive.manifest.frames), count_of_submaps(run, workers), overlap)
+    run.store.remove("submap-*")  # of another cut: they hold all features
     if len(spans) < 2:
         return []
-    run.store.save(SUBMAPS, key, {"ends": np.array([(span.first, span.last) for span in spans])}, {})
+    ends = np.array([(span.first, span.last) for span in spans])
+    run.store.save(SUBMAPS, _cut_key(run), {"ends": ends}, {})
     return spans
+
+
+def is_cut(run: Run) -> bool:
+    """True where a cut of the run's drive is in the store."""
+    return _stored_cut(run) is not None
+
+
+def _stored_cut(run: Run) -> list[Span] | None:
+    stored = run.store.load(SUBMAPS, _cut_key(run))
+    if stored is None:
+        return None
+    return spans_between([(first, last) for first, last in stored[0]["ends"].tolist()])
+
+
+def _cut_key(run: Run) -> str:
+    settings = [run.config.submaps.model_dump(exclude={"processes"}), run.config.features.max_keypoints]
+    return fingerprint(run.key or run.drive_key, SUBMAPS, settings, SUBMAPS_VERSION)
 
 
 def count_of_submaps(run: Run, workers: int) -> int:
@@ -83,7 +109,7 @@ class SubmapRun:
     Parameters
     ----------
     run
-        Of the whole drive, whose own car is known.
+        The whole drive's, whose own car is known.
     """
 
     def __init__(self, run: Run, span: Span) -> None:
@@ -98,7 +124,7 @@ class SubmapRun:
             run.progress,
             run.cancel,
             own_cars=run.own_cars,
-            key=fingerprint(run.key or run.drive_key, SUBMAPS, span.first, span.last),
+            key=fingerprint(run.key or run.drive_key, SUBMAPS, asdict(span)),
         )
         self.run.share_models(run)
 
@@ -134,7 +160,8 @@ class SubmapRun:
         def work() -> tuple[Arrays, dict[str, Any]]:
             keypoints = keypoints_of(self.run, features)
             begun = mapping_of(self.run, keypoints, read_pairs(matches), self.known)
-            arrays: Arrays = {"keyframe": begun.mapper.keyframe}
+            arrays: Arrays = {"keyframe": begun.mapper.keyframe.copy()}
+            begun.mapper.keyframe |= self.span.is_shared  # else creeping units might have no pose in common
             try:
                 begun.map_from_seeds()
             except ReconstructionError as problem:
@@ -142,8 +169,8 @@ class SubmapRun:
             parts = begun.put_together()
             for number, part in enumerate(parts):
                 arrays |= {f"{number}.{name}": array for name, array in part_arrays(part).items()}
-            report = packed(parts, features)[1]
-            return arrays, {**report, "findings": []}  # what they find, the joined scene finds as well
+            # What they find, the joined scene finds as well.
+            return arrays, {**described(parts), "findings": []}
 
         return self.run.stage(Stage.MAPPING, mapping_settings(self.run), work)[0]
 
@@ -189,11 +216,13 @@ def run_submaps(run: Run, spans: Sequence[Span]) -> list[SubmapRun]:
     for stage in STAGES:
         run.begin(stage)
         tally = _Tally(run.progress, len(submaps))
+        done = {}
         if processes > 1:
-            _do_in_processes(run, stage, [submap.span for submap in submaps], processes, tally)
+            done = _do_in_processes(run, stage, [submap.span for submap in submaps], processes, tally)
         for submap in submaps:
             submap.run.progress = tally.step(submap.span.number)
             submap.do(stage)
+            _entry(submap, stage).update(done.get(submap.span.number, {}))
         if stage is Stage.FEATURES:  # the others go on with what no sub-map has
             run.progress(stage, 1, 1)
     return submaps
@@ -203,20 +232,28 @@ def _processes(config: EngineConfig) -> int:
     return config.submaps.processes or max(1, config.threads // THREADS_A_PROCESS)
 
 
-def _do_in_processes(run: Run, stage: Stage, spans: Sequence[Span], processes: int, tally: _Tally) -> None:
-    """Do a stage of all sub-maps that are not finished, each in a process of its own that leaves it in the store."""
+def _do_in_processes(
+    run: Run, stage: Stage, spans: Sequence[Span], processes: int, tally: _Tally
+) -> dict[int, dict[str, Any]]:
+    """Do a stage of all sub-maps that are not finished, each in a process of its own that leaves it in the store.
+
+    Returns
+    -------
+    dict
+        How long it took and whether it was there already, by the number of the sub-map.
+    """
     config = run.config.model_copy(update={"threads": max(1, run.config.threads // processes)})
     sent = replace(
         run,
         config=config,
         key=run.key or run.drive_key,
-        progress=_tell_nobody,
+        progress=_report_to_nobody,
         cancel=_is_never_cancelled,
         report=new_report(),
     )
     failed = threading.Event()
 
-    def one(span: Span) -> None:
+    def one(span: Span) -> tuple[int, dict[str, Any]]:
         ended = run_in_subprocess(
             _do,
             sent,
@@ -225,6 +262,8 @@ def _do_in_processes(run: Run, stage: Stage, spans: Sequence[Span], processes: i
             progress=tally.step(span.number),
             cancel=lambda: failed.is_set() or run.cancel(),
         )
+        if ended.result is None and not ended.failure.startswith("killed"):
+            raise RuntimeError(f"the process of sub-map {span.number}, stage {stage}: {ended.failure}")
         if ended.result is None:
             raise ReconstructionError(
                 f"the process of sub-map {span.number} ended early in stage {stage}: {ended.failure}",
@@ -232,12 +271,12 @@ def _do_in_processes(run: Run, stage: Stage, spans: Sequence[Span], processes: i
                 "reused.",
                 code="submap-process",
             )
+        return span.number, ended.result
 
     with ThreadPoolExecutor(processes) as pool:
         futures = [pool.submit(one, span) for span in spans if not SubmapRun(run, span).is_finished]
         try:
-            for future in as_completed(futures):
-                future.result()
+            return dict(future.result() for future in as_completed(futures))
         except BaseException:
             failed.set()
             for future in futures:
@@ -245,13 +284,14 @@ def _do_in_processes(run: Run, stage: Stage, spans: Sequence[Span], processes: i
             raise
 
 
-def _do(progress: StageProgress, run: Run, stage: Stage, span: Span) -> bool:
-    """Do a stage of a sub-map, in this process."""
-    SubmapRun(replace(run, progress=progress), span).do(stage)
-    return True
+def _do(progress: StageProgress, run: Run, stage: Stage, span: Span) -> dict[str, Any]:
+    """Do a stage of a sub-map, in this process; how long it took, and whether it was there already."""
+    submap = SubmapRun(replace(run, progress=progress), span)
+    submap.do(stage)
+    return {name: _entry(submap, stage)[name] for name in ("seconds", "reused")}
 
 
-def _tell_nobody(stage: str, done: int, total: int) -> None:
+def _report_to_nobody(stage: str, done: int, total: int) -> None:
     """Progress of a run that is sent to other processes, which have their own."""
 
 
@@ -306,7 +346,8 @@ def join_submaps(
     keyframe = _keyframes(run, submaps)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        return packed(join(mapping_of(run, keypoints, pairs, known), parts, keyframe), found)
+        arrays, report = packed(join(mapping_of(run, keypoints, pairs, known), parts, keyframe), found)
+        return arrays, report | _joined_counts([report, *(_entry(submap, Stage.MAPPING) for submap in submaps)])
 
     return found, pairs, mappers(run, keypoints, known, work)
 
@@ -335,12 +376,20 @@ def _joined_matches(
     spans = [submap.span for submap in submaps]
     unit = np.array([image.unit for image in run.drive.images], dtype=np.int64)
 
-    def across(pairs: Ints) -> Ints:
-        result: Ints = pairs[~share_a_submap(spans, unit[pairs[:, 0]], unit[pairs[:, 1]])]
-        return result
-
     def work(stage: StageWriter) -> dict[str, Any]:
-        inside = {(pair.image_a, pair.image_b): pair for submap in reversed(submaps) for pair in submap.pairs()}
+        unlike = [_unlike_images(submap, found) for submap in submaps]
+        inside = {
+            (pair.image_a, pair.image_b): pair
+            for submap, others in zip(reversed(submaps), reversed(unlike), strict=True)
+            for pair in submap.pairs()
+            if not (others[pair.image_a] or others[pair.image_b])
+        }
+        again = np.any(unlike, axis=0)
+
+        def across(pairs: Ints) -> Ints:
+            is_apart = ~share_a_submap(spans, unit[pairs[:, 0]], unit[pairs[:, 1]]) | again[pairs].any(axis=1)
+            return np.array([pair for pair in pairs[is_apart].tolist() if tuple(pair) not in inside]).reshape(-1, 2)
+
         chosen = PairChoice(run.drive, found, known, run.config)
         further = chosen.further
         result = match_pairs(
@@ -361,7 +410,7 @@ def _joined_matches(
         every = sorted([*inside.values(), *result.pairs], key=lambda pair: (pair.image_a, pair.image_b))
         write_pairs(stage, chosen.with_revisits(every))
         reports = [describe_matches(run.drive, result), *(_entry(submap, Stage.MATCHES) for submap in submaps)]
-        return _joined_match_report(reports, every)
+        return {**_joined_match_report(reports, every), "images_with_unlike_keypoints": int(again.sum())}
 
     settings = [match_settings(run), [(span.first, span.last) for span in spans]]
     stage, report = run.large_stage(Stage.MATCHES, settings, work)
@@ -369,17 +418,32 @@ def _joined_matches(
     return read_pairs(stage)
 
 
+def _unlike_images(submap: SubmapRun, found: JoinedFeatures) -> Bools:
+    """Images (i,) whose keypoints are others in this sub-map than in the drive: other machines extracted them.
+
+    The same image gives the same keypoints, but for the last digits of networks on another processor: an order by
+    score may then differ.
+    """
+    result = np.zeros(len(found), dtype=np.bool_)
+    for row, image in enumerate(submap.images.tolist()):
+        if found.is_from(image, submap.features):
+            continue
+        result[image] = not np.array_equal(found[image].xy_px, submap.features[row].xy_px)
+    return result
+
+
 def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[PairMatches]) -> dict[str, Any]:
     """Report of pairs across sub-maps and of those within each; pairs that two of them share were tried in both."""
-    by_matches = max(reports, key=lambda report: int(report["simultaneous"]["matches"]))
+    by_matches = sorted(reports, key=lambda report: -int(report["simultaneous"]["matches"]))
+    contradictions = [report["contradiction"] for report in by_matches if report["contradiction"] is not None]
     summed = _summed([{name: report[name] for name in _COUNTED} for report in reports])
     return {
         **summed,
         "verified_pairs": sum(bool(pair.inliers.any()) for pair in pairs),
         "matches": sum(len(pair.matches) for pair in pairs),
         "verified_matches": sum(int(pair.inliers.sum()) for pair in pairs),
-        "simultaneous": by_matches["simultaneous"],
-        "contradiction": by_matches["contradiction"],
+        "simultaneous": by_matches[0]["simultaneous"],
+        "contradiction": next(iter(contradictions), None),
     }
 
 
@@ -391,6 +455,17 @@ def _summed(reports: Sequence[Any]) -> Any:
     if isinstance(reports[0], dict):
         return {name: _summed([report[name] for report in reports]) for name in reports[0]}
     return sum(reports)
+
+
+def _joined_counts(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Counts of registrations in sub-maps and as they were joined; units that two sub-maps share count twice."""
+    result: dict[str, Any] = {"local_adjustments": sum(report.get("local_adjustments", 0) for report in reports)}
+    for name in ("registered_by", "cameras_voted_out", "cameras_without_a_vote"):
+        counts: Counter[str] = Counter()
+        for report in reports:
+            counts.update(report.get(name, {}))
+        result[name] = dict(counts)
+    return result
 
 
 def _entry(submap: SubmapRun, stage: Stage) -> dict[str, Any]:

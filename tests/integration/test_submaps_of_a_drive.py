@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,10 @@ import pytest
 
 from mrasfm_engine.config import EngineConfig, SubmapConfig
 from mrasfm_engine.errors import StorageError
+from mrasfm_engine.features.sift import SiftExtractor
 from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
 from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.scene.scene import ImageFeatures
 from schemas.artifacts import PLAN_CHECKPOINTS, checkpoint_file, submap_checkpoint
 from tests.integration.conftest import CommandResult, Variant, read_report, synth
 
@@ -79,8 +82,7 @@ def test_sub_maps_that_others_have_done_are_not_done_again(drive: Path, scene: P
     planned = plan_submaps(drive, out, CONFIG, workers=3, content_sha256=contents)
     assert [(one.number, one.first_unit, one.last_unit) for one in planned] == [(1, 0, 6), (2, 4, 10), (3, 8, 14)]
     assert not any(one.is_finished for one in planned)
-    # Without stops nothing is left out.
-    assert names_of(out) == {checkpoint_file(name) for name in PLAN_CHECKPOINTS} - {"standing.npz"}
+    assert names_of(out) == {checkpoint_file(name) for name in PLAN_CHECKPOINTS}
     plan = {name: (out / ".stages" / name).read_bytes() for name in names_of(out)}
     for one in planned:
         part, worker = tmp_path / f"drive {one.number}", tmp_path / f"worker {one.number}"
@@ -104,8 +106,36 @@ def test_sub_maps_that_others_have_done_are_not_done_again(drive: Path, scene: P
 
 
 def test_a_sub_map_without_its_plan_is_not_done(drive: Path, tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="plan of sub-map 7"):
+    with pytest.raises(StorageError, match="plan of the drive's sub-maps"):
         reconstruct_submap(drive, tmp_path / "scene", CONFIG, 7)
+
+
+def test_images_that_two_machines_extracted_differently_are_matched_again(
+    drive: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second sub-map's keypoints come in another order, as scores on another processor might put them."""
+    out, extract = tmp_path / "scene", SiftExtractor.extract
+    plan_submaps(drive, out, CONFIG, workers=3)
+    with monkeypatch.context() as other:
+        other.setattr(SiftExtractor, "extract", lambda *given: reversed_order(extract(*given)))
+        reconstruct_submap(drive, out, CONFIG, 2)
+    reconstruct(drive, out, CONFIG)
+    matches = read_report(out)["by_stage"]["matches"]
+    assert matches["images_with_unlike_keypoints"] == 2 * 2 * 3  # cameras, neighbours, shared units
+    assert read_report(scene)["by_stage"]["matches"]["images_with_unlike_keypoints"] == 0
+    np.testing.assert_allclose(positions_m(out), positions_m(scene), atol=0.01)
+
+
+def reversed_order(found: ImageFeatures) -> ImageFeatures:
+    scores = None if found.scores is None else found.scores[::-1].copy()
+    return replace(
+        found,
+        xy_px=found.xy_px[::-1].copy(),
+        descriptors=found.descriptors[::-1].copy(),
+        colors=found.colors[::-1].copy(),
+        classes=found.classes[::-1].copy(),
+        scores=scores,
+    )
 
 
 @pytest.mark.slow
@@ -114,12 +144,15 @@ def test_processes_make_the_same_scene(drive: Path, scene: Path, tmp_path: Path,
     settings.write_text("use_gnss = false\n[submaps]\ncount = 3\noverlap_units = 3\nprocesses = 2\n")
     result = mrasfm("reconstruct", drive, "--config", settings, "--out", tmp_path / "scene")
     assert result.code == 0, result.err
+    stages = [stage for part in read_report(tmp_path / "scene")["submaps"] for stage in part["stages"]]
+    assert not any(stage["reused"] for stage in stages)
+    assert min(stage["seconds"] for stage in stages) > 0.05
     np.testing.assert_allclose(positions_m(tmp_path / "scene"), positions_m(scene), atol=1e-5)
 
 
 @pytest.mark.slow
 def test_a_sub_map_that_sees_nothing_is_a_gap(drive: Path, variant_of: Callable[[Path], Variant]) -> None:
-    """A tunnel of the length of the middle one; the ends share neither images nor positions."""
+    """A tunnel of the length of the middle one; images across it link the ends, which share no unit."""
     variant = variant_of(drive)
     for unit, frame in enumerate(variant.document["frames"]):
         for image in frame["images"].values():
@@ -133,5 +166,9 @@ def test_a_sub_map_that_sees_nothing_is_a_gap(drive: Path, variant_of: Callable[
     middle = report["submaps"][1]["stages"][2]
     assert middle["components"] == []
     assert middle["reason"]
-    assert {"drive-in-components", "units-without-pose"} <= {finding["code"] for finding in report["findings"]}
-    assert (variant.scene / "components" / "1" / "poses.json").exists()
+    (component,) = report["by_stage"]["mapping"]["components"]
+    assert component["spans"] == [[0, 3], [11, 14]]
+    assert [link["by"] for link in component["links"]] == ["images"]
+    assert component["links"][0]["spans"] in ([[0, 3]], [[11, 14]])
+    assert [missing["unit"] for missing in report["by_stage"]["mapping"]["units_not_registered"]] == list(range(4, 11))
+    assert "units-without-pose" in {finding["code"] for finding in report["findings"]}

@@ -11,6 +11,7 @@ import pytest
 
 from mrasfm_engine import stages
 from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import StorageError
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.scene.drive import Drive
 from schemas.artifacts import Stage
@@ -39,12 +40,30 @@ def test_a_drive_without_a_stop_and_a_setting_of_zero_change_nothing(drive: Driv
     moving = Drive(
         drive.root, drive.manifest.model_copy(update={"frames": [drive.manifest.frames[k] for k in (0, 1, 2, 8, 9)]})
     )
-    for run in (run_of(moving, tmp_path / "scene"), run_of(drive, tmp_path / "scene", keyframe_motion_px=0.0)):
+    for run in (run_of(drive, tmp_path / "zero", keyframe_motion_px=0.0), run_of(moving, tmp_path / "scene")):
         before = run.drive
         assert stages.leave_out_standing(run, NO_PRIOR) is NO_PRIOR
         assert run.drive is before
         assert not run.key
-        assert not (tmp_path / "scene").exists()
+    assert not (tmp_path / "zero").exists()
+
+
+def test_a_planned_run_looks_at_no_image(drive: Drive, tmp_path: Path) -> None:
+    """Not even where the search left out nothing: a worker with some of the images would find something else."""
+    moving = Drive(
+        drive.root, drive.manifest.model_copy(update={"frames": [drive.manifest.frames[k] for k in (0, 1, 2, 8, 9)]})
+    )
+    contents = dict.fromkeys((image.file for image in moving.images), "0" * 64)
+    stages.leave_out_standing(run_of(moving, tmp_path / "scene", contents), NO_PRIOR)
+    shutil.rmtree(moving.root)
+    for scene in ("scene", "elsewhere"):
+        run = run_of(moving, tmp_path / scene, contents)
+        run.is_planned = True
+        if scene == "scene":
+            assert stages.leave_out_standing(run, NO_PRIOR) is NO_PRIOR
+        else:
+            with pytest.raises(StorageError, match="plan"):
+                stages.leave_out_standing(run, NO_PRIOR)
 
 
 def test_a_second_run_reads_no_image(drive: Drive, tmp_path: Path) -> None:

@@ -171,6 +171,7 @@ def test_a_sub_map_without_images_leaves_components(simulated: SimulatedDrive) -
     assert found == [list(range(8)), list(range(16, 24))]
     for component in components:
         assert rmse(metric_errors_m(component.mapper, simulated)) < 0.02
+        assert component.links == []  # not with itself, mapped again
 
 
 def test_a_drive_of_which_no_sub_map_could_begin_is_refused(simulated: SimulatedDrive) -> None:

@@ -17,7 +17,11 @@ def test_sub_maps_cover_the_drive_and_share_units_with_their_neighbours(units: i
     lengths = {len(span.units) for span in spans}
     assert max(lengths) - min(lengths) <= 1
     for before, after in pairwise(spans):
-        assert before.last - after.first + 1 == overlap
+        assert before.last - after.first + 1 == before.shared_after == after.shared_before == overlap
+    for span in spans:
+        shared = span.units[span.is_shared].tolist()
+        others = [unit for other in spans if other is not span for unit in other.units.tolist()]
+        assert shared == sorted(set(others) & set(span.units.tolist()))
 
 
 def test_no_unit_is_in_three_sub_maps() -> None:
