@@ -48,6 +48,7 @@ class Run:
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
     standing: Standing | None = None  # where units are left out: which, and the drive with all of them
     whole_drive: Drive | None = None
+    nothing_left_out: tuple[str, Arrays] | None = None  # key and arrays of a search for stops that is not stored
     is_planned: bool = False  # whether what is found once for the whole drive is in the store, and in no other way
 
     @cached_property

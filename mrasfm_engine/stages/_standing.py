@@ -40,13 +40,22 @@ def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
             cancel=run.cancel,
         )
         arrays = {"included": standing.included, "moved_px": standing.moved_px, "compared": np.array(standing.compared)}
-        run.store.save(STANDING, key, arrays, {})
+        if standing.included.all():
+            run.nothing_left_out = (key, arrays)
+        else:
+            run.store.save(STANDING, key, arrays, {})
     if standing.included.all():
         return known
     run.standing, run.whole_drive = standing, run.drive
     run.key = fingerprint(run.drive_key, standing.included.tolist())
     run.drive = run.drive.restricted_to(standing.included)
     return prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
+
+
+def keep_nothing_left_out(run: Run) -> None:
+    """Store that a search left out no unit: only sub-maps need to know that, which see a part of the drive."""
+    if run.nothing_left_out is not None:
+        run.store.save(STANDING, *run.nothing_left_out, {})
 
 
 def all_units(

@@ -45,7 +45,7 @@ from mrasfm_engine.stages._matches import (
     write_pairs,
 )
 from mrasfm_engine.stages._run import Run, new_report
-from mrasfm_engine.stages._standing import in_units
+from mrasfm_engine.stages._standing import in_units, keep_nothing_left_out
 from mrasfm_engine.subprocess_run import run_in_subprocess
 from mrasfm_engine.types import Bools, Ints, StageProgress
 from schemas.artifacts import Stage, submap_checkpoint
@@ -70,6 +70,7 @@ def cut_drive(run: Run, workers: int = 1) -> list[Span]:
     run.store.remove("submap-*")  # of another cut: they hold all features
     if len(spans) < 2:
         return []
+    keep_nothing_left_out(run)
     ends = np.array([(span.first, span.last) for span in spans])
     run.store.save(SUBMAPS, _cut_key(run), {"ends": ends}, {})
     return spans

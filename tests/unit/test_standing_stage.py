@@ -14,6 +14,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import StorageError
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.stages._standing import keep_nothing_left_out
 from schemas.artifacts import Stage
 from tests.unit.matching.test_standing import stop_px, view, write
 
@@ -45,7 +46,8 @@ def test_a_drive_without_a_stop_and_a_setting_of_zero_change_nothing(drive: Driv
         assert stages.leave_out_standing(run, NO_PRIOR) is NO_PRIOR
         assert run.drive is before
         assert not run.key
-    assert not (tmp_path / "zero").exists()
+        assert not (tmp_path / "scene").exists()
+        assert not (tmp_path / "zero").exists()
 
 
 def test_a_planned_run_looks_at_no_image(drive: Drive, tmp_path: Path) -> None:
@@ -54,7 +56,10 @@ def test_a_planned_run_looks_at_no_image(drive: Drive, tmp_path: Path) -> None:
         drive.root, drive.manifest.model_copy(update={"frames": [drive.manifest.frames[k] for k in (0, 1, 2, 8, 9)]})
     )
     contents = dict.fromkeys((image.file for image in moving.images), "0" * 64)
-    stages.leave_out_standing(run_of(moving, tmp_path / "scene", contents), NO_PRIOR)
+    plan = run_of(moving, tmp_path / "scene", contents)
+    stages.leave_out_standing(plan, NO_PRIOR)
+    assert not (tmp_path / "scene").exists()
+    keep_nothing_left_out(plan)
     shutil.rmtree(moving.root)
     for scene in ("scene", "elsewhere"):
         run = run_of(moving, tmp_path / scene, contents)
