@@ -110,6 +110,7 @@ def test_a_sub_map_without_its_plan_is_not_done(drive: Path, tmp_path: Path) -> 
         reconstruct_submap(drive, tmp_path / "scene", CONFIG, 7)
 
 
+@pytest.mark.slow
 def test_images_that_two_machines_extracted_differently_are_matched_again(
     drive: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
