@@ -130,20 +130,15 @@ def plan_submaps(
         return []  # all of this is left to `reconstruct`
     _, spans = _begun(run, workers)
     unit_of = np.arange(len(drive.manifest.frames)) if run.standing is None else np.flatnonzero(run.standing.included)
-    result = []
-    for span in spans:
-        images = [run.drive.images[image] for image in span.images_of(run.drive)]
-        files = [name for image in images for name in (image.file, image.mask) if name is not None]
-        result.append(
-            Submap(
-                number=span.number,
-                first_unit=int(unit_of[span.first]),
-                last_unit=int(unit_of[span.last]),
-                files=tuple(files),
-                is_finished=stages.SubmapRun(run, span).is_finished,
-            )
+    return [
+        Submap(
+            number=span.number,
+            first_unit=int(unit_of[span.first]),
+            last_unit=int(unit_of[span.last]),
+            is_finished=stages.SubmapRun(run, span).is_finished,
         )
-    return result
+        for span in spans
+    ]
 
 
 def reconstruct_submap(
@@ -155,10 +150,15 @@ def reconstruct_submap(
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
     content_sha256: Mapping[str, str] | None = None,
-) -> None:
+) -> dict[str, Any]:
     """Extract, match and map one of the sub-maps that `plan_submaps` made; its finished stages stay in `out/.stages`.
 
     Of the drive's files its own are enough, if the SHA-256 of all are given.
+
+    Returns
+    -------
+    dict
+        What `report.json` will say of it.
 
     Raises
     ------
@@ -177,7 +177,9 @@ def reconstruct_submap(
                 f"the plan of the drive has no sub-map {number}", remedy="Ask for the reconstruction again."
             )
         stages.own_cars(run)
-        stages.SubmapRun(run, span).do(Stage.MAPPING)
+        submap = stages.SubmapRun(run, span)
+        submap.do(Stage.MAPPING)
+    return submap.report
 
 
 def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Span]]:

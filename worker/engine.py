@@ -88,26 +88,16 @@ def _plan(
 def _map_submap(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
-    under_way, reused = "", []
-
-    def watch(stage: str, done: int, total: int) -> None:
-        """Note stages that end and have not begun: they were finished before."""
-        nonlocal under_way
-        if stage != under_way and done == total == 1:
-            reused.append(stage)
-        under_way = stage
-        progress(stage, done, total)
-
-    reconstruct_submap(
+    report = reconstruct_submap(
         _drive_of(request),
         request.out,
         config,
         request.submap,
-        progress=watch,
+        progress=progress,
         cancel=cancelled,
         content_sha256=request.content_sha256,
     )
-    return {"reused": reused}
+    return {"stages": [{"stage": stage["stage"], "reused": stage["reused"]} for stage in report["stages"]]}
 
 
 def _reconstruct(

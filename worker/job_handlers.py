@@ -166,7 +166,7 @@ class SubmapHandler(_StagesHandler):
     ) -> dict[str, Any]:
         """End the job, whose stages are stored."""
         self._require_stored(session, [submap_checkpoint(self._number, stage) for stage in SUBMAP_STAGES])
-        jobs.succeed(session, self._held, reused=done.report["reused"])
+        jobs.succeed(session, self._held, reused=_reused(done.report))
         return {"submap": self._number}
 
 

@@ -6,6 +6,7 @@ neither the images of the drive nor thousands of small arrays are ever put toget
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Any, overload
 
@@ -83,7 +84,40 @@ def _part(kind: str, window: int) -> str:
     return f"{kind}.{window}"
 
 
-class StoredFeatures(Sequence[ImageFeatures]):
+class FeaturesOnDisk(Sequence[ImageFeatures], ABC):
+    """Features of images that are read from a file at every use.
+
+    Attributes
+    ----------
+    counts
+        Keypoints of each image (n,).
+    mask_bytes
+        Size of the mask that a network made for it (n,), 0 where there is none.
+    """
+
+    counts: Ints
+    mask_bytes: Ints
+
+    @abstractmethod
+    def _image(self, index: int) -> ImageFeatures: ...
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @overload
+    def __getitem__(self, image: int) -> ImageFeatures: ...
+    @overload
+    def __getitem__(self, image: slice) -> list[ImageFeatures]: ...
+    def __getitem__(self, image: int | slice) -> ImageFeatures | list[ImageFeatures]:
+        if isinstance(image, slice):
+            return [self[i] for i in range(*image.indices(len(self)))]
+        return self._image(range(len(self))[image])
+
+    def __iter__(self) -> Iterator[ImageFeatures]:
+        return (self[i] for i in range(len(self)))
+
+
+class StoredFeatures(FeaturesOnDisk):
     """Features of all images, read from the file at every use."""
 
     def __init__(self, stage: StoredStage, left_out: Sequence[Incomplete | None]) -> None:
@@ -104,21 +138,8 @@ class StoredFeatures(Sequence[ImageFeatures]):
         """Give images without keypoints the kinds of arrays that another file's images have."""
         self._none = other._none
 
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    @overload
-    def __getitem__(self, image: int) -> ImageFeatures: ...
-    @overload
-    def __getitem__(self, image: slice) -> list[ImageFeatures]: ...
-    def __getitem__(self, image: int | slice) -> ImageFeatures | list[ImageFeatures]:
-        if isinstance(image, slice):
-            return [self[i] for i in range(*image.indices(len(self)))]
-        index = range(len(self))[image]
+    def _image(self, index: int) -> ImageFeatures:
         return _StoredImage(self, index, self._left_out[index])
-
-    def __iter__(self) -> Iterator[ImageFeatures]:
-        return (self[i] for i in range(len(self)))
 
     def rows(self, kind: str, image: int, count: int | None = None) -> NDArray[Any] | None:
         """One kind of an image's arrays, or its first `count` rows."""
@@ -134,7 +155,7 @@ class StoredFeatures(Sequence[ImageFeatures]):
         return self._stage.rows(_part("masks", int(self._window[image])), first, first + count) if count else None
 
 
-class JoinedFeatures(Sequence[ImageFeatures]):
+class JoinedFeatures(FeaturesOnDisk):
     """Features of a drive in the files of its sub-maps; an image that several of them have is read from the first.
 
     Parameters
@@ -146,10 +167,10 @@ class JoinedFeatures(Sequence[ImageFeatures]):
     def __init__(self, parts: Sequence[tuple[StoredFeatures, Ints]]) -> None:
         self._parts = [features for features, _ in parts]
         images = max(int(images.max()) for _, images in parts) + 1
-        self._part, self._row = np.empty(images, dtype=np.int64), np.empty(images, dtype=np.int64)
-        self.counts = np.empty(images, dtype=np.int64)
+        self._part, self._row, self.counts, self.mask_bytes = np.empty((4, images), dtype=np.int64)
         for number, (features, own) in reversed(list(enumerate(parts))):
-            self._part[own], self._row[own], self.counts[own] = number, np.arange(len(own)), features.counts
+            self._part[own], self._row[own] = number, np.arange(len(own))
+            self.counts[own], self.mask_bytes[own] = features.counts, features.mask_bytes
         seen = next((part for part in self._parts if part.counts.any()), self._parts[0])
         for part in self._parts:
             if not part.counts.any():
@@ -159,22 +180,8 @@ class JoinedFeatures(Sequence[ImageFeatures]):
         """True where an image is read from a part's file."""
         return self._parts[int(self._part[image])] is part
 
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    @overload
-    def __getitem__(self, image: int) -> ImageFeatures: ...
-    @overload
-    def __getitem__(self, image: slice) -> list[ImageFeatures]: ...
-    def __getitem__(self, image: int | slice) -> ImageFeatures | list[ImageFeatures]:
-        if isinstance(image, slice):
-            return [self[i] for i in range(*image.indices(len(self)))]
-        index = range(len(self))[image]
-        features, row = self._parts[int(self._part[index])], int(self._row[index])
-        return features[row]
-
-    def __iter__(self) -> Iterator[ImageFeatures]:
-        return (self[i] for i in range(len(self)))
+    def _image(self, index: int) -> ImageFeatures:
+        return self._parts[int(self._part[index])][int(self._row[index])]
 
 
 def _within_window(counts: Ints, window: Ints) -> Ints:

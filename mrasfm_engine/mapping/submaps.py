@@ -130,13 +130,13 @@ def join(begun: DriveMapping, parts: Sequence[Part], keyframe: Bools) -> list[Co
         )
     begun.mapper.keyframe = keyframe
     groups = in_common_frames(parts)
-    of_group = [np.isin(np.arange(len(keyframe)), [unit for part in group for unit in part.units]) for group in groups]
-    for number, group in enumerate(groups):
+    in_any = np.isin(np.arange(len(keyframe)), np.concatenate([part.units for part in parts]))
+    for group in groups:
         mapper = _mapper_of(begun, group)
         component = Component(mapper=mapper, log=MappingLog(absolute=replace(begun.absolute)))
         adjust_globally(mapper, component.log, begun.cancel)
         # Units that another group has are linked with all of it, or not at all.
-        mapper.keyframe = keyframe & ~np.any([~keyframe, *of_group[:number], *of_group[number + 1 :]], axis=0)
+        mapper.keyframe = keyframe & (mapper.registered | ~in_any)
         register_remaining(mapper, component.log, progress=begun.progress, cancel=begun.cancel)
         mapper.keyframe = keyframe
         begun.parts.append(component)

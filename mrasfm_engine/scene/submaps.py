@@ -68,9 +68,8 @@ class Submap:
     number
         Counts from 1 along the path.
     first_unit, last_unit
-        Of the drive's frames, both inclusive; units of a standing car between them take no part.
-    files
-        Images and masks that it needs.
+        Of the drive's frames, both inclusive, whose images and masks it needs; units of a standing car between them
+        take no part.
     is_finished
         Whether its result is there already.
     """
@@ -78,7 +77,6 @@ class Submap:
     number: int
     first_unit: int
     last_unit: int
-    files: tuple[str, ...]
     is_finished: bool
 
 

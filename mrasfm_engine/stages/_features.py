@@ -11,7 +11,7 @@ import numpy as np
 
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.features.extraction import features_by_image
-from mrasfm_engine.features.stored_features import FeatureWriter, JoinedFeatures, StoredFeatures
+from mrasfm_engine.features.stored_features import FeaturesOnDisk, FeatureWriter, StoredFeatures
 from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.stage_store import StageWriter
 from mrasfm_engine.scene.drive import Drive, Incomplete
@@ -93,7 +93,7 @@ def left_out_of(report: Mapping[str, Any]) -> dict[str, Incomplete]:
     return {image["file"]: Incomplete(image["reason"]) for image in report["images_left_out"]}
 
 
-def require_features(run: Run, found: StoredFeatures | JoinedFeatures, left_out: Mapping[str, Incomplete]) -> None:
+def require_features(run: Run, found: FeaturesOnDisk, left_out: Mapping[str, Incomplete]) -> None:
     """Say what was left out, and refuse a drive that shows nothing.
 
     Raises

@@ -54,6 +54,7 @@ SUBMAPS, SUBMAPS_VERSION = "submaps", 1
 STAGES = (Stage.FEATURES, Stage.MATCHES, Stage.MAPPING)
 THREADS_A_PROCESS = 4  # one process has not enough to do for more all of the time: units are registered one by one
 BYTES_PER_MB = 1_000_000
+_COUNTED = ("candidate_pairs", "rejected_pairs", "prior", "dropped_between_classes")  # of the matches' reports
 
 
 def cut_drive(run: Run, workers: int = 1) -> list[Span]:
@@ -193,8 +194,11 @@ class SubmapRun:
 
     def parts(self) -> list[Part]:
         """Its components in the whole drive's units."""
-        count = len({name.partition(".")[0] for name in self.mapped if "." in name})
-        return [part_from_arrays(numbered(self.mapped, k), self.span.units, self.images) for k in range(count)]
+        components = _entry(self, Stage.MAPPING)["components"]
+        return [
+            part_from_arrays(numbered(self.mapped, number), self.span.units, self.images)
+            for number in range(len(components))
+        ]
 
     def pairs(self) -> list[PairMatches]:
         """Its pairs in the whole drive's images."""
@@ -219,7 +223,7 @@ def run_submaps(run: Run, spans: Sequence[Span]) -> list[SubmapRun]:
         tally = _Tally(run.progress, len(submaps))
         done = {}
         if processes > 1:
-            done = _do_in_processes(run, stage, [submap.span for submap in submaps], processes, tally)
+            done = _do_in_processes(run, stage, submaps, processes, tally)
         for submap in submaps:
             submap.run.progress = tally.step(submap.span.number)
             submap.do(stage)
@@ -234,7 +238,7 @@ def _processes(config: EngineConfig) -> int:
 
 
 def _do_in_processes(
-    run: Run, stage: Stage, spans: Sequence[Span], processes: int, tally: _Tally
+    run: Run, stage: Stage, submaps: Sequence[SubmapRun], processes: int, tally: _Tally
 ) -> dict[int, dict[str, Any]]:
     """Do a stage of all sub-maps that are not finished, each in a process of its own that leaves it in the store.
 
@@ -275,7 +279,7 @@ def _do_in_processes(
         return span.number, ended.result
 
     with ThreadPoolExecutor(processes) as pool:
-        futures = [pool.submit(one, span) for span in spans if not SubmapRun(run, span).is_finished]
+        futures = [pool.submit(one, submap.span) for submap in submaps if not submap.is_finished]
         try:
             return dict(future.result() for future in as_completed(futures))
         except BaseException:
@@ -363,7 +367,7 @@ def _joined_features(run: Run, submaps: Sequence[SubmapRun]) -> JoinedFeatures:
     by_class: Counter[str] = Counter()
     for features in found:
         by_class.update(count_classes([features.classes]))
-    made = sum(features.made_mask is not None for features in found)
+    made = int((found.mask_bytes > 0).sum())
     described = describe_features(run.drive, found.counts, by_class, made, left_out)
     run.report["stages"].append({"stage": Stage.FEATURES, **_times(reports), **described})
     require_features(run, found, left_out)
@@ -446,9 +450,6 @@ def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[Pair
         "simultaneous": by_matches[0]["simultaneous"],
         "contradiction": next(iter(contradictions), None),
     }
-
-
-_COUNTED = ("candidate_pairs", "rejected_pairs", "prior", "dropped_between_classes")
 
 
 def _summed(reports: Sequence[Any]) -> Any:
