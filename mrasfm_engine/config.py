@@ -56,8 +56,10 @@ class FeatureConfig(_Section):
         True,
         description="no keypoints on the vehicle itself, which is found by the edges that stay while it moves",
     )
-    max_side_px: Count = Field(
-        1600, description="larger images are extracted at reduced size; coordinates stay those of the full image"
+    max_side_px: Count | None = Field(
+        None,
+        description="larger images are extracted at reduced size; coordinates stay those of the full image; by default "
+        "1600, and with `sift` no more than three quarters of `max_keypoints` need",
     )
 
 

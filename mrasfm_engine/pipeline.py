@@ -176,6 +176,7 @@ def reconstruct_submap(
             raise StorageError(
                 f"the plan of the drive has no sub-map {number}", remedy="Ask for the reconstruction again."
             )
+        stages.extraction_sizes(run)
         stages.own_cars(run)
         submap = stages.SubmapRun(run, span)
         submap.do(Stage.MAPPING)
@@ -187,6 +188,7 @@ def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Spa
     stages.load_models(run)
     stages.preflight(run)
     prior = stages.leave_out_standing(run, stages.prior(run))
+    stages.extraction_sizes(run)
     if not stages.is_cut(run):  # else the probe came before
         stages.probe(run)
     spans = stages.cut_drive(run, workers)

@@ -50,7 +50,7 @@ def checkpoint_file(name: str) -> str:
 
 
 # What is done of a long drive before it is cut: names of checkpoints.
-PLAN_CHECKPOINTS = ("standing", "own-car", "submaps")
+PLAN_CHECKPOINTS = ("standing", "extraction-size", "own-car", "submaps")
 
 
 def submap_checkpoint(number: int, stage: str) -> str:

@@ -16,6 +16,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import colors_at
+from mrasfm_engine.features.extraction_size import largest_side_px
 from mrasfm_engine.features.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.features.tiles import Tile, cut, duplicates, lay_tiles
 from mrasfm_engine.learned.network import STRIDE_PX, Network
@@ -98,7 +99,7 @@ class NetworkExtractor:
         )
 
     def _scaled(self, rgb: Bytes) -> Bytes:
-        scale = self._config.max_side_px / max(rgb.shape[:2])
+        scale = largest_side_px(self._config) / max(rgb.shape[:2])
         if scale >= 1.0:
             return rgb
         return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -8,6 +8,7 @@ import numpy as np
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE, NO_FEATURES, colors_at
+from mrasfm_engine.features.extraction_size import largest_side_px
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes
@@ -22,24 +23,18 @@ class SiftExtractor:
     def __init__(self, config: FeatureConfig) -> None:
         self._config = config
 
+    def with_side(self, max_side_px: int) -> SiftExtractor:
+        """See `SizedExtractor`."""
+        return SiftExtractor(self._config.model_copy(update={"max_side_px": max_side_px}))
+
+    def count(self, rgb: Bytes, mask: Bools | None) -> int:
+        """See `SizedExtractor`."""
+        gray, small_mask, sift = self._prepared(rgb, mask)
+        return min(len(sift.detect(gray, small_mask)), self._config.max_keypoints)
+
     def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
         """See `Extractor`."""
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        scale = min(1.0, self._config.max_side_px / max(gray.shape))
-        if scale < 1.0:
-            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        small_mask, wanted = None, self._config.max_keypoints * (CANDIDATES if self._config.spread else 1)
-        if mask is not None:
-            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
-            # OpenCV masks only after it has chosen the strongest: the rest of the image must not use up the number.
-            wanted = round(wanted / max(float(small_mask.mean()), 0.05))
-        # A detector an image: OpenCV's objects must not be shared between threads. Without precise upscaling all its
-        # keypoints are 0.25 px too far right and down, which turns cameras by 0.02 deg against one another.
-        sift = cv2.SIFT.create(
-            nfeatures=wanted,
-            contrastThreshold=self._config.contrast_threshold,
-            enable_precise_upscale=True,
-        )
+        gray, small_mask, sift = self._prepared(rgb, mask)
         keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
         if not keypoints:
             return NO_FEATURES
@@ -60,6 +55,26 @@ class SiftExtractor:
             descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
             colors=colors_at(rgb, xy),
         )
+
+    def _prepared(self, rgb: Bytes, mask: Bools | None) -> tuple[Bytes, Bytes | None, cv2.SIFT]:
+        """The image and the mask at the size of the extraction, and a detector."""
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        scale = min(1.0, largest_side_px(self._config) / max(gray.shape))
+        if scale < 1.0:
+            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small_mask, wanted = None, self._config.max_keypoints * (CANDIDATES if self._config.spread else 1)
+        if mask is not None:
+            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            # OpenCV masks only after it has chosen the strongest: the rest of the image must not use up the number.
+            wanted = round(wanted / max(float(small_mask.mean()), 0.05))
+        # A detector an image: OpenCV's objects must not be shared between threads. Without precise upscaling all its
+        # keypoints are 0.25 px too far right and down, which turns cameras by 0.02 deg against one another.
+        sift = cv2.SIFT.create(
+            nfeatures=wanted,
+            contrastThreshold=self._config.contrast_threshold,
+            enable_precise_upscale=True,
+        )
+        return np.asarray(gray, dtype=np.uint8), small_mask, sift
 
 
 METHOD = Method[FeatureConfig, SiftExtractor](build=SiftExtractor)

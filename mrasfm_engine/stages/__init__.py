@@ -6,6 +6,7 @@ Each takes its input, leaves its result and a report in the store, and is skippe
 from __future__ import annotations
 
 from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
+from mrasfm_engine.stages._extraction_size import extraction_sizes
 from mrasfm_engine.stages._features import features
 from mrasfm_engine.stages._mapping import mapping
 from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
@@ -23,6 +24,7 @@ __all__ = [
     "components",
     "count_of_submaps",
     "cut_drive",
+    "extraction_sizes",
     "features",
     "in_units",
     "is_cut",

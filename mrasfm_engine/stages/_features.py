@@ -47,7 +47,7 @@ def extract(run: Run) -> tuple[StoredFeatures, dict[str, Any]]:
         left_out: dict[str, Incomplete] = {}
         extracted = features_by_image(
             run.drive,
-            run.components.extractor,
+            run.extractor,
             threads=run.config.threads,
             segmenter=run.components.segmenter,
             class_margin_px=run.config.features.class_margin_px,

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 from mrasfm_engine import __version__
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, StorageError
+from mrasfm_engine.features.extraction import Extractor
+from mrasfm_engine.features.extraction_size import Size, at_sizes
 from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.io.stage_store import Arrays, StageStore, StageWriter, StoredStage, drive_fingerprint, fingerprint
 from mrasfm_engine.matching.standing import Standing
@@ -24,8 +26,8 @@ Result = TypeVar("Result")
 
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-OWN_CAR_VERSION = 1
-VERSIONS = {Stage.FEATURES: 5, Stage.MATCHES: 6, Stage.MAPPING: 9}
+OWN_CAR_VERSION, EXTRACTION_SIZE_VERSION = 1, 1
+VERSIONS = {Stage.FEATURES: 6, Stage.MATCHES: 6, Stage.MAPPING: 9}
 
 
 def new_report() -> dict[str, Any]:
@@ -45,6 +47,7 @@ class Run:
     content_sha256: Mapping[str, str] | None = None  # of the drive's files by name, where the caller knows them
     report: dict[str, Any] = field(default_factory=new_report)
     own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once images were looked at
+    side_px: Mapping[Size, int] = field(default_factory=dict)  # that images of a size are reduced to, once it is known
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
     standing: Standing | None = None  # where units are left out: which, and the drive with all of them
     whole_drive: Drive | None = None
@@ -56,6 +59,11 @@ class Run:
         """Extractor, matcher and segmenter; their models are loaded at the first use, once."""
         return load_components(self.config, self.drive.manifest.label_map)
 
+    @property
+    def extractor(self) -> Extractor:
+        """The extractor at the sizes that were found."""
+        return at_sizes(self.components.extractor, self.side_px)
+
     def share_models(self, other: Run) -> None:
         """Use the models that another run with the same settings has loaded, or will load."""
         self.__dict__["components"] = other.components
@@ -66,7 +74,8 @@ class Run:
         config = self.config
         models = self.components.fingerprint_of("extractor", "segmenter")
         own_car = OWN_CAR_VERSION if config.features.own_car else None
-        return [config.features.model_dump(), config.semantics.model_dump(), models, own_car]
+        size = EXTRACTION_SIZE_VERSION if config.features.max_side_px is None else None
+        return [config.features.model_dump(), config.semantics.model_dump(), models, own_car, size]
 
     def require_unplanned(self) -> None:
         """Refuse to find anew what a plan has found for the whole drive: this run may have some of its files only.

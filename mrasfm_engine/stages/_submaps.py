@@ -111,7 +111,7 @@ class SubmapRun:
     Parameters
     ----------
     run
-        The whole drive's, whose own car is known.
+        The whole drive's, whose own car and sizes of extraction are known.
     """
 
     def __init__(self, run: Run, span: Span) -> None:
@@ -126,6 +126,7 @@ class SubmapRun:
             run.progress,
             run.cancel,
             own_cars=run.own_cars,
+            side_px=run.side_px,
             key=fingerprint(run.key or run.drive_key, SUBMAPS, asdict(span)),
         )
         self.run.share_models(run)
