@@ -33,6 +33,7 @@ REDUCTIONS = tuple(2.0 ** (-k / 4) for k in (4, 3, 2, 1))
 # and by no more than 3 % with 75 % and more; KITTI 01, 02 and PandaSet lost nothing.
 ENOUGH = 0.75
 SAMPLED_IMAGES = 12  # of a size
+MARGIN = 0.9  # of the reduction that is expected to do
 
 
 @runtime_checkable
@@ -90,13 +91,18 @@ def find_sides(
     """
     result: dict[Size, int] = {}
     for size in sorted({(camera.width, camera.height) for camera in drive.cameras}):
-        sampled = _sample(drive, size)
+        sampled, promising = _sample(drive, size), 0.0
         for reduction in REDUCTIONS:
+            if reduction < promising:
+                continue
             side_px = round(reduction * min(max(size), LARGEST_SIDE_PX))
             counts = _counts(drive, sampled, extractor.with_side(side_px), threads=threads, cancel=cancel)
-            if counts and np.quantile(counts, 0.25) >= ENOUGH * max_keypoints:
+            share = float(np.quantile(counts, 0.25)) / (ENOUGH * max_keypoints) if counts else 0.0
+            if share >= 1.0:
                 result[size] = side_px
                 break
+            # Keypoints are as many as pixels, or so: sizes far from enough need not be tried.
+            promising = reduction / np.sqrt(share) * MARGIN if share else np.inf
     return result
 
 
