@@ -27,7 +27,8 @@ from pydantic.config import JsonDict
 
 # Long lists end at their first bad item (FailFast): a million bad ones would take gigabytes to describe.
 
-# COLMAP's models that describe the cameras cars carry, with their parameters in COLMAP's order.
+# Models of the cameras that cars carry, with their parameters in order: COLMAP's, and the unified model of Mei and
+# Rives with OpenCV's distortion (its omnidir module, Kalibr's omni-radtan, KITTI-360's fisheyes).
 CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -35,6 +36,8 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "MEI": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "xi"),
 }
 
 FIELDS_OF_VERSION_2 = frozenset({"sigma_principal_point_px", "sigma_distortion", "sigma_time_offset_us"})  # of Camera
@@ -43,6 +46,7 @@ MAX_CAMERAS = 64
 MAX_FRAMES = 100_000
 MAX_GNSS_SAMPLES = 1_000_000  # 100 Hz for 2.7 hours
 MAX_IMAGE_SIDE_PX = 20_000
+MAX_XI = 10.0  # of a MEI camera: 0 is a pinhole, 1 a parabolic mirror, fisheyes have 1 to 3
 MAX_PATH_CHARACTERS = 512
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
 MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
@@ -119,11 +123,12 @@ class Camera(_Model):
     """One fixed camera of the rig."""
 
     name: Name = Field(description="unique in the rig")
-    model: str = Field(description=f"COLMAP's camera model: one of {', '.join(CAMERA_MODELS)}")
+    model: str = Field(description=f"camera model, COLMAP's or MEI: one of {', '.join(CAMERA_MODELS)}")
     width: Annotated[int, Field(gt=0, le=MAX_IMAGE_SIDE_PX, strict=True, description="pixels")]
     height: Annotated[int, Field(gt=0, le=MAX_IMAGE_SIDE_PX, strict=True, description="pixels")]
     params: list[Finite] = Field(
-        description="COLMAP's parameters of the model, pixels; the centre of the top left pixel is at (0.5, 0.5)"
+        description="parameters of the model in COLMAP's order, pixels; the centre of the top left pixel is at "
+        "(0.5, 0.5)"
     )
     rig_from_cam: Pose = Field(
         description="the camera's pose in the rig; camera axes are x right, y down, z forward. Its translation is "
@@ -184,6 +189,8 @@ def _check_params(params: list[float], *, model: str, width: int, height: int) -
                 f"focal length {name} = {values[name]:g} px does not fit an image of {width}x{height} pixels: "
                 "the calibration is singular or in other units than pixels"
             )
+    if not 0.0 <= values.get("xi", 0.0) <= MAX_XI:
+        raise ValueError(f"xi = {values['xi']:g} is out of range: no lens has less than 0 or more than {MAX_XI:g}")
     if not (-0.5 * width < values["cx"] < 1.5 * width) or not (-0.5 * height < values["cy"] < 1.5 * height):
         raise ValueError(
             f"principal point ({values['cx']:g}, {values['cy']:g}) is far outside the image of {width}x{height} pixels"

@@ -19,6 +19,7 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, reprojection_errors_focal
+from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.resection import resect
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -78,13 +79,11 @@ class Relocaliser:
     def __init__(self, b: SourceScene, config: AggregationConfig, *, seed: int) -> None:
         self._b, self._config, self._seed = b, config, seed
         self._kind, self._params = pack_cameras(b.drive.cameras)
-        self._cameras = [
-            pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=c.params) for c in b.drive.cameras
-        ]
+        self._cameras = SolverCameras.from_cameras(b.drive.cameras, self._kind, self._params)
         self._b_from_cam = b.world_from_cam
 
     def errors_focal(self, a_from_b: Floats, seen: Matches2D3D) -> Floats:
-        """Reprojection errors (n,) in focal lengths if b lies so in a; infinite behind a camera."""
+        """Reprojection errors (n,) in focal lengths if b lies so in a; infinite where a camera shows nothing."""
         cam_from_a = se3.inverse(a_from_b @ self._b_from_cam[seen.image])
         points = np.einsum("nij,nj->ni", cam_from_a[:, :3, :3], seen.points_m) + cam_from_a[:, :3, 3]
         camera = self._b.image_camera[seen.image]
@@ -104,9 +103,13 @@ class Relocaliser:
 
     def _unit_pose(self, unit: int, own: Matches2D3D) -> Floats | None:
         """a_from_rig of a unit."""
+        xy_px, usable = self._cameras.pixels(self._b.image_camera[own.image], own.xy_px)
+        own, xy_px = own.select(usable), xy_px[usable]
+        if len(own.unit) < self._config.min_unit_inliers:
+            return None
         images, eye = np.unique(own.image, return_inverse=True)
         rig_from_eye = se3.inverse(self._b.world_from_rig[unit]) @ self._b_from_cam[images]
-        cameras = [self._cameras[int(self._b.image_camera[i])] for i in images]
+        cameras = [self._cameras.cameras[int(self._b.image_camera[i])] for i in images]
         ransac = pycolmap.RANSACOptions()
         focal = float(np.mean([self._params[int(self._b.image_camera[i]), :2].mean() for i in images]))
         ransac.max_error = MAX_ERROR_FOCAL * focal
@@ -116,13 +119,13 @@ class Relocaliser:
             options = pycolmap.AbsolutePoseEstimationOptions()
             options.ransac = ransac
             result = pycolmap.estimate_and_refine_absolute_pose(
-                own.xy_px, own.points_m, cameras[0], estimation_options=options
+                xy_px, own.points_m, cameras[0], estimation_options=options
             )
             key, eye_from_rig = "cam_from_world", se3.inverse(rig_from_eye[0])
         else:
             poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(m[:3, :3]), m[:3, 3]) for m in se3.inverse(rig_from_eye)]
             result = pycolmap.estimate_and_refine_generalized_absolute_pose(
-                own.xy_px, own.points_m, [int(e) for e in eye], poses, cameras, estimation_options=ransac
+                xy_px, own.points_m, [int(e) for e in eye], poses, cameras, estimation_options=ransac
             )
             key, eye_from_rig = "rig_from_world", np.eye(4)
         if result is None or result["num_inliers"] < self._config.min_unit_inliers:

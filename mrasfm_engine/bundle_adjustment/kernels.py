@@ -50,8 +50,7 @@ from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS, Groups
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.types import Bools, Floats, Ints
 
-BEHIND_PX = 1000.0  # what an observation costs whose point is behind the camera
-MIN_DEPTH_M = 1e-3
+BEHIND_PX = 1000.0  # what an observation costs whose point is where its camera shows nothing
 UNIT_SUMS = 27  # of an image: its unit's block by its lower triangle, and gradient
 
 
@@ -61,7 +60,8 @@ def image_sums(inner: int) -> int:
 
 
 class Views(NamedTuple):
-    """Poses of units (u, 3, 3), (u, 3) and of cameras (c, 3, 3), (c, 3); the cameras' kinds and parameters (c, 8)."""
+    """Poses of units (u, 3, 3), (u, 3) and of cameras (c, 3, 3), (c, 3); the cameras' kinds and
+    parameters (c, PARAMETERS)."""
 
     unit_r: Floats
     unit_t: Floats
@@ -159,7 +159,7 @@ def camera_point(
 def squared_errors(
     views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any
 ) -> None:
-    """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared behind the camera."""
+    """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared of points not seen."""
     d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
     for n in range(lo, hi):
         u, c = observed.unit[n], observed.camera[n]
@@ -168,10 +168,9 @@ def squared_errors(
             views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c],
             points[observed.point[n]], d, rig, cam,
         )  # fmt: skip
-        if cam[2] < MIN_DEPTH_M:
+        if not project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj):
             out[n] = BEHIND_PX * BEHIND_PX
             continue
-        project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj)
         out[n] = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
 
 
@@ -181,14 +180,13 @@ def linearise(
     kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
 ) -> bool:  # fmt: skip
-    """Weighted residual, and its derivatives in the point and the camera, of one observation; False behind the camera.
+    """Weighted residual, and its derivatives in the point and the camera, of one observation; False if it is not seen.
 
     Those in the unit follow from jx = N and d = X - t_u.
     """
     camera_point(unit_r, unit_t, bands, band, follows, cam_r, cam_t, x, d, rig, cam)
-    if cam[2] < MIN_DEPTH_M:
+    if not project(kind, k, cam[0], cam[1], cam[2], work, proj):
         return False
-    project(kind, k, cam[0], cam[1], cam[2], work, proj)
     r0, r1 = (proj[0] - xy[0]) / sigma, (proj[1] - xy[1]) / sigma
     sw = math.sqrt(1.0 / (1.0 + (r0 * r0 + r1 * r1) / loss2))
     res[0], res[1] = r0 * sw, r1 * sw
@@ -235,22 +233,28 @@ def intrinsics_derivatives(kind: int, k: Any, cam: Any, proj: Any, s: float, jc:
     A perspective camera's distortion is the radial one's, of which it has none: how far it may be off is asked all the
     same.
     """
-    a, b = cam[0] / cam[2], cam[1] / cam[2]
+    iz = 1.0 / cam[2]
+    if kind == 4:
+        iz = (1.0 + k[9]) / (cam[2] + k[9] * math.sqrt(cam[0] * cam[0] + cam[1] * cam[1] + cam[2] * cam[2]))
+    a, b = cam[0] * iz, cam[1] * iz
     r2 = a * a + b * b
     jc[0, 9], jc[1, 9] = 0.0, (proj[1] - k[3]) * s
     jc[0, 10], jc[1, 10] = s, 0.0
     jc[0, 11], jc[1, 11] = 0.0, s
     fx, fy = k[0] * s, k[1] * s
     if kind == 2:
-        r = math.sqrt(r2)
-        theta = math.atan(r)
+        r = math.sqrt(cam[0] * cam[0] + cam[1] * cam[1])
+        theta = math.atan2(r, cam[2])
         power = theta**3 / max(r, 1e-12)
         for i in range(4):
-            jc[0, 12 + i], jc[1, 12 + i] = fx * a * power, fy * b * power
+            jc[0, 12 + i], jc[1, 12 + i] = fx * cam[0] * power, fy * cam[1] * power
             power *= theta * theta
     else:
-        jc[0, 12], jc[1, 12] = fx * a * r2, fy * b * r2
-        jc[0, 13], jc[1, 13] = fx * a * r2 * r2, fy * b * r2 * r2
+        share = 1.0
+        if kind == 3:
+            share = 1.0 / (1.0 + r2 * (k[10] + r2 * (k[11] + r2 * k[12])))
+        jc[0, 12], jc[1, 12] = fx * a * r2 * share, fy * b * r2 * share
+        jc[0, 13], jc[1, 13] = fx * a * r2 * r2 * share, fy * b * r2 * r2 * share
         jc[0, 14], jc[1, 14] = fx * 2.0 * a * b, fy * (r2 + 2.0 * b * b)
         jc[0, 15], jc[1, 15] = fx * (r2 + 2.0 * a * a), fy * 2.0 * a * b
 

@@ -17,6 +17,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 LARGEST_DENSE = 4000  # unknowns
 SINGULAR = 1e-11  # pivots and eigenvalues of the scaled matrix below this are rounding
+UNKNOWN_SCALE = 1e3  # sigma of the scale, relative: no image knows it so badly, and rounding no better
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +104,7 @@ def _regular_marginals(
     if np.isinf(variance[:, 3:]).any():
         scale = np.inf
     elif layout.num_units >= 2:
-        scale = float(np.sqrt(max(joint[-1, -1], 0.0)))
+        scale = _sigma_scale(joint[-1, -1])
     return _Marginals(
         units=np.maximum(variance, 0.0),
         cameras=covariances_of_cameras[0],
@@ -174,7 +175,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
         scale = np.inf
     elif len(position) >= 2:
         functional = scale_functional(position)
-        scale = float(np.sqrt(max(float(functional @ covariance[:split, :split] @ functional), 0.0)))
+        scale = _sigma_scale(float(functional @ covariance[:split, :split] @ functional))
     cameras = covariance[split:, split:]
     return _Marginals(units=units, cameras=cameras, cameras_of_independent_errors=cameras, sigma_scale=scale)
 
@@ -202,6 +203,12 @@ def _inverse(matrix: Floats) -> tuple[Floats, Bools]:
         inverse = (vectors[:, ~null] / values[~null]) @ vectors[:, ~null].T
     result: Floats = inverse * d[:, None] * d[None, :]
     return result, loose
+
+
+def _sigma_scale(variance: float) -> float:
+    """Standard deviation of the scale; infinite where its information is what rounding leaves of none."""
+    sigma = float(np.sqrt(max(variance, 0.0)))
+    return sigma if sigma < UNKNOWN_SCALE else np.inf
 
 
 def scale_functional(position: Floats) -> Floats:

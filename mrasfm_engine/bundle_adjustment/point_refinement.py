@@ -17,7 +17,6 @@ from numba import njit
 
 from mrasfm_engine.bundle_adjustment.kernels import (
     BEHIND_PX,
-    MIN_DEPTH_M,
     Bands,
     Observed,
     Views,
@@ -45,8 +44,7 @@ def _point_cost(
             views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c], x, d, rig, cam
         )
         r2 = BEHIND_PX * BEHIND_PX
-        if cam[2] >= MIN_DEPTH_M:
-            project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj)
+        if project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj):
             r2 = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
         product *= 1.0 + r2 / scale2
         if product > 1e200:  # one logarithm for many factors

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.problem import PLACES_OF_INTRINSICS, READOUT, TIME, Layout
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRINSICS, READOUT, TIME, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
@@ -193,12 +193,12 @@ class IntrinsicsPrior:
     phi is the logarithm of fx over what was given, alpha that of fy over fx; see `problem`.
     """
 
-    params: Floats  # (c, 8) given
+    params: Floats  # (c, PARAMETERS) given
     sigma: Floats  # (c, INTRINSICS); infinite for those of which nothing is known
 
     def _residuals(self, state: State) -> Floats:
         now, given = state.camera_params, self.params
-        off = now - given
+        off = now[:, :INTRINSICS] - given[:, :INTRINSICS]
         off[:, 0] = np.log(now[:, 0] / given[:, 0])
         off[:, 1] = np.log(now[:, 1] / given[:, 1]) - off[:, 0]
         result: Floats = off / self.sigma

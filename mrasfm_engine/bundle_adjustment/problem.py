@@ -27,11 +27,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import ADJUSTED
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
 
 UNIT_DOF = 6
-INTRINSICS = 8  # phi, alpha, cx, cy, d0, d1, d2, d3
+INTRINSICS = ADJUSTED  # phi, alpha, cx, cy, d0, d1, d2, d3
 CAMERA_DOF = 16
 # Places of a camera's step: phi, delta, rho, and from here on the rest of the intrinsics.
 FOCAL, TIME, READOUT, LENS = 6, 7, 8, 9
@@ -177,7 +178,7 @@ def retract(state: State, layout: Layout, step: Floats, points_m: Floats) -> Sta
         camera_time_offset_s[cameras] += d_camera[:, TIME]
     if layout.camera_dof > LENS:
         camera_params[cameras, 1] *= np.exp(d_camera[:, LENS])
-        camera_params[cameras, 2:] += d_camera[:, LENS + 1 :]
+        camera_params[cameras, 2:ADJUSTED] += d_camera[:, LENS + 1 :]
     return replace(
         state,
         unit_rotation=unit_rotation,

@@ -20,8 +20,10 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.colmap_cameras import NearestModel, nearest_model
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
+from schemas.findings import Finding, warning
 
 RIG_ID = 1
 REFERENCE_SENSOR_ID = 1
@@ -62,6 +64,28 @@ def images_of_frames(scene: Scene) -> dict[int, list[int]]:
     return dict(sorted(frames.items()))
 
 
+def colmap_models(scene: Scene) -> list[NearestModel]:
+    """COLMAP's models of the cameras, with their refined parameters."""
+    return [
+        nearest_model(camera, refined.params)
+        for camera, refined in zip(scene.drive.cameras, scene.calibration, strict=True)
+    ]
+
+
+def approximations(scene: Scene) -> list[Finding]:
+    """Findings of cameras whose model COLMAP does not have."""
+    return [
+        warning(
+            "colmap-model-approximate",
+            f"COLMAP has no model {camera.model}: `model/` and `features.db` have camera {camera.name} as "
+            f"{nearest.model}, which is off by up to {nearest.error_px:.2g} px in its image",
+            "Take the camera's own model from calibration.json where that matters.",
+        )
+        for camera, nearest in zip(scene.drive.cameras, colmap_models(scene), strict=True)
+        if nearest.model != camera.model
+    ]
+
+
 def _wxyz_and_translation(transforms: Floats) -> Floats:
     """COLMAP's seven numbers (..., 7) of a pose: w x y z of the quaternion, translation."""
     q = se3.quaternion_from_rotation(transforms[..., :3, :3])
@@ -70,10 +94,10 @@ def _wxyz_and_translation(transforms: Floats) -> Floats:
 
 def _cameras(scene: Scene) -> bytes:
     parts = [struct.pack("<Q", len(scene.drive.cameras))]
-    for k, (camera, refined) in enumerate(zip(scene.drive.cameras, scene.calibration, strict=True)):
-        model = int(getattr(pycolmap.CameraModelId, camera.model).value)
+    for k, (camera, nearest) in enumerate(zip(scene.drive.cameras, colmap_models(scene), strict=True)):
+        model = int(getattr(pycolmap.CameraModelId, nearest.model).value)
         parts.append(struct.pack("<IiQQ", k + 1, model, camera.width, camera.height))
-        parts.append(np.asarray(refined.params, dtype="<f8").tobytes())
+        parts.append(np.asarray(nearest.params, dtype="<f8").tobytes())
     return b"".join(parts)
 
 

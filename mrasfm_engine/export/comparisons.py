@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from mrasfm_engine.export.colmap import RIG_ID, frame_of_image
+from mrasfm_engine.export.colmap import RIG_ID, colmap_models, frame_of_image
 from mrasfm_engine.export.readers import ModelImage, ModelPoints, transforms
 from mrasfm_engine.export.road import DECIMALS
 from mrasfm_engine.scene.scene import Scene
@@ -113,11 +113,12 @@ def _rigs_and_cameras(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
         rig = found.rigs[vehicle + RIG_ID]
         sensors = (rig.num_sensors(), rig.ref_sensor_id.type)
         yield Row("rigs: cameras and the vehicle's reference", sensors, (size + 1, pycolmap.SensorType.IMU))
-    for k, (given, refined) in enumerate(zip(scene.drive.cameras, scene.calibration, strict=True)):
+    models = colmap_models(scene)
+    for k, (given, refined, model) in enumerate(zip(scene.drive.cameras, scene.calibration, models, strict=True)):
         camera, rig = found.cameras[k + 1], found.rigs[int(scene.rig_of_camera[k]) + RIG_ID]
         known = (camera.model.name, camera.width, camera.height)
-        yield Row(f"cameras: {given.name}", known, (given.model, given.width, given.height))
-        yield Row(f"cameras: {given.name}'s params", camera.params, refined.params, ROUNDING)
+        yield Row(f"cameras: {given.name}", known, (model.model, given.width, given.height))
+        yield Row(f"cameras: {given.name}'s params", camera.params, model.params, ROUNDING)
         sensor_from_rig = rig.sensor_from_rig(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, k + 1)).matrix()
         expected = np.linalg.inv(refined.rig_from_cam)[:3]
         yield Row(f"rigs: {given.name}'s pose", sensor_from_rig, expected, POSE_TOLERANCE)
@@ -204,7 +205,7 @@ def features(scene: Scene, select: Callable[[str], Iterator[Any]]) -> Rows:
         "its frames", list(select("SELECT frame_id, sensor_id, data_id FROM frame_data ORDER BY data_id")), frames
     )
     params = [row[0] for row in select("SELECT params FROM cameras ORDER BY camera_id")]
-    yield Row("its camera parameters", params, [camera.params.tobytes() for camera in scene.calibration])
+    yield Row("its camera parameters", params, [model.params.tobytes() for model in colmap_models(scene)])
     by_image = dict(enumerate(scene.features, 1))
     for table, column in (("keypoints", "xy_px"), ("descriptors", "descriptors")):
         rows = select(f"SELECT image_id, rows, data FROM {table}")

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.export.colmap import REFERENCE_SENSOR_ID, RIG_ID, frame_of_image
+from mrasfm_engine.export.colmap import REFERENCE_SENSOR_ID, RIG_ID, colmap_models, frame_of_image
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.colmap_cameras import NearestModel, nearest_model
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.types import Floats
@@ -36,7 +37,7 @@ def write_features(scene: Scene, path: Path) -> None:
             features=scene.features,
             pairs=scene.pairs,
             rig_from_cam=[refined.rig_from_cam for refined in scene.calibration],
-            params=[refined.params for refined in scene.calibration],
+            models=colmap_models(scene),
             frames=[frame_of_image(scene, i) for i in range(len(scene.drive.images))],
         ),
         path,
@@ -58,7 +59,7 @@ def write_matches(drive: Drive, features: Sequence[ImageFeatures], pairs: Sequen
             features=features,
             pairs=pairs,
             rig_from_cam=list(drive.rig_from_cam),
-            params=[np.array(camera.params) for camera in drive.cameras],
+            models=[nearest_model(camera, np.array(camera.params)) for camera in drive.cameras],
             frames=[image.unit + 1 for image in drive.images],
             descriptors=False,
         ),
@@ -72,7 +73,7 @@ class _Content:
     features: Sequence[ImageFeatures]
     pairs: Sequence[PairMatches]
     rig_from_cam: Sequence[Floats]  # by camera (4, 4)
-    params: Sequence[Floats]  # by camera, COLMAP's order
+    models: Sequence[NearestModel]  # by camera
     frames: Sequence[int]  # by image, the id of its frame
     descriptors: bool = True
 
@@ -99,9 +100,9 @@ def _write_cameras(content: _Content, database: pycolmap.Database) -> None:
     rig = pycolmap.Rig()
     rig.rig_id = RIG_ID
     rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.IMU, REFERENCE_SENSOR_ID))
-    for k, (camera, params) in enumerate(zip(content.drive.cameras, content.params, strict=True)):
+    for k, (camera, nearest) in enumerate(zip(content.drive.cameras, content.models, strict=True)):
         written = pycolmap.Camera(
-            model=camera.model, width=camera.width, height=camera.height, params=params, camera_id=k + 1
+            model=nearest.model, width=camera.width, height=camera.height, params=nearest.params, camera_id=k + 1
         )
         written.has_prior_focal_length = True
         database.write_camera(written, use_camera_id=True)

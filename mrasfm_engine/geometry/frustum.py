@@ -49,9 +49,10 @@ def _seen_fractions(
                     x[i] += ma[i, j] * samples[ca, s, j]
             for i in range(3):
                 y[i] = mb[0, i] * x[0] + mb[1, i] * x[1] + mb[2, i] * x[2]
-            if y[2] < 0.1 * (abs(y[0]) + abs(y[1])) + 0.1 or y[2] > 1.3 * max_depth:
+            if y[0] * y[0] + y[1] * y[1] + y[2] * y[2] > (1.3 * max_depth) ** 2:
                 continue
-            project(kind[cb], params[cb], y[0], y[1], y[2], work, pixel)
+            if not project(kind[cb], params[cb], y[0], y[1], y[2], work, pixel):
+                continue
             if 0 <= pixel[0] < size[cb, 0] and 0 <= pixel[1] < size[cb, 1]:
                 seen += 1
         out[n] = seen / samples.shape[1]

@@ -27,7 +27,6 @@ NEAREST_M = 1.0  # nearer things than this are not expected
 FARTHEST_M = 1000.0
 MAX_CAMERA_HEIGHT_M = 4.0  # of any camera above the ground
 MAX_GRADE = 0.1  # by which the ground may fall away from the vehicle
-MIN_DEPTH_M = 1e-3
 DEPTHS = 24  # tried between nearest and farthest, evenly in inverse depth
 MIN_FLOW_PX = 6.0  # what the world must move by before standing still means something
 STILL_SHARE = 0.5  # of the least flow of anything in the world: what moves by less moves along
@@ -168,7 +167,7 @@ def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats,
 def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any) -> None:
     """Distances (n,) of pixels from where rays (n, 3) from an origin are seen, from their deepest point to the nearest.
 
-    The way is followed in straight steps between DEPTHS knots; those behind the camera are left out.
+    The way is followed in straight steps between DEPTHS knots; those that the camera does not show are left out.
     """
     work, proj = np.empty(6), np.empty(8)
     for i in range(len(rays)):
@@ -178,10 +177,10 @@ def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest:
             part = s / (DEPTHS - 1)
             inverse = (1.0 - part) / deepest[i] + part / NEAREST_M
             z = rays[i, 2] / inverse + origin[2]
-            if z <= MIN_DEPTH_M:
+            x, y = rays[i, 0] / inverse + origin[0], rays[i, 1] / inverse + origin[1]
+            if not project(kind, params, x, y, z, work, proj):
                 before = False
                 continue
-            project(kind, params, rays[i, 0] / inverse + origin[0], rays[i, 1] / inverse + origin[1], z, work, proj)
             u, v = proj[0] - xy_px[i, 0], proj[1] - xy_px[i, 1]
             best = min(best, u * u + v * v)
             if before:

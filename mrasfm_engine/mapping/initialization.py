@@ -180,11 +180,14 @@ def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: 
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
     options.min_num_trials, options.max_num_trials = 100, 2000
-    both, cameras = np.concatenate([a, b]), cameras_of(mapper)
+    a, b, xy_a, xy_b = _for_solver(mapper, a, b)
+    if not len(a):
+        return None
+    both, cameras = np.concatenate([a, b]), cameras_of(mapper).cameras
     views = CameraViews.from_keypoints(mapper, mapper.keypoints.camera[both], mapper.keypoints.band[both])
     result = pycolmap.estimate_generalized_relative_pose(
-        mapper.keypoints.xy_px[a],
-        mapper.keypoints.xy_px[b],
+        xy_a,
+        xy_b,
         [int(i) for i in views.index[: len(a)]],
         [int(i) for i in views.index[len(a) :]],
         [rigid3d(m) for m in se3.inverse(views.rig_from_view)],
@@ -204,10 +207,11 @@ def _single_camera_relative_pose(
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
     index = int(mapper.image_camera[0])
-    camera = cameras_of(mapper)[index]
-    result = pycolmap.estimate_essential_matrix(
-        mapper.keypoints.xy_px[a], mapper.keypoints.xy_px[b], camera, camera, estimation_options=options
-    )
+    camera = cameras_of(mapper).cameras[index]
+    a, b, xy_a, xy_b = _for_solver(mapper, a, b)
+    if not len(a):
+        return None
+    result = pycolmap.estimate_essential_matrix(xy_a, xy_b, camera, camera, estimation_options=options)
     if result is None:
         return None
     length_m = 1.0
@@ -221,6 +225,14 @@ def _single_camera_relative_pose(
     rig_from_view = rig_from_view @ mapper.state.rig_from_cam[index]
     result_pose: Floats = rig_from_view[0] @ u_from_v @ se3.inverse(rig_from_view[1])
     return result_pose
+
+
+def _for_solver(mapper: Mapper, a: Ints, b: Ints) -> tuple[Ints, Ints, Floats, Floats]:
+    """Matching keypoints (n,) that COLMAP's solvers can use, and their pixels (n, 2) as these take them."""
+    cameras, keypoints = cameras_of(mapper), mapper.keypoints
+    (xy_a, usable_a), (xy_b, usable_b) = (cameras.pixels(keypoints.camera[k], keypoints.xy_px[k]) for k in (a, b))
+    both = usable_a & usable_b
+    return a[both], b[both], xy_a[both], xy_b[both]
 
 
 def _matches_between(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int) -> tuple[Ints, Ints]:

@@ -22,7 +22,6 @@ SIGMAS_PX = (32.0, 8.0, 2.0)  # of the Cauchy loss, one after the other, where n
 UNWEIGHTED_PX = 1e6  # of the Cauchy loss: beyond every error
 STEPS = 6  # with each, at most
 SMALL = 1e-5  # a step (rad, m) below this has arrived
-MIN_DEPTH_M = 1e-3
 
 
 def resect(
@@ -104,9 +103,8 @@ def _pose_system(
         x = view_r[e, 0, 0] * rig[0] + view_r[e, 1, 0] * rig[1] + view_r[e, 2, 0] * rig[2]
         y = view_r[e, 0, 1] * rig[0] + view_r[e, 1, 1] * rig[1] + view_r[e, 2, 1] * rig[2]
         z = view_r[e, 0, 2] * rig[0] + view_r[e, 1, 2] * rig[1] + view_r[e, 2, 2] * rig[2]
-        if z < MIN_DEPTH_M:
+        if not project(kind[e], params[e], x, y, z, work, proj):
             continue
-        project(kind[e], params[e], x, y, z, work, proj)
         r0, r1 = (proj[0] - xy[k, 0]) / sigma, (proj[1] - xy[k, 1]) / sigma
         s = math.sqrt(1.0 / (1.0 + r0 * r0 + r1 * r1))
         for row in range(2):

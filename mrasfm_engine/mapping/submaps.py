@@ -36,7 +36,7 @@ class Part:
     units, world_from_rig
         Units (n,) that have a pose, and these poses (n, 4, 4).
     rig_from_cam, camera_params, camera_time_offset_s
-        The calibration (c, 4, 4), (c, 8), (c,) that they were found with.
+        The calibration (c, 4, 4), (c, PARAMETERS), (c,) that they were found with.
     missing
         Images (m,) of its units that have no pose.
     own, unit_from_image

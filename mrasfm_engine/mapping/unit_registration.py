@@ -15,7 +15,8 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import unpack_camera
+from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.inlier_gates import gates_px, observation_gate_px, robust_sigma, widest_gates_px
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.per_camera_pnp import Vote, agree, calibration_covariance, largest_agreement
@@ -221,12 +222,9 @@ def _spread(count: int, limit: int) -> Ints:
     return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.int64))
 
 
-def cameras_of(mapper: Mapper) -> list[pycolmap.Camera]:
-    """The cameras with their current intrinsics, as pycolmap takes them."""
-    return [
-        pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=unpack_camera(c.model, params))
-        for c, params in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
-    ]
+def cameras_of(mapper: Mapper) -> SolverCameras:
+    """The cameras with their current intrinsics, for COLMAP's solvers."""
+    return SolverCameras.from_cameras(mapper.drive.cameras, mapper.camera_kind, mapper.state.camera_params)
 
 
 def rigid3d(a_from_b: Floats) -> pycolmap.Rigid3d:
@@ -251,12 +249,13 @@ def _ransac(mapper: Mapper, max_error_px: float) -> pycolmap.RANSACOptions:
 def _joint_pose(mapper: Mapper, matched: Correspondences2D3D) -> Floats | None:
     """world_from_rig by one generalised PnP over all cameras."""
     views, cameras = CameraViews.from_keypoints(mapper, matched.camera, matched.band), cameras_of(mapper)
+    xy_px, usable = cameras.pixels(matched.camera, matched.xy_px)
     result = pycolmap.estimate_and_refine_generalized_absolute_pose(
-        matched.xy_px,
-        matched.points_m,
-        [int(i) for i in views.index],
+        xy_px[usable],
+        matched.points_m[usable],
+        [int(i) for i in views.index[usable]],
         [rigid3d(m) for m in se3.inverse(views.rig_from_view)],
-        [cameras[c] for c in views.camera],
+        [cameras.cameras[c] for c in views.camera],
         estimation_options=_ransac(mapper, float(widest_gates_px(mapper)[matched.camera].mean())),
     )
     return None if result is None else se3.inverse(matrix_of(result["rig_from_world"]))
@@ -280,19 +279,17 @@ def _as_expected(mapper: Mapper, matched: Correspondences2D3D, expected: Floats)
 
 
 def _errors_px(mapper: Mapper, world_from_rig: Floats, matched: Correspondences2D3D) -> Floats:
-    """Reprojection errors (n,) under a pose of the unit; infinite behind a camera."""
+    """Reprojection errors (n,) under a pose of the unit; infinite where a camera shows nothing."""
     views = CameraViews.from_keypoints(mapper, matched.camera, matched.band)
     eye_from_world = se3.inverse(world_from_rig @ views.rig_from_view)
     errors = np.full(len(matched.camera), np.inf)
-    for c, camera in enumerate(cameras_of(mapper)):
+    for c, (kind, params) in enumerate(zip(mapper.camera_kind, mapper.state.camera_params, strict=True)):
         rows = np.flatnonzero(matched.camera == c)
         if mapper.state.simultaneous:
             points = se3.apply(eye_from_world[c], matched.points_m[rows])
         else:
             points = se3.apply(eye_from_world[views.index[rows]], matched.points_m[rows, None])[:, 0]
-        front = points[:, 2] > 1e-3
-        pixels = camera.img_from_cam(points[front])
-        errors[rows[front]] = np.linalg.norm(pixels - matched.xy_px[rows[front]], axis=1)
+        errors[rows] = np.linalg.norm(project_points(int(kind), params, points) - matched.xy_px[rows], axis=1)
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
@@ -333,13 +330,15 @@ def camera_votes(mapper: Mapper, matched: Correspondences2D3D) -> list[Vote]:
     votes = []
     rig_from_view = _rig_from_cameras(mapper, matched)
     gates_px, options = widest_gates_px(mapper), pycolmap.AbsolutePoseEstimationOptions()
-    for c, camera in enumerate(cameras_of(mapper)):
-        rows = np.flatnonzero(matched.camera == c)
+    cameras = cameras_of(mapper)
+    xy_px, usable = cameras.pixels(matched.camera, matched.xy_px)
+    for c, camera in enumerate(cameras.cameras):
+        rows = np.flatnonzero((matched.camera == c) & usable)
         if len(rows) < MIN_CAMERA_MATCHES:
             continue
         options.ransac = _ransac(mapper, float(gates_px[c]))
         result = pycolmap.estimate_and_refine_absolute_pose(
-            matched.xy_px[rows], matched.points_m[rows], camera, estimation_options=options
+            xy_px[rows], matched.points_m[rows], camera, estimation_options=options
         )
         if result is None or result["num_inliers"] < MIN_CAMERA_INLIER_RATIO * len(rows):
             continue

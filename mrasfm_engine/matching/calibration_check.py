@@ -11,10 +11,10 @@ from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.geometry.colmap_cameras import MIN_FORWARD
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.verification import (
-    MIN_FORWARD,
     epipolar_errors,
     essential_inliers,
     in_front_of_both,

@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.colmap_cameras import MIN_FORWARD
 from mrasfm_engine.types import Bools, Floats
 
-MIN_FORWARD = 0.15  # z of a unit ray below which a pinhole's plane coordinates explode (81 degrees off axis)
+WIDE = 0.5  # z of a unit ray 60 degrees off axis: beyond it, an error counts over four times in the plane z = 1
+REFINEMENTS = 3
 CONFIDENCE = 0.9999
 MIN_RANSAC_MATCHES = 8
 
@@ -16,22 +18,86 @@ MIN_RANSAC_MATCHES = 8
 def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bools:
     """Return which matches (n,) agree with one essential matrix found by RANSAC.
 
+    Views of less than 120 degrees are judged in the plane z = 1. There an error at the rim of a wider view is tens of
+    times what it is at its centre: RANSAC works in planes turned towards the matches, and then all rays are judged by
+    their angles.
+
     Parameters
     ----------
     rays_a, rays_b
         Unit viewing rays (n, 3) in camera axes.
     max_error
-        Distance from the epipolar line in the plane z = 1 (pixels over focal length).
+        Distance from the epipolar line in the plane z = 1 (pixels over focal length), of wide views in radians.
     """
+    if len(rays_a) and min(rays_a[:, 2].min(), rays_b[:, 2].min()) < WIDE:
+        return _wide_inliers(rays_a, rays_b, max_error)
+    return _plane_inliers(rays_a, rays_b, max_error)[0]
+
+
+def _plane_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> tuple[Bools, Floats | None]:
+    """Inliers (n,) by their distances in the plane z = 1, and the essential matrix if there is one."""
     inliers = np.zeros(len(rays_a), dtype=np.bool_)
     usable = np.flatnonzero((rays_a[:, 2] > MIN_FORWARD) & (rays_b[:, 2] > MIN_FORWARD))
     if len(usable) < MIN_RANSAC_MATCHES:
-        return inliers
+        return inliers, None
     a, b = rays_a[usable, :2] / rays_a[usable, 2:], rays_b[usable, :2] / rays_b[usable, 2:]
     essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, CONFIDENCE, max_error)
-    if essential is not None and essential.shape == (3, 3):
-        inliers[usable] = mask.ravel() > 0
-    return inliers
+    if essential is None or essential.shape != (3, 3):
+        return inliers, None
+    inliers[usable] = mask.ravel() > 0
+    return inliers, np.asarray(essential, dtype=np.float64)
+
+
+def _wide_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> Bools:
+    """Inliers (n,) of wide views by their angles from the epipolar planes."""
+    turn_a, turn_b = _towards(rays_a), _towards(rays_b)
+    turned_a, turned_b = rays_a @ turn_a.T, rays_b @ turn_b.T
+    best = np.zeros(len(rays_a), dtype=np.bool_)
+    central = (turned_a[:, 2] > WIDE) & (turned_b[:, 2] > WIDE)
+    for rows in (np.flatnonzero(central), np.arange(len(rays_a))):
+        _, essential = _plane_inliers(turned_a[rows], turned_b[rows], max_error)
+        if essential is None:
+            continue
+        inliers = _angles(essential, turned_a, turned_b) < max_error
+        for _ in range(REFINEMENTS):
+            if inliers.sum() < MIN_RANSAC_MATCHES:
+                break
+            refined = _angles(_linear_essential(turned_a[inliers], turned_b[inliers]), turned_a, turned_b) < max_error
+            if refined.sum() <= inliers.sum():
+                break
+            inliers = refined
+        if inliers.sum() > best.sum():
+            best = inliers
+    return best
+
+
+def _towards(rays: Floats) -> Floats:
+    """A rotation (3, 3) that turns the mean of rays (n, 3) to the z axis."""
+    mean = rays.mean(axis=0)
+    mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    axis, cosine = np.cross(mean, [0.0, 0.0, 1.0]), mean[2]
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.eye(3)
+    result: Floats = se3.exp_so3(axis / sine * np.arctan2(sine, cosine))
+    return result
+
+
+def _angles(essential: Floats, rays_a: Floats, rays_b: Floats) -> Floats:
+    """Sampson distances (n,) in radians of rays from an essential matrix."""
+    normal_b, normal_a = rays_a @ essential.T, rays_b @ essential
+    length = np.sqrt((normal_a**2).sum(1) + (normal_b**2).sum(1))
+    result: Floats = np.abs((normal_b * rays_b).sum(1)) / np.maximum(length, 1e-12)
+    return result
+
+
+def _linear_essential(rays_a: Floats, rays_b: Floats) -> Floats:
+    """The essential matrix nearest to what solves all equations b' E a = 0 [Hartley and Zisserman, 11.1]."""
+    equations = (rays_b[:, :, None] * rays_a[:, None, :]).reshape(len(rays_a), 9)
+    _, vectors = np.linalg.eigh(equations.T @ equations)
+    u, _, vt = np.linalg.svd(vectors[:, 0].reshape(3, 3))
+    result: Floats = u @ np.diag([1.0, 1.0, 0.0]) @ vt
+    return result
 
 
 def epipolar_errors(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Floats:

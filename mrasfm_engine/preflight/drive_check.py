@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.heights import ellipsoidal_heights
 from mrasfm_engine.preflight.image_files import check_images
+from mrasfm_engine.preflight.lenses import lens_findings
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import CountProgress
 from schemas import DriveManifest
@@ -50,8 +51,8 @@ def check_drive(drive: Drive, *, use_gnss: bool = True, progress: CountProgress 
 
 
 def check_manifest_here(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Finding]:
-    """List the findings of `check_manifest`, and of GNSS heights that this machine cannot convert."""
-    found = check_manifest(manifest, use_gnss=use_gnss)
+    """List the findings of `check_manifest`, of lenses, and of GNSS heights that this machine cannot convert."""
+    found = [*check_manifest(manifest, use_gnss=use_gnss), *lens_findings(manifest)]
     if use_gnss and manifest.gnss is not None:
         try:
             ellipsoidal_heights(manifest.gnss)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import PARAMETERS
 from mrasfm_engine.types import Floats, Ints
 
 
@@ -22,11 +23,15 @@ class State:
     unit_position_m: Floats  # (u, 3)
     camera_rotation: Floats  # (c, 3, 3) of rig_from_cam
     camera_position_m: Floats  # (c, 3)
-    camera_params: Floats  # (c, 8), see geometry.camera_model
+    camera_params: Floats  # (c, PARAMETERS), see geometry.camera_model
     points_m: Floats  # (p, 3)
     camera_time_offset_s: Floats  # (c,) by how much later than their timestamps a camera's images were taken
     band_rotation: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (s, 3, 3) of unit_from_band
     band_position_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (s, 3)
+
+    def __post_init__(self) -> None:
+        if self.camera_params.shape[1:] != (PARAMETERS,):  # compiled functions would read beyond its end
+            raise ValueError(f"camera_params {self.camera_params.shape} do not have {PARAMETERS} numbers a camera")
 
     @property
     def world_from_rig(self) -> Floats:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.errors import CancelledError, ReconstructionError
+from mrasfm_engine.export.colmap import approximations
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
@@ -31,7 +32,7 @@ def scene(
     run.begin(Stage.REFINEMENT)
     result, findings, report = _refined(run, mapper, found, pairs, known)
     return_freed_memory()
-    run.report["findings"] += findings
+    run.report["findings"] += findings + [as_json(finding) for finding in approximations(result)]
     run.report["stages"].append(report)
     run.progress(Stage.REFINEMENT, 1, 1)
     return result

@@ -54,7 +54,12 @@ class Shot:
 
 
 def render_drives(
-    options: SynthOptions, out: Path, *, force: bool = False, progress: CountProgress | None = None
+    options: SynthOptions,
+    out: Path,
+    *,
+    force: bool = False,
+    rig: list[TrueCamera] | None = None,
+    progress: CountProgress | None = None,
 ) -> list[Path]:
     """Render one world's drives.
 
@@ -67,6 +72,8 @@ def render_drives(
         everything is written, and not at all when something goes wrong.
     force
         Replace what is there.
+    rig
+        Cameras in the place of the arrangement that the options ask for.
     progress
         Called with the number of images done and of all.
 
@@ -89,7 +96,7 @@ def render_drives(
         partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
         partial.chmod(0o755)
         names = ["."] if options.drives == 1 else [f"drive_{k}" for k in range(options.drives)]
-        _render_into([partial / name for name in names], options, progress)
+        _render_into([partial / name for name in names], options, rig, progress)
         _replace(partial, out)
     except OSError as error:
         raise StorageError(
@@ -111,10 +118,12 @@ def _replace(partial: Path, out: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _render_into(folders: list[Path], options: SynthOptions, progress: CountProgress | None) -> None:
+def _render_into(
+    folders: list[Path], options: SynthOptions, rig: list[TrueCamera] | None, progress: CountProgress | None
+) -> None:
     # Each topic has its own stream of random numbers, so that an option changes nothing but its own topic.
     world = build_world(options, np.random.default_rng([options.seed, 0]))
-    rig = true_cameras(
+    rig = rig or true_cameras(
         options.cameras,
         width=options.width,
         height=options.height,

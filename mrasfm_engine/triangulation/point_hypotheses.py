@@ -34,7 +34,7 @@ class Views(NamedTuple):
     time_s: Floats  # (bands,)
     is_posed: Bools  # (bands,)
     kind: Ints  # (cameras,)
-    params: Floats  # (cameras, 8)
+    params: Floats  # (cameras, PARAMETERS)
     sigma_px: Floats  # (cameras,) standard deviation of an image coordinate
 
 
@@ -99,11 +99,10 @@ def _linearise(count: int, unknowns: int, p: Any, sight: Any, views: Any, loss: 
         x = r[k, 0, 0] * q0 + r[k, 0, 1] * q1 + r[k, 0, 2] * q2
         y = r[k, 1, 0] * q0 + r[k, 1, 1] * q1 + r[k, 1, 2] * q2
         z = r[k, 2, 0] * q0 + r[k, 2, 1] * q1 + r[k, 2, 2] * q2
-        if z < 1e-3:
+        c = sight.camera[m]
+        if not project(views.kind[c], views.params[c], x, y, z, work, out):
             total += BEHIND
             continue
-        c = sight.camera[m]
-        project(views.kind[c], views.params[c], x, y, z, work, out)
         per_px = 1.0 / views.sigma_px[c]
         r0, r1 = (out[0] - sight.xy_px[m, 0]) * per_px, (out[1] - sight.xy_px[m, 1]) * per_px
         squared = r0 * r0 + r1 * r1
@@ -139,13 +138,12 @@ def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views
     for m in range(count):
         k, c = sight.band[m], sight.camera[m]
         dx, dy, dz = x - offset[m, 0], y - offset[m, 1], z - offset[m, 2]
-        ahead = r[k, 2, 0] * dx + r[k, 2, 1] * dy + r[k, 2, 2] * dz
-        if ahead < 1e-3:
-            return np.inf
-        project(
+        if not project(
             views.kind[c], views.params[c], r[k, 0, 0] * dx + r[k, 0, 1] * dy + r[k, 0, 2] * dz,
-            r[k, 1, 0] * dx + r[k, 1, 1] * dy + r[k, 1, 2] * dz, ahead, scratch.work, out,
-        )  # fmt: skip
+            r[k, 1, 0] * dx + r[k, 1, 1] * dy + r[k, 1, 2] * dz, r[k, 2, 0] * dx + r[k, 2, 1] * dy + r[k, 2, 2] * dz,
+            scratch.work, out,
+        ):  # fmt: skip
+            return np.inf
         squared = ((out[0] - sight.xy_px[m, 0]) ** 2 + (out[1] - sight.xy_px[m, 1]) ** 2) / views.sigma_px[c] ** 2
         total += loss2 * math.log(1.0 + squared / loss2)
     return total

@@ -21,18 +21,19 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_HYPOTHESES = 24  # pairs of rays tried a track
 MAX_OBSERVATIONS = 256  # of a track that are looked at
-MIN_DEPTH_M = 0.05
+MIN_DISTANCE_M = 0.05
 ALL_SHOTS = 4096  # up to so many, the poses of all are computed at once; rolling shutters have hundreds a unit
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, work: Any, proj: Any) -> Any:
-    """Squared reprojection error of x under cam_from_world (r, t); huge behind the camera."""
+    """Squared reprojection error of x under cam_from_world (r, t); huge where it is not seen."""
     for i in range(3):
         cam[i] = r[i, 0] * x[0] + r[i, 1] * x[1] + r[i, 2] * x[2] + t[i]
-    if cam[2] < 0.05:
+    if cam[0] * cam[0] + cam[1] * cam[1] + cam[2] * cam[2] < MIN_DISTANCE_M * MIN_DISTANCE_M:
         return 1e12
-    project(kind, params, cam[0], cam[1], cam[2], work, proj)
+    if not project(kind, params, cam[0], cam[1], cam[2], work, proj):
+        return 1e12
     return (proj[0] - xy[0]) ** 2 + (proj[1] - xy[1]) ** 2
 
 
@@ -134,7 +135,7 @@ def _triangulate(
                 if det < 1e-12:
                     continue
                 si, sj = (pi - c * pj) / det, (c * pi - pj) / det
-                if si < MIN_DEPTH_M or sj < MIN_DEPTH_M:
+                if si < MIN_DISTANCE_M or sj < MIN_DISTANCE_M:
                     continue
                 for q in range(3):
                     x[q] = 0.5 * (origin[i, q] + si * direction[i, q] + origin[j, q] + sj * direction[j, q])

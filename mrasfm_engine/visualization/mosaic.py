@@ -134,7 +134,6 @@ class MosaicPainter:
                 np.zeros((2, 2)) if self._own_car_m is None else self._own_car_m,
                 view.kind,
                 view.params,
-                placed.widest,
                 view.gain,
                 view.camera + 1,
                 placed.heights_m,
@@ -190,7 +189,7 @@ def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: fl
 @njit(cache=True, nogil=True)
 def _paint(
     rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, centre: Any, rig_from_plan: Any, own_car: Any,
-    kind: int, params: Any, widest: float, gain: Any, camera: int, heights: Any, place: Any, bounds: Any,
+    kind: int, params: Any, gain: Any, camera: int, heights: Any, place: Any, bounds: Any,
     owner: Any, score: Any, color: Any,
 ) -> int:  # fmt: skip
     """Colour the cells that the image sees better than what is there; how many."""
@@ -214,8 +213,8 @@ def _paint(
             if layer < 0:
                 continue
             if not find_pixel(
-                rgb, usable, has_mask, cam_from_plan[1], rig_from_plan, own_car, kind, params[1], widest, x, y, z, dx,
-                dy, above, work, pixel,
+                rgb, usable, has_mask, cam_from_plan[1], rig_from_plan, own_car, kind, params[1], x, y, z, dx, dy,
+                above, work, pixel,
             ):  # fmt: skip
                 continue
             u, v = pixel[0], pixel[1]
@@ -230,8 +229,7 @@ def _paint(
             m = cam_from_plan[0]
             for i in range(3):
                 cam[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
-            if cam[2] > 1e-3:
-                project(kind, params[0], cam[0], cam[1], cam[2], work, pixel)
+            if project(kind, params[0], cam[0], cam[1], cam[2], work, pixel):
                 sample(rgb, pixel[0], pixel[1], gain, color[0, layer, row, column])
             painted += 1
     return painted

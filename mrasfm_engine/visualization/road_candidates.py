@@ -110,7 +110,6 @@ class Shot:
             np.zeros((2, 2)) if self.own_car_m is None else self.own_car_m,
             self.view.kind,
             self.view.params[REFINED],
-            self.placed.widest,
             self.placed.heights_m,
             self.placed.first_m,
         )
@@ -169,7 +168,7 @@ def log_ratios(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float, 
 @njit(cache=True, nogil=True)
 def _add(
     rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
-    own_car: Any, kind: int, params: Any, widest: float, heights: Any, first: Any, gain: Any, place: int, cell: float,
+    own_car: Any, kind: int, params: Any, heights: Any, first: Any, gain: Any, place: int, cell: float,
     first_row: int, first_column: int, bounds: Any, count: Any, color: Any, quality: Any, places: Any,
 ) -> int:  # fmt: skip
     """Offer the view to every cell; to how many it is added."""
@@ -205,7 +204,7 @@ def _add(
             if s <= beaten:
                 continue
             if not find_pixel(
-                rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, widest, x, y, z, dx, dy,
+                rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, x, y, z, dx, dy,
                 above, work, pixel,
             ):  # fmt: skip
                 continue
@@ -238,7 +237,7 @@ def _add(
 @njit(cache=True, nogil=True)
 def _ratios(
     rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
-    own_car: Any, kind: int, params: Any, widest: float, heights: Any, first: Any, gain: Any, cell: float,
+    own_car: Any, kind: int, params: Any, heights: Any, first: Any, gain: Any, cell: float,
     first_row: int, first_column: int, bounds: Any, count: Any, color: Any, quality: Any, found: Any,
 ) -> int:  # fmt: skip
     """Compare the view with the best one of every few cells; of how many."""
@@ -259,7 +258,7 @@ def _ratios(
             if hidden[round(middle + dy / STEP_M), round(middle + dx / STEP_M)]:
                 continue
             if not find_pixel(
-                rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, widest, x, y, z, dx, dy,
+                rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, x, y, z, dx, dy,
                 above, work, pixel,
             ):  # fmt: skip
                 continue

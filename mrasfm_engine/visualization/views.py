@@ -35,7 +35,7 @@ class View:
 
     camera: int
     plan_from_cam: Floats
-    params: Floats  # (2, 8) as given and as refined
+    params: Floats  # (2, PARAMETERS) as given and as refined
     kind: int
     size_px: tuple[int, int]  # width, height
     plan_from_rig: Floats  # (4, 4)
@@ -86,21 +86,6 @@ def _read_ahead(count: int, read: Read) -> Iterator[tuple[int, Bytes, Bools | No
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def widest_angle(kind: int, params: Floats, size_px: tuple[int, int]) -> float:
-    """Tangent of the largest angle between the axis and a pixel of the image's border.
-
-    Beyond it distortion polynomials fold back, and points far outside the view seem to lie inside.
-    """
-    width, height = size_px
-    u, v = np.linspace(0, width, 17), np.linspace(0, height, 17)
-    border = np.concatenate(
-        [np.column_stack([u, np.full(17, e)]) for e in (0, height)]
-        + [np.column_stack([np.full(17, e), v]) for e in (0, width)]
-    )
-    rays = unproject_pixels(kind, params, border)
-    return float((np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(rays[:, 2], 1e-3)).max())
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlacedView:
     """A view above the ground that it may see.
@@ -111,8 +96,6 @@ class PlacedView:
         (2, 3, 4) as given and as refined.
     rig_from_plan
         (2, 4): x and y only.
-    widest
-        See `widest_angle`.
     heights_m, first_m
         Heights of the ground around the camera, and x and y (2,) of the first one; see `GroundTiles.around`.
     above_ground_m
@@ -124,7 +107,6 @@ class PlacedView:
     cam_from_plan: Floats
     rig_from_plan: Floats
     centre_m: Floats
-    widest: float
     heights_m: Floats
     first_m: Floats
     above_ground_m: float
@@ -143,7 +125,6 @@ def place_view(view: View, ground: GroundTiles, *, margin_m: float = 0.0) -> Pla
         cam_from_plan=np.ascontiguousarray(se3.inverse(view.plan_from_cam)[:, :3]),
         rig_from_plan=np.ascontiguousarray(se3.inverse(view.plan_from_rig)[:2]),
         centre_m=centre,
-        widest=widest_angle(view.kind, view.params[REFINED], view.size_px),
         heights_m=heights,
         first_m=first,
         above_ground_m=float(centre[2] - height_at(heights, *(centre[:2] - first))),
@@ -193,7 +174,7 @@ def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -
 @njit(cache=True, inline="always")
 def find_pixel(
     rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, rig_from_plan: Any, own_car: Any, kind: int,
-    params: Any, widest: float, x: float, y: float, z: float, dx: float, dy: float, above: float, work: Any,
+    params: Any, x: float, y: float, z: float, dx: float, dy: float, above: float, work: Any,
     pixel: Any,
 ) -> bool:  # fmt: skip
     """Find the pixel that shows a place; False where none does."""
@@ -201,9 +182,8 @@ def find_pixel(
     a = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
     b = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
     c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    if c < 1e-3 or a * a + b * b > (widest * c) ** 2:
+    if not project(kind, params, a, b, c, work, pixel):
         return False
-    project(kind, params, a, b, c, work, pixel)
     if not (0.0 <= pixel[0] < rgb.shape[1] and 0.0 <= pixel[1] < rgb.shape[0]):
         return False
     if has_mask and not usable[int(pixel[1]), int(pixel[0])]:

@@ -25,6 +25,7 @@ import pycolmap
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import PERSPECTIVE, packed
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.synthetic.simulate import SimulatedObservations, simulate_observations
 from tests.benchmarks.commands import CommandFailed
@@ -141,7 +142,7 @@ def _start(
         unit_position_m=shifted(world_from_rig[:, :3, 3], START["unit_m"]),
         camera_rotation=turned(rig_from_cam[:, :3, :3], START["camera_deg"]),
         camera_position_m=shifted(rig_from_cam[:, :3, 3], START["camera_m"]),
-        camera_params=np.concatenate([camera_params, np.zeros((len(camera_params), 4))], axis=1),
+        camera_params=np.stack([packed(PERSPECTIVE, own)[1] for own in camera_params]),
         camera_time_offset_s=np.zeros(len(camera_params)),
         points_m=shifted(points_m, START["point_m"]),
     )

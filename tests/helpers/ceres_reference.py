@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, Termination
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
+from mrasfm_engine.geometry.camera_model import ADJUSTED, FISHEYE, PERSPECTIVE, RADIAL
 from mrasfm_engine.scene.state import State
 
 Floats = NDArray[np.float64]
@@ -299,7 +299,7 @@ def _camera(problem: Problem, camera: int, camera_id: int) -> pycolmap.Camera:
     kind, params = int(problem.camera_kind[camera]), problem.state.camera_params[camera]
     one_focal = problem.layout.free_intrinsics[:, 0].any() and problem.layout.camera_slot[camera] >= 0
     model, terms = (ONE_FOCAL_MODEL if one_focal else MODEL)[kind]
-    if one_focal and (params[0] != params[1] or params[4 + terms :].any()):
+    if one_focal and (params[0] != params[1] or params[4 + terms : ADJUSTED].any()):
         raise ValueError(
             f"camera {camera}: COLMAP varies one focal length only where fx = fy, and with {terms} terms of radial "
             "distortion at most"

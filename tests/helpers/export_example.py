@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from mrasfm_engine.geometry import geodesy, se3
+from mrasfm_engine.geometry.camera_model import pack_camera, project_points
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
 from mrasfm_engine.scene.road_relief import Relief
@@ -34,8 +35,17 @@ RIG_FROM_FORWARD_CAM = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 MODELS = {"PINHOLE": [800.0, 810.0, 480.0, 300.0], "OPENCV": [700.0, 705.0, 470.0, 310.0, -0.05, 0.01, 1e-3, -5e-4]}
 
 
-def make_scene(*, georeferenced: bool = True, folder: str = "images", moving: bool = False) -> Scene:
-    """Two cameras, five units of which one is missing, and points projected exactly by pycolmap.
+FOREIGN_MODEL = {"MEI": [1400.0, 1410.0, 470.0, 310.0, 0.01, 0.5, 1e-3, -5e-4, 1.1]}  # which COLMAP does not have
+
+
+def make_scene(
+    *,
+    georeferenced: bool = True,
+    folder: str = "images",
+    moving: bool = False,
+    models: Mapping[str, list[float]] = MODELS,
+) -> Scene:
+    """Two cameras, five units of which one is missing, and points projected exactly.
 
     `moving`: the images of a unit are not taken at one time.
     """
@@ -45,8 +55,8 @@ def make_scene(*, georeferenced: bool = True, folder: str = "images", moving: bo
         for yaw, y in ((0.1, 0.5), (-0.1, -0.5))
     ]
     cameras = [
-        Camera(name=name, model=model, width=960, height=600, params=MODELS[model], rig_from_cam=pose_from_matrix(pose))
-        for name, model, pose in zip(("left", "right"), MODELS, given, strict=True)
+        Camera(name=name, model=model, width=960, height=600, params=models[model], rig_from_cam=pose_from_matrix(pose))
+        for name, model, pose in zip(("left", "right"), models, given, strict=True)
     ]
     frames = [
         Frame(
@@ -88,10 +98,8 @@ def make_scene(*, georeferenced: bool = True, folder: str = "images", moving: bo
             places = rng.permutation(len(xy))[:POINTS]
             world_from_image = world_from_rig[image.unit] @ unit_from_image[i]
             cam_from_world = se3.inverse(world_from_image @ calibration[image.camera].rig_from_cam)
-            model = pycolmap.Camera(
-                model=cameras[image.camera].model, width=960, height=600, params=calibration[image.camera].params
-            )
-            xy[places] = model.img_from_cam(se3.apply(cam_from_world, points))
+            lens = pack_camera(cameras[image.camera].model, calibration[image.camera].params)
+            xy[places] = project_points(*lens, se3.apply(cam_from_world, points))
             rows += [(p, i, k) for p, k in enumerate(places)]
         features.append(
             ImageFeatures(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import PERSPECTIVE, project_points
+from mrasfm_engine.geometry.camera_model import PERSPECTIVE, packed, project_points
 from tests.helpers.simulated_drive import SimulatedDrive, random_descriptors
 
 SIZE_M = (4.4, 1.8, 1.5)
@@ -39,7 +39,7 @@ def with_cars(
         for c, (car, body) in enumerate(zip(cars, bodies, strict=True)):
             shift = np.array([*car.place_m, 0.0]) + time_s[image.unit] * np.array([*car.velocity_m_s, 0.0])
             in_camera = se3.apply(cam_from_world, se3.apply(first, body + shift))
-            params = np.array([*truth.camera_params[image.camera], 0, 0, 0, 0])
+            params = packed(PERSPECTIVE, truth.camera_params[image.camera])[1]
             pixels = project_points(PERSPECTIVE, params, in_camera)
             inside = np.flatnonzero(((pixels > 0) & (pixels < [width, height])).all(1) & (in_camera[:, 2] > 1.0))
             xy.append(pixels[inside] + rng.normal(0, noise_px, (len(inside), 2)))

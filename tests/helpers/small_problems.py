@@ -13,7 +13,15 @@ from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, Layout, Observat
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL, project_points
+from mrasfm_engine.geometry.camera_model import (
+    FISHEYE,
+    OMNIDIRECTIONAL,
+    PERSPECTIVE,
+    RADIAL,
+    RATIONAL,
+    packed,
+    project_points,
+)
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.synthetic.simulate import SimulatedObservations, simulate_observations
 
@@ -21,7 +29,10 @@ DISTORTION = {
     PERSPECTIVE: [0.0, 0.0, 0.0, 0.0],
     RADIAL: [-0.05, 0.01, 0.0006, -0.0004],
     FISHEYE: [0.02, -0.008, 0.002, -0.0005],
+    RATIONAL: [-0.2, 0.05, 0.0006, -0.0004],
+    OMNIDIRECTIONAL: [-0.05, 0.01, 0.0006, -0.0004],
 }
+REST = {RATIONAL: [0.01, -0.1, 0.02, 0.003], OMNIDIRECTIONAL: [1.8]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,17 +71,21 @@ def make_case(
         straight=straight,
         rng=rng,
     )
+    kind = np.zeros(cameras, dtype=np.int64) if kinds is None else np.array(kinds, dtype=np.int64)
     truth = State(
         unit_rotation=np.ascontiguousarray(sim.world_from_rig[:, :3, :3]),
         unit_position_m=np.ascontiguousarray(sim.world_from_rig[:, :3, 3]),
         camera_rotation=np.ascontiguousarray(sim.rig_from_cam[:, :3, :3]),
         camera_position_m=np.ascontiguousarray(sim.rig_from_cam[:, :3, 3]),
-        camera_params=np.concatenate([sim.camera_params, np.zeros((cameras, 4))], axis=1),
+        camera_params=np.stack(
+            [
+                packed(k, [*of_camera, *DISTORTION[k]], REST.get(k, ()))[1]
+                for k, of_camera in zip(kind.tolist(), sim.camera_params, strict=True)
+            ]
+        ),
         camera_time_offset_s=np.zeros(cameras),
         points_m=sim.points_m.copy(),
     )
-    kind = np.zeros(cameras, dtype=np.int64) if kinds is None else np.array(kinds, dtype=np.int64)
-    truth.camera_params[:, 4:] = [DISTORTION[int(k)] for k in kind]
     order = np.argsort(sim.point, kind="stable")
     unit, camera, point = (a[order].astype(np.int64) for a in (sim.unit, sim.camera, sim.point))
     xy = sim.xy_px[order] if kinds is None else project(truth, kind, unit, camera, point)
@@ -103,7 +118,7 @@ def with_focal(layout: Layout, free: bool) -> Layout:
 
 def focal_prior(params: np.ndarray, sigma: np.ndarray) -> IntrinsicsPrior:
     """A prior of focal lengths, with sigmas (cameras,) relative to them, and of no other intrinsics."""
-    every = np.full(params.shape, np.inf)
+    every = np.full((len(params), INTRINSICS), np.inf)
     every[:, 0] = sigma
     return IntrinsicsPrior(params=params.copy(), sigma=every)
 

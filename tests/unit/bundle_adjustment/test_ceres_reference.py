@@ -23,7 +23,7 @@ from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
+from mrasfm_engine.geometry.camera_model import ADJUSTED, FISHEYE, PERSPECTIVE, RADIAL
 from mrasfm_engine.scene.state import State
 from tests.helpers.ceres_reference import CeresProblem, solve_with_ceres
 from tests.helpers.small_problems import focal_prior, make_case, perturbed, project
@@ -48,7 +48,7 @@ def problem_at_truth(
     o, kind = case.problem.observations, case.problem.camera_kind
     if free_focal:  # what COLMAP has models for: fx = fy, two terms of radial distortion
         case.truth.camera_params[:, 1] = case.truth.camera_params[:, 0]
-        case.truth.camera_params[:, 6:] = 0.0
+        case.truth.camera_params[:, 6:ADJUSTED] = 0.0
     xy_px = project(case.truth, kind, o.unit, o.camera, o.point)
     xy_px += rng.normal(scale=TIGHT.sigma_px, size=xy_px.shape)
     wrong = rng.random(len(xy_px)) < outliers

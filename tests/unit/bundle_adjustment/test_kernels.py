@@ -26,7 +26,7 @@ from mrasfm_engine.bundle_adjustment.problem import (
 )
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, RADIAL
+from mrasfm_engine.geometry.camera_model import FISHEYE, OMNIDIRECTIONAL, PERSPECTIVE, RADIAL, RATIONAL, packed
 from mrasfm_engine.geometry.local_motion import local_motion
 from mrasfm_engine.scene.state import State
 from tests.helpers.small_problems import (
@@ -49,11 +49,11 @@ def case_of_all_kinds(seed: int = 0, *, free_intrinsics: bool = False) -> tuple[
     """
     case = make_case(
         units=3,
-        cameras=3,
+        cameras=5,
         points=90,
-        kinds=[RADIAL if free_intrinsics else PERSPECTIVE, RADIAL, FISHEYE],
+        kinds=[RADIAL if free_intrinsics else PERSPECTIVE, RADIAL, FISHEYE, RATIONAL, OMNIDIRECTIONAL],
         free_units=[False, True, True],
-        free_cameras=[True, True, True],
+        free_cameras=[True] * 5,
         free_focal=True,
         free_intrinsics=free_intrinsics,
         seed=seed,
@@ -64,7 +64,7 @@ def case_of_all_kinds(seed: int = 0, *, free_intrinsics: bool = False) -> tuple[
         case.truth,
         rng,
         units=[1, 2],
-        cameras=[0, 1, 2],
+        cameras=range(5),
         unit_deg=0.05,
         unit_m=0.01,
         camera_deg=0.05,
@@ -387,7 +387,7 @@ def test_a_point_of_very_many_units_is_still_right() -> None:
         unit_position_m=position,
         camera_rotation=camera_rotation,
         camera_position_m=np.zeros((1, 3)),
-        camera_params=np.array([[500.0, 500, 480, 270, 0, 0, 0, 0]]),
+        camera_params=packed(PERSPECTIVE, [500.0, 500, 480, 270])[1][None],
         camera_time_offset_s=np.zeros(1),
         points_m=np.array([[20.0, 3.0, 1.0]]),
     )

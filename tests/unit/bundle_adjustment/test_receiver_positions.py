@@ -10,6 +10,7 @@ from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.receiver_positions import MAX_KNOTS, ReceiverPositions
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import PARAMETERS
 from mrasfm_engine.scene.state import State
 
 UNITS, WANDER_TIME_S = 12, 30.0
@@ -29,7 +30,7 @@ def moving(rng: np.random.Generator) -> State:
         unit_position_m=np.cumsum(np.array([2.0, 0.0, 0.0]) + rng.normal(size=(UNITS, 3)), axis=0),
         camera_rotation=np.eye(3)[None],
         camera_position_m=np.zeros((1, 3)),
-        camera_params=np.ones((1, 8)),
+        camera_params=np.ones((1, PARAMETERS)),
         points_m=np.zeros((0, 3)),
         camera_time_offset_s=np.zeros(1),
     )

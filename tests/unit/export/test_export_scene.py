@@ -19,6 +19,7 @@ import pytest
 from mrasfm_engine.errors import MrasfmError, StorageError
 from mrasfm_engine.export import comparisons, feature_database, picture_files, ply, publishing, readers
 from mrasfm_engine.export.calibration import calibration_document, document_in_map
+from mrasfm_engine.export.colmap import approximations, colmap_models
 from mrasfm_engine.export.feature_database import write_features, write_matches
 from mrasfm_engine.export.pose_files import poses_document
 from mrasfm_engine.export.scene import write_scene
@@ -32,8 +33,10 @@ from schemas.drive import MAX_IMAGE_SIDE_PX
 from tests.helpers.export_example import (
     EXTRA_KEYPOINTS,
     FILES,
+    FOREIGN_MODEL,
     MISSING_IMAGE,
     MISSING_UNIT,
+    MODELS,
     POINTS,
     UNITS,
     assert_nothing_published,
@@ -81,6 +84,29 @@ def test_colmap_reads_the_model_and_its_points_project_onto_their_keypoints(
     assert 0 < max(errors) < 1e-3  # the keypoints are float32
     model.update_point_3d_errors()
     assert 0 < model.compute_mean_reprojection_error() < 1e-4
+
+
+def test_a_camera_that_colmap_does_not_have_is_written_as_its_nearest_model(tmp_path: Path) -> None:
+    scene = make_scene(models={"PINHOLE": MODELS["PINHOLE"], **FOREIGN_MODEL})
+    write_scene(scene, tmp_path / "scene", {})
+    (finding,) = approximations(scene)
+    off_px = colmap_models(scene)[1].error_px
+    assert finding.code == "colmap-model-approximate"
+    assert "camera right as OPENCV_FISHEYE" in finding.what
+    assert f"{off_px:.2g} px" in finding.what
+    assert 0.0 < off_px < 2.0
+    model = pycolmap.Reconstruction(str(tmp_path / "scene" / "model"))
+    assert [model.cameras[k].model.name for k in (1, 2)] == ["PINHOLE", "OPENCV_FISHEYE"]
+    errors_px = []
+    for image in model.images.values():
+        if image.camera_id == 2:
+            seen = [(point.xy, model.points3D[point.point3D_id].xyz) for point in image.points2D if point.has_point3D()]
+            errors_px += [np.linalg.norm(image.project_point(xyz) - xy) for xy, xyz in seen]
+    assert len(errors_px) > 50
+    assert 0.0 < max(errors_px) < off_px + 1e-3  # keypoints are floats
+    calibration = json.loads((tmp_path / "scene" / "calibration.json").read_text())
+    assert calibration["cameras"]["right"]["model"] == "MEI"
+    assert calibration["cameras"]["right"]["param_names"][-1] == "xi"
 
 
 def test_images_that_are_not_simultaneous_are_frames_of_their_own(tmp_path: Path) -> None:

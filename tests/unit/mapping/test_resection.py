@@ -66,7 +66,7 @@ def test_the_information_of_a_pose_is_that_of_its_pixels_derivatives() -> None:
     def pixels(step: np.ndarray) -> np.ndarray:
         moved_pose = se3.transform(se3.exp_so3(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:])
         result = np.empty((len(matched.camera), 2))
-        for c, camera in enumerate(cameras_of(mapper)):
+        for c, camera in enumerate(cameras_of(mapper).cameras):
             rows = matched.camera == c
             cam_from_world = se3.inverse(moved_pose @ state.rig_from_cam[c])
             result[rows] = camera.img_from_cam(se3.apply(cam_from_world, matched.points_m[rows]))

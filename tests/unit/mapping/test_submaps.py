@@ -11,6 +11,7 @@ import pytest
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import PARAMETERS
 from mrasfm_engine.mapping.components import Component, DriveMapping, begin_mapping
 from mrasfm_engine.mapping.submaps import Part, in_common_frames, join, part_arrays, part_from_arrays
 from mrasfm_engine.scene.scene import PairMatches
@@ -41,7 +42,7 @@ def a_part(simulated: SimulatedDrive, units: Sequence[int], *, observations: int
         units=rows,
         world_from_rig=simulated.world_from_rig[rows],
         rig_from_cam=simulated.drive.rig_from_cam,
-        camera_params=np.zeros((4, 8)),
+        camera_params=np.zeros((4, PARAMETERS)),
         camera_time_offset_s=np.zeros(4),
         missing=np.zeros(0, dtype=np.int64),
         own=np.zeros(0, dtype=np.int64),

@@ -241,6 +241,6 @@ def test_poses_go_to_pycolmap_and_back() -> None:
     pose = se3.transform(se3.exp_so3([0.1, -2.0, 0.4]), [1.0, 2.0, 3.0])
     np.testing.assert_allclose(matrix_of(rigid3d(pose)), pose, atol=1e-12)
     simulated, mapper = scene(cameras=2, points=300)
-    cameras = cameras_of(mapper)
+    cameras = cameras_of(mapper).cameras
     assert [c.model.name for c in cameras] == ["PINHOLE"] * 2
     np.testing.assert_allclose(cameras[1].params, simulated.truth.camera_params[1])

@@ -62,6 +62,41 @@ def test_rays_far_off_axis_are_left_out_not_blown_up() -> None:
     assert inliers[20:].mean() > 0.97
 
 
+def fisheye_views(count: int, seed: int, *, looks_aside: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """b_from_a of two fisheyes of 190 deg on a street, and rays of points around them with noise of 0.4 px at 300 px
+    per radian."""
+    rng = np.random.default_rng(seed)
+    motion = [-1.0, 0.02, 0.1] if looks_aside else [0.05, 0.02, -1.0]
+    b_from_a = se3.transform(se3.exp_so3(rng.normal(size=3) * 0.02), motion)
+    points = rng.normal(size=(20 * count, 3)) * [9.0, 3.0, 9.0]
+    rays = [p / np.linalg.norm(p, axis=1, keepdims=True) for p in (points, se3.apply(b_from_a, points))]
+    seen = (np.minimum(rays[0][:, 2], rays[1][:, 2]) > np.cos(np.radians(95.0))) & (np.linalg.norm(points, axis=1) > 3)
+    a, b = (ray[np.flatnonzero(seen)[:count]] for ray in rays)
+    a, b = (ray + rng.normal(size=ray.shape) * 0.4 / 300.0 for ray in (a, b))
+    return b_from_a, *(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in (a, b))
+
+
+@pytest.mark.parametrize("looks_aside", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_true_matches_at_the_rim_of_fisheyes_survive(seed: int, looks_aside: bool) -> None:
+    b_from_a, a, b = fisheye_views(1000, seed, looks_aside=looks_aside)
+    rng = np.random.default_rng(seed)
+    wrong = rng.choice(1000, 250, replace=False)
+    b[wrong] = b[rng.permutation(wrong)]
+    right = np.setdiff1d(np.arange(1000), wrong)
+    inliers = essential_inliers(a, b, max_error=2.0 / 300.0)
+    angle = np.degrees(np.arccos(np.minimum(a[:, 2], b[:, 2])))
+    rim = right[(angle[right] > 75.0) & (angle[right] < 90.0)]
+    beyond = right[angle[right] > 90.0]
+    assert len(rim) > 80
+    assert inliers[rim].mean() >= 0.97
+    assert len(beyond) > 20
+    assert inliers[beyond].mean() >= 0.97
+    clearly_wrong = wrong[epipolar_errors(b_from_a, a[wrong], b[wrong]) > 6.0 / 300.0]
+    assert len(clearly_wrong) > 60
+    assert inliers[clearly_wrong].mean() < 0.08
+
+
 def test_exact_rays_have_no_epipolar_error() -> None:
     b_from_a, _, a, b = two_views()
     assert epipolar_errors(b_from_a, a, b).max() < 1e-12

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.geometry.camera_model import PERSPECTIVE, packed, project_points
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, build_tracks
 from tests.helpers.simulated_drive import make_simulated_drive, true_matches
@@ -133,6 +133,6 @@ def test_keypoints_line_up_images_and_their_rays() -> None:
         assert (keypoints.image[rows] == i).all()
         assert (keypoints.unit[rows] == image.unit).all()
         assert (keypoints.camera[rows] == image.camera).all()
-        params = np.concatenate([simulated.truth.camera_params[image.camera], np.zeros(4)])
+        _, params = packed(PERSPECTIVE, simulated.truth.camera_params[image.camera])
         if len(f.xy_px):
             np.testing.assert_allclose(project_points(0, params, keypoints.rays[rows]), f.xy_px, atol=1e-3)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import FISHEYE, project_points, unproject_pixels
+from mrasfm_engine.geometry.camera_model import FISHEYE, PERSPECTIVE, packed, project_points, unproject_pixels
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.triangulation.triangulate import Triangulator, cam_from_world
 
-PARAMS = np.array([500.0, 505.0, 480.0, 270.0, 0, 0, 0, 0])
+PARAMS = packed(PERSPECTIVE, [500.0, 505.0, 480.0, 270.0])[1]
 RIG_FROM_FORWARD_CAM = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
@@ -112,7 +112,7 @@ def some_points(count: int = 60, seed: int = 1) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("kind", "params"), [(0, PARAMS), (FISHEYE, np.array([300.0, 300, 480, 270, 0.02, -0.008, 0.002, -0.0005]))]
+    ("kind", "params"), [(0, PARAMS), packed(FISHEYE, [300.0, 300, 480, 270, 0.02, -0.008, 0.002, -0.0005])]
 )
 def test_exact_points_are_recovered(kind: int, params: np.ndarray) -> None:
     points = some_points()

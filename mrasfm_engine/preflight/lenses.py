@@ -1,0 +1,43 @@
+"""Lens models that do not reach over their whole image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.geometry.camera_model import largest_angle_rad, pack_camera, project_points, unproject_pixels
+from schemas import Camera, DriveManifest
+from schemas.findings import Finding, warning
+
+GRID = 65  # pixels across and down an image that are looked at
+COMES_BACK_PX = 0.01
+FULL_CIRCLE_RAD = np.radians(90.0)  # lenses that reach farther show an image circle: its corners are dark
+
+
+def lens_findings(manifest: DriveManifest) -> list[Finding]:
+    """Find the cameras whose distortion folds back inside the image: no ray leads to the pixels beyond."""
+    found = []
+    for camera in manifest.rig.cameras:
+        share, angle_rad = share_without_ray(camera)
+        if share > 0.0 and angle_rad < FULL_CIRCLE_RAD:
+            found.append(
+                warning(
+                    "lens-folds",
+                    f"rig.cameras: the distortion of camera {camera.name} folds back {np.degrees(angle_rad):.0f} deg "
+                    f"off its axis, and its image reaches farther: {share:.0%} of the pixels have no ray, and what is "
+                    "seen there takes no part",
+                    "Check the order and signs of params; calibrate with views that reach the image's corners, or "
+                    "with a model for wide lenses.",
+                )
+            )
+    return found
+
+
+def share_without_ray(camera: Camera) -> tuple[float, float]:
+    """Share of a camera's pixels to which no ray leads, and the largest angle in rad that its model can show."""
+    kind, params = pack_camera(camera.model, camera.params)
+    u, v = np.meshgrid(*(np.linspace(0.5, side - 0.5, GRID) for side in (camera.width, camera.height)))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    # Rays at the very limit project to nowhere by rounding alone.
+    back = project_points(kind, params, unproject_pixels(kind, params, pixels))
+    comes_back = np.linalg.norm(back - pixels, axis=1) < COMES_BACK_PX
+    return float(1.0 - comes_back.mean()), largest_angle_rad(params)
