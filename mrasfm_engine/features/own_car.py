@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.features.static_outline import RESOLUTION, StaticEdges, trace_outline
+from mrasfm_engine.features.static_outline import RESOLUTION, RIM_PX, StaticEdges, trace_outline
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_small
@@ -56,6 +56,7 @@ MIN_EVIDENCE_SHARE = 1 / 16
 MIN_EVIDENCE_PX = WIDTH_PX / 16  # less than this of an outline can be dirt or one thing that moves along
 
 JPEG_BLOCK_PX = 16  # side of a block with subsampled colours
+SURROUND_LEVELS = 24  # grey levels that stray light and compression leave of black
 CONSTANT_LEVELS = 2  # change of a value that rounding and compression alone explain
 MIN_CONSTANT_SHARE = 0.002  # of an image; less is not worth a mask
 MIN_BORDER_EDGE = 0.5  # of the outline of constant pixels; that of a black or saturated sky moves
@@ -246,6 +247,11 @@ class _Statistics:
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     @property
+    def dark(self) -> Bools:
+        """Pixels (h, w) that are never brighter than the surroundings of an image circle."""
+        return np.asarray(self._highest.max(-1) <= SURROUND_LEVELS)
+
+    @property
     def constant(self) -> Bools:
         """Pixels (h, w) that never change and are not saturated."""
         spread = self._highest.astype(np.int16) - self._lowest
@@ -279,11 +285,19 @@ def _static_region(drive: Drive, camera: int, statistics: _Statistics) -> Bools:
     edges = StaticEdges.from_sums(
         statistics.gradients, statistics.energy, statistics.change, statistics.count, fall=fall, flow=flow
     )
-    found = trace_outline(edges.turned(side))
+    block_px = math.ceil(JPEG_BLOCK_PX * fall.shape[1] / drive.cameras[camera].width)
+    # The dark around an image circle is no part of a sky that it touches, and its rim, which stays, none of the car.
+    surround = _constant_border(statistics.constant & statistics.dark, edges.edge, block_px)
+    other = _constant_border(statistics.constant & ~statistics.dark, edges.edge, block_px)
+    found = trace_outline(edges.without(_near(surround, block_px + RIM_PX)).turned(side))
     is_car = found.evidence_px >= MIN_EVIDENCE_PX and found.evidence_share >= MIN_EVIDENCE_SHARE
     mask = np.rot90(found.mask, -side) if is_car else np.zeros(fall.shape, np.bool_)
-    block_px = math.ceil(JPEG_BLOCK_PX * mask.shape[1] / drive.cameras[camera].width)
-    return np.ascontiguousarray(mask | _constant_border(statistics.constant, edges.edge, block_px))
+    return np.ascontiguousarray(mask | surround | other)
+
+
+def _near(mask: Bools, margin_px: int) -> Bools:
+    side = 2 * margin_px + 1
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def _world_motion(drive: Drive, camera: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, int]:

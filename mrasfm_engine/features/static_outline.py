@@ -8,7 +8,7 @@ Columns follow one another, so that dynamic programming finds the best path in t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import cv2
@@ -98,6 +98,12 @@ class StaticEdges:
             change=np.asarray(cv2.blur(change, (5, 5)), dtype=np.float32),
             fall=fall.astype(np.float32),
         )
+
+    def without(self, area: Bools) -> StaticEdges:
+        """The same without edges in an area (h, w)."""
+        names = ("edge", "evidence", "always", "step", "step_evidence")
+        cleared = {name: np.where(area, np.float32(0), getattr(self, name)) for name in names}
+        return replace(self, **cleared)
 
     def turned(self, quarters: int) -> StaticEdges:
         """The same after quarter turns counterclockwise."""

@@ -38,7 +38,7 @@ FACES = {
     "down": se3.exp_so3([-np.pi / 2, 0.0, 0.0]),
 }
 MAX_OF_PINHOLES = 1.5
-OPTIONS = {"perturb_rotation_deg": 0.2, "perturb_translation_m": 0.01, "declare_sigmas": True, "gnss_bias_m": 0.0}
+OPTIONS = {"perturb_rotation_deg": 0.2, "perturb_translation_m": 0.002, "declare_sigmas": True, "gnss_bias_m": 0.0}
 
 
 def fisheyes(work: Path, seed: int) -> Iterator[Figure]:

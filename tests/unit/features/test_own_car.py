@@ -97,6 +97,30 @@ def test_a_camera_that_is_upside_down_sees_the_bonnet_above(with_bonnet: Path, t
     assert 0.9 < overlap(car.mask, truth(with_bonnet)[::-1, ::-1]) <= 1
 
 
+def in_a_circle(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image as a lens shows it whose image circle is the image's width across, and the dark around the circle."""
+    height, width = image.shape[:2]
+    y, x = np.mgrid[:height, :width] + 0.5
+    outside = (x - width / 2) ** 2 + (y - height / 2) ** 2 > (0.46 * width) ** 2
+    result = image.copy()
+    result[outside] = 3
+    return result, outside
+
+
+@pytest.mark.parametrize("bonnet", [False, True])
+def test_the_dark_around_an_image_circle_is_masked_and_no_more(
+    bonnet: bool, with_bonnet: Path, without_bonnet: Path, tmp_path: Path
+) -> None:
+    """A rim that stays is no outline of the car, although the ground is inside it; a bonnet is found all the same."""
+    source = with_bonnet if bonnet else without_bonnet
+    drive = changed(source, tmp_path / "drive", lambda index, images: in_a_circle(images[index])[0])
+    car = find_own_cars(drive, threads=1)[0]
+    dark = in_a_circle(cv2.imread(str(drive.root / drive.images[0].file)))[1]
+    expected = dark | truth(source) if bonnet else dark
+    assert car.mask is not None
+    assert 0.85 < overlap(car.mask, expected) <= 1
+
+
 def test_a_vehicle_that_stands_shows_nothing(with_bonnet: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
 
