@@ -26,6 +26,7 @@ CONVENTIONS = {
 FILES = {
     "model": "local (COLMAP writes cam_from_world, quaternions w x y z; its world is local)",
     "points.ply": "local",
+    "points.copc.laz": "its own coordinate reference system: UTM with ellipsoidal heights; without one: local",
     "poses.tum": "local_from_rig, quaternions x y z w",
     "poses.json": "world_from_rig and world_from_cam with world = local, and geodetic positions where georeferenced",
     "calibration.json": "rig_from_cam",

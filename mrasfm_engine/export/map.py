@@ -1,8 +1,9 @@
 """Writes a map's files, checks them, and puts them in place.
 
-A map's folder holds what a scene's does (`model/`, `points.ply`, `poses.tum`, `poses.json`, `frame.json`, `pictures/`,
-`report.json`), `calibration/NAME.json` of every drive, `map.json` (scenes, transforms, seams, verdicts), and in
-`scenes/` and `seams/` what is needed to add scenes to it and take some out. One with a `report.json` is complete.
+A map's folder holds what a scene's does (`model/`, `points.ply`, `points.copc.laz`, `poses.tum`, `poses.json`,
+`frame.json`, `pictures/`, `report.json`), `calibration/NAME.json` of every drive, `map.json` (scenes, transforms, seams,
+verdicts), and in `scenes/` and `seams/` what is needed to add scenes to it and take some out. One with a `report.json`
+is complete.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Ints
-from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
+from schemas.artifacts import COPC_FILE, MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
 
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
 
 CALIBRATION_FOLDER = "calibration"
-REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
+REPLACED = (PICTURES_FOLDER, COPC_FILE, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
         array for part in (content.scenes, content.seams) for _, arrays, _ in part.values() for array in arrays.values()
     ]
     rows = len(content.scene.observation_point)
-    needed = sum(array.nbytes for array in kept) + 400 * len(content.scene.points_m) + 200 * rows + 4_000_000
+    needed = sum(array.nbytes for array in kept) + 460 * len(content.scene.points_m) + 200 * rows + 4_000_000
     needed += 60 * sum(len(f.xy_px) for f in content.scene.features) + picture_files.size_bytes(content.pictures)
     with publishing(out, needed, replaced=REPLACED) as work:
         return _write(content, work, report)

@@ -1,10 +1,10 @@
 """Writes a scene's files, checks them, and puts them in place.
 
-A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
-`poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
-scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a camera shows the
-vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the drive that
-nothing links to this one, and `report.json`. One with a `report.json` is complete.
+A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `points.copc.laz`,
+`poses.tum`, `poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the
+engine's axes: the scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a
+camera shows the vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the
+drive that nothing links to this one, and `report.json`. One with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from mrasfm_engine.export import (
     colmap,
     comparisons,
     coordinate_frame,
+    copc,
     feature_database,
     picture_files,
     ply,
@@ -37,11 +38,12 @@ from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats, Ints
-from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
+from schemas.artifacts import COMPONENTS_FOLDER, COPC_FILE, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
 
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
+REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COPC_FILE, COMPONENTS_FOLDER)
 
 
 def write_scene(
@@ -78,7 +80,7 @@ def write_scene(
     for one in scenes:
         check_scene(one)
     needed = sum(map(_size_bytes, scenes)) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=(PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER)) as work:
+    with publishing(out, needed, replaced=REPLACED) as work:
         _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
         for number, (other, own_report) in enumerate(components, start=1):
             folder = work / component_folder(number)
@@ -141,6 +143,12 @@ def write_common(scene: Scene, work: Path, pictures: PictureFiles, read_back: Re
     else:
         figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
     ply.write_ply(scene, work / "points.ply")
+    if copc.fits(scene):
+        copc.write_copc(scene, work / COPC_FILE)
+    else:
+        figures["notes"].append(
+            f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"
+        )
     return figures
 
 
@@ -201,7 +209,7 @@ def _size_bytes(scene: Scene) -> int:
     """About what the files take, with the database's write-ahead log."""
     keypoints = sum(len(f.xy_px) for f in scene.features)
     matches = sum(len(p.matches) for p in scene.pairs)
-    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 300 * len(scene.points_m) + 2_000_000
+    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 360 * len(scene.points_m) + 2_000_000
 
 
 def check_scene(scene: Scene) -> None:

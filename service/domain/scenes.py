@@ -22,6 +22,7 @@ _MEDIA_TYPES = {
     ".pgw": "text/plain; charset=utf-8",
     ".tif": "image/tiff",
     ".db": "application/vnd.sqlite3",
+    ".laz": "application/vnd.laszip",
 }
 
 

@@ -22,6 +22,7 @@ MISSING_UNIT, MISSING_IMAGE = 1, 9  # the second camera of the last unit
 FILES = {
     "model",
     "points.ply",
+    "points.copc.laz",
     "poses.tum",
     "poses.json",
     "calibration.json",
