@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mrasfm_engine.errors import MrasfmError
-from mrasfm_engine.export import comparisons, copc, copc_readback, readers
+from mrasfm_engine.export import comparisons, readers
 from mrasfm_engine.export.colmap import text_model_fits
 from mrasfm_engine.export.comparisons import Rows
 from mrasfm_engine.export.picture_files import LargeFile, PictureFiles
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import COPC_FILE, PICTURES_FOLDER, REPORT_FILE
+from schemas.artifacts import PICTURES_FOLDER, REPORT_FILE
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,6 @@ def common_checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
     return [
         *(text if text_model_fits(scene) else []),
         Check("points.ply", readers.ply, partial(comparisons.ply, scene)),
-        *([Check(COPC_FILE, copc_readback.read_copc, partial(copc_readback.copc, scene))] if copc.fits(scene) else []),
         Check("frame.json", readers.json_object, partial(comparisons.frame, scene)),
         Check("poses.json", readers.json_object, partial(comparisons.poses, scene)),
         Check(REPORT_FILE, readers.json_object, comparisons.nothing),

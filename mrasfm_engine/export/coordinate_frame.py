@@ -29,6 +29,7 @@ FILES = {
     "points.copc.laz": "its own coordinate reference system: UTM with ellipsoidal heights; without one: local",
     "poses.tum": "local_from_rig, quaternions x y z w",
     "poses.json": "world_from_rig and world_from_cam with world = local, and geodetic positions where georeferenced",
+    "trajectory.gpkg": "longitude, latitude and ellipsoidal height where georeferenced, else local",
     "calibration.json": "rig_from_cam",
 }
 

@@ -1,10 +1,11 @@
 """Writes a scene's files, checks them, and puts them in place.
 
-A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `points.copc.laz`,
-`poses.tum`, `poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the
-engine's axes: the scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a
-camera shows the vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the
-drive that nothing links to this one, and `report.json`. One with a `report.json` is complete.
+A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text), `points.ply`, `poses.tum`,
+`poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
+scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a camera shows the
+vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the drive that
+nothing links to this one, what other programs read (`export.interchange`), and `report.json`. One with a `report.json`
+is complete.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from mrasfm_engine.export import (
     colmap,
     comparisons,
     coordinate_frame,
-    copc,
     feature_database,
+    interchange,
     picture_files,
     ply,
     pose_files,
@@ -33,17 +34,18 @@ from mrasfm_engine.export import (
     road,
 )
 from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
+from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats, Ints
-from schemas.artifacts import COMPONENTS_FOLDER, COPC_FILE, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
+from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
 
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
-REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COPC_FILE, COMPONENTS_FOLDER)
+REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, *interchange.FILES)
 
 
 def write_scene(
@@ -115,6 +117,8 @@ def _write(
 ) -> None:
     read_back = ReadBack(work)
     figures = write_common(scene, work, pictures, read_back)
+    others = Interchange(scene=scene, scene_of_unit=[scene.drive.manifest.name] * len(scene.unit_registered))
+    figures["notes"] += others.write(work)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
     feature_database.write_features(scene, work / "features.db")
     if scene.road is not None:
@@ -126,7 +130,7 @@ def _write(
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
     write_json(work / COMPLETE_MARK, {**report, "summary": figures})
-    read_back.check(_checks(scene, pictures))
+    read_back.check([*_checks(scene, pictures), *others.checks()])
     read_back.require_all()
 
 
@@ -143,12 +147,6 @@ def write_common(scene: Scene, work: Path, pictures: PictureFiles, read_back: Re
     else:
         figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
     ply.write_ply(scene, work / "points.ply")
-    if copc.fits(scene):
-        copc.write_copc(scene, work / COPC_FILE)
-    else:
-        figures["notes"].append(
-            f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"
-        )
     return figures
 
 
@@ -209,7 +207,8 @@ def _size_bytes(scene: Scene) -> int:
     """About what the files take, with the database's write-ahead log."""
     keypoints = sum(len(f.xy_px) for f in scene.features)
     matches = sum(len(p.matches) for p in scene.pairs)
-    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 360 * len(scene.points_m) + 2_000_000
+    other = 360 * len(scene.points_m) + 300 * len(scene.drive.images)
+    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + other + 2_000_000
 
 
 def check_scene(scene: Scene) -> None:

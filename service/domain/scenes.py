@@ -23,6 +23,7 @@ _MEDIA_TYPES = {
     ".tif": "image/tiff",
     ".db": "application/vnd.sqlite3",
     ".laz": "application/vnd.laszip",
+    ".gpkg": "application/geopackage+sqlite3",
 }
 
 

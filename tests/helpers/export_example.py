@@ -23,6 +23,7 @@ FILES = {
     "model",
     "points.ply",
     "points.copc.laz",
+    "trajectory.gpkg",
     "poses.tum",
     "poses.json",
     "calibration.json",
