@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from mrasfm_engine.export import copc, copc_readback, geopackage, geopackage_readback
+from mrasfm_engine.export import copc, copc_readback, geopackage, geopackage_readback, rig_files, rig_files_readback
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import COPC_FILE, TRAJECTORY_FILE
+from schemas.artifacts import COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE
 
-FILES = (COPC_FILE, TRAJECTORY_FILE)  # some are not there where the scene has no place on the earth, or no points
+FILES = (COPC_FILE, TRAJECTORY_FILE, RIG_FOLDER, RIGS_FOLDER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +21,13 @@ class Interchange:
 
     scene: Scene
     scene_of_unit: Sequence[str]  # name of the scene that each unit is of
+    rigs: Mapping[str, str]  # folders, and what the names of their cameras begin with
 
     def write(self, folder: Path) -> list[str]:
         """Write the files into a scene's or map's folder; which are withheld, and why."""
         geopackage.write_geopackage(self.scene, self.scene_of_unit, folder / TRAJECTORY_FILE)
+        for rig, prefix in self.rigs.items():
+            rig_files.write_rig(rig_files.rig_cameras(self.scene, prefix), folder / rig)
         if not copc.fits(self.scene):
             return [f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"]
         copc.write_copc(self.scene, folder / COPC_FILE)
@@ -38,4 +41,14 @@ class Interchange:
         return [
             *([points] if copc.fits(scene) else []),
             Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, trajectory),
+            *(check for rig, prefix in self.rigs.items() for check in _rig_checks(scene, rig, prefix)),
         ]
+
+
+def _rig_checks(scene: Scene, folder: str, prefix: str) -> Iterator[Check]:
+    read = rig_files_readback.read_text
+    yield Check(f"{folder}/{rig_files.CAMCHAIN}", read, partial(rig_files_readback.camchain, scene, prefix))
+    yield Check(f"{folder}/{rig_files.DESCRIPTION}", read, partial(rig_files_readback.description, scene, prefix))
+    for camera in rig_files.rig_cameras(scene, prefix):
+        file = f"{folder}/{rig_files.CAMERA_INFO}/{camera.name}.yaml"
+        yield Check(file, read, partial(rig_files_readback.camera_info, scene, prefix, camera.name))

@@ -27,7 +27,7 @@ from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Ints
-from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
+from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, RIGS_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
 
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
@@ -73,7 +73,8 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:
     scene, read_back = content.scene, ReadBack(work)
     figures = write_common(scene, work, content.pictures, read_back)
-    others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit)
+    rigs = {f"{RIGS_FOLDER}/{name}": f"{name}/" for name in content.calibrations}
+    others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs)
     figures["notes"] += others.write(work)
     (work / "poses.tum").write_text(_poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", _poses_document(content))

@@ -40,7 +40,7 @@ from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats, Ints
-from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
+from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, RIG_FOLDER, component_folder
 
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
@@ -117,7 +117,8 @@ def _write(
 ) -> None:
     read_back = ReadBack(work)
     figures = write_common(scene, work, pictures, read_back)
-    others = Interchange(scene=scene, scene_of_unit=[scene.drive.manifest.name] * len(scene.unit_registered))
+    names = [scene.drive.manifest.name] * len(scene.unit_registered)
+    others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
     figures["notes"] += others.write(work)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
     feature_database.write_features(scene, work / "features.db")

@@ -23,6 +23,8 @@ _MEDIA_TYPES = {
     ".tif": "image/tiff",
     ".db": "application/vnd.sqlite3",
     ".laz": "application/vnd.laszip",
+    ".yaml": "application/yaml",
+    ".urdf": "application/xml",
     ".gpkg": "application/geopackage+sqlite3",
 }
 

@@ -24,6 +24,7 @@ FILES = {
     "points.ply",
     "points.copc.laz",
     "trajectory.gpkg",
+    "rig",
     "poses.tum",
     "poses.json",
     "calibration.json",
