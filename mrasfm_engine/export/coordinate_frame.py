@@ -31,6 +31,8 @@ FILES = {
     "poses.json": "world_from_rig and world_from_cam with world = local, and geodetic positions where georeferenced",
     "trajectory.gpkg": "longitude, latitude and ellipsoidal height where georeferenced, else local",
     "calibration.json": "rig_from_cam",
+    "rig": "rig_from_cam, relative poses of cameras; pixels count from the centre of the top left one",
+    "autoware": "local, raised by the origin's ellipsoidal height",
 }
 
 

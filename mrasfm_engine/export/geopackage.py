@@ -115,7 +115,7 @@ def _feature_rows(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[
     """Rows of the tables with geometries, by table."""
     srs, drive = _srs_id(scene), scene.drive
     rig, cameras = (_positions(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
-    lines = []
+    lines: list[tuple[Any, ...]] = []
     for name in dict.fromkeys(scene_of_unit):
         units = np.flatnonzero(scene.unit_registered & (np.array(scene_of_unit) == name))
         units = units[np.argsort(drive.timestamps_us[units], kind="stable")]

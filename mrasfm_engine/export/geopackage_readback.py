@@ -46,7 +46,9 @@ def geopackage(scene: Scene, scene_of_unit: Sequence[str], select: Select) -> Ro
     yield Row("its application id", select("PRAGMA application_id"), [(0x47504B47,)])
     yield Row("its version", select("PRAGMA user_version"), [(10300,)])
     yield Row("its integrity", select("PRAGMA integrity_check"), [("ok",)])
-    tables = dict(select("SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%'"))
+    tables: dict[str, str] = dict(
+        select("SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%'")
+    )
     yield Row("its tables", tables, {name: f"CREATE TABLE {name} ({columns})" for name, columns in TABLES.items()})
     rig, cameras = (_places(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
     yield from _contents(scene, select, rig=rig, cameras=cameras)

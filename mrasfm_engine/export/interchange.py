@@ -7,12 +7,21 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from mrasfm_engine.export import copc, copc_readback, geopackage, geopackage_readback, rig_files, rig_files_readback
+from mrasfm_engine.export import (
+    autoware,
+    autoware_readback,
+    copc,
+    copc_readback,
+    geopackage,
+    geopackage_readback,
+    rig_files,
+    rig_files_readback,
+)
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE
+from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE
 
-FILES = (COPC_FILE, TRAJECTORY_FILE, RIG_FOLDER, RIGS_FOLDER)
+FILES = (COPC_FILE, TRAJECTORY_FILE, RIG_FOLDER, RIGS_FOLDER, AUTOWARE_FOLDER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +37,8 @@ class Interchange:
         geopackage.write_geopackage(self.scene, self.scene_of_unit, folder / TRAJECTORY_FILE)
         for rig, prefix in self.rigs.items():
             rig_files.write_rig(rig_files.rig_cameras(self.scene, prefix), folder / rig)
+        if autoware.fits(self.scene):
+            autoware.write_autoware(self.scene, folder / AUTOWARE_FOLDER)
         if not copc.fits(self.scene):
             return [f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"]
         copc.write_copc(self.scene, folder / COPC_FILE)
@@ -42,6 +53,7 @@ class Interchange:
             *([points] if copc.fits(scene) else []),
             Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, trajectory),
             *(check for rig, prefix in self.rigs.items() for check in _rig_checks(scene, rig, prefix)),
+            *(_autoware_checks(scene) if autoware.fits(scene) else []),
         ]
 
 
@@ -52,3 +64,9 @@ def _rig_checks(scene: Scene, folder: str, prefix: str) -> Iterator[Check]:
     for camera in rig_files.rig_cameras(scene, prefix):
         file = f"{folder}/{rig_files.CAMERA_INFO}/{camera.name}.yaml"
         yield Check(file, read, partial(rig_files_readback.camera_info, scene, prefix, camera.name))
+
+
+def _autoware_checks(scene: Scene) -> Iterator[Check]:
+    points, projection = (f"{AUTOWARE_FOLDER}/{name}" for name in (autoware.POINTS, autoware.PROJECTOR))
+    yield Check(projection, rig_files_readback.read_text, partial(autoware_readback.projector, scene))
+    yield Check(points, autoware_readback.read_pcd, partial(autoware_readback.pcd, scene))

@@ -27,7 +27,15 @@ from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Ints
-from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, RIGS_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
+from schemas.artifacts import (
+    MAP_FILE,
+    PICTURES_FOLDER,
+    RIG_FOLDER,
+    RIGS_FOLDER,
+    SCENES_FOLDER,
+    SEAMS_FOLDER,
+    checkpoint_file,
+)
 
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
@@ -150,5 +158,9 @@ def _poses_document(content: MapContent) -> dict[str, Any]:
 
 def _frame_document(scene: Scene) -> dict[str, Any]:
     document = coordinate_frame.frame_document(scene)
-    files = {name: text for name, text in document["files"].items() if name != "calibration.json"}
-    return document | {"files": files | {"calibration/NAME.json": "rig_from_cam of the drive NAME"}}
+    files = {name: text for name, text in document["files"].items() if name not in ("calibration.json", RIG_FOLDER)}
+    of_drives = {
+        "calibration/NAME.json": "rig_from_cam of the drive NAME",
+        f"{RIGS_FOLDER}/NAME": coordinate_frame.FILES[RIG_FOLDER],
+    }
+    return document | {"files": files | of_drives}

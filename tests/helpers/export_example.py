@@ -25,6 +25,7 @@ FILES = {
     "points.copc.laz",
     "trajectory.gpkg",
     "rig",
+    "autoware",
     "poses.tum",
     "poses.json",
     "calibration.json",
