@@ -19,27 +19,12 @@ from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import COPC_FILE
-from tests.helpers.export_example import assert_nothing_published, make_scene, scene_with_road
-
-
-def many_points(count: int = 60_000) -> Scene:
-    """The example with points along a street of 600 m, so many that there are nodes below the root."""
-    rng, scene = np.random.default_rng(5), scene_with_road()
-    along = 600 * rng.random(count) ** 2 - 80
-    return replace(
-        scene,
-        points_m=np.column_stack([along, 30 * np.sin(along / 90) + rng.normal(0, 6, count), 4 * rng.random(count)]),
-        point_colors=rng.integers(0, 256, (count, 3), dtype=np.uint8),
-        point_error_px=rng.gamma(2.0, 0.2, count),
-        point_classes=rng.integers(0, 6, count).astype(np.uint8),
-        point_patches=rng.integers(-1, 2, count).astype(np.int32),
-        observation_point=np.sort(rng.integers(0, count, 4 * count)),
-    )
+from tests.helpers.export_example import assert_nothing_published, make_scene, scene_with_road, street_of_points
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return many_points()
+    return street_of_points(60_000)
 
 
 @pytest.fixture(scope="module")
