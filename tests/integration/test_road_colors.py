@@ -1,4 +1,4 @@
-"""The COPC and the GeoTIFF of one scene agree on the earth: points of the road have the colours of its picture there."""
+"""The COPC and the GeoTIFF of a scene agree on the earth: points of the road have the colours of the picture there."""
 
 from __future__ import annotations
 
