@@ -32,8 +32,8 @@ FILES = {
     "trajectory.gpkg": "longitude, latitude and ellipsoidal height where georeferenced, else local",
     "calibration.json": "rig_from_cam",
     "rig": "rig_from_cam, relative poses of cameras; pixels count from the centre of the top left one",
-    "autoware": "local, raised by the origin's ellipsoidal height",
 }
+ONLY_GEOREFERENCED = {"autoware": "local, raised by the origin's ellipsoidal height"}
 
 
 def frame_document(scene: Scene) -> dict[str, Any]:
@@ -64,4 +64,5 @@ def frame_document(scene: Scene) -> dict[str, Any]:
         local = "metres, axes and origin of the drive's own choosing, not tied to the earth"
     if scene.rough_world_from_local is not None:
         document["rough_world_from_local"] = scene.rough_world_from_local.tolist()
-    return document | {"axes": {"local": local, **AXES}, "conventions": CONVENTIONS, "files": FILES}
+    files = FILES if place is None else FILES | ONLY_GEOREFERENCED
+    return document | {"axes": {"local": local, **AXES}, "conventions": CONVENTIONS, "files": files}

@@ -117,7 +117,7 @@ def _feature_rows(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[
     rig, cameras = (_positions(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
     lines: list[tuple[Any, ...]] = []
     for name in dict.fromkeys(scene_of_unit):
-        units = np.flatnonzero(scene.unit_registered & (np.array(scene_of_unit) == name))
+        units = np.flatnonzero(scene.unit_registered & np.array([own == name for own in scene_of_unit]))
         units = units[np.argsort(drive.timestamps_us[units], kind="stable")]
         if len(units) > 1:
             lines.append((len(lines) + 1, _line(rig[units], srs), name, len(units)))

@@ -118,7 +118,9 @@ def _points(scene: Scene, table: str, blobs: list[bytes | None], places: Floats)
 
 
 def _lines(scene: Scene, scene_of_unit: Sequence[str], rows: list[tuple[Any, ...]], places: Floats) -> Rows:
-    units = {name: _path(scene, np.array(scene_of_unit) == name) for name in dict.fromkeys(scene_of_unit)}
+    units = {
+        name: _path(scene, np.array([own == name for own in scene_of_unit])) for name in dict.fromkeys(scene_of_unit)
+    }
     expected = [(name, len(path)) for name, path in units.items() if len(path) > 1]
     yield Row("the rows of trajectory", [row[2:] for row in rows], expected)
     yield Row("the ids of trajectory", [row[0] for row in rows], [*range(1, len(rows) + 1)])
