@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from io import SEEK_END, BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import lazrs
 import numpy as np
@@ -57,6 +57,11 @@ def write_copc(scene: Scene, path: Path) -> None:
     """Write the points in steps of 0.1 mm: as UTM and ellipsoidal height, in the local frame without a place on earth.
 
     They must fit.
+
+    Raises
+    ------
+    OSError
+        Where the file cannot be written.
     """
     place = scene.georeference
     wkt = "" if place is None else utm.well_known_text(_zone(place))
@@ -70,19 +75,20 @@ def write_copc(scene: Scene, path: Path) -> None:
         _record("LASF_Spec", 4, "extra attributes", b"".join(_extra(name, *EXTRA[name]) for name in EXTRA)),
     ]
     points_at = _HEADER_BYTES + _INFO_BYTES + sum(map(len, records))
-    with path.open("w+b") as file:
-        file.write(b"".join([bytes(_HEADER_BYTES + _INFO_BYTES), *records]))
-        _compress(file, laszip, _chunks(scene, steps, octree))
-        nodes_at = file.seek(0, 2)
-        file.seek(points_at)
-        sizes = [size for _, size in lazrs.read_chunk_table(file, laszip)]
-        entries = _entries(octree, points_at, sizes)
-        file.seek(nodes_at)
-        file.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(entries), b"EPT Hierarchy") + entries)
-        file.seek(0)
-        bounds_m = low * STEP_M + offset_m, high * STEP_M + offset_m
-        file.write(_header(bounds_m, offset_m, count=len(steps), records=len(records), offsets=(points_at, nodes_at)))
-        file.write(_information(bounds_m[0], octree, nodes_at + 60, len(entries)))
+    file = BytesIO(b"".join([bytes(_HEADER_BYTES + _INFO_BYTES), *records]))  # lazrs would hide that a disk is full
+    file.seek(points_at)
+    _compress(file, laszip, _chunks(scene, steps, octree))
+    nodes_at = file.seek(0, SEEK_END)
+    file.seek(points_at)
+    sizes = [size for _, size in lazrs.read_chunk_table(file, laszip)]
+    entries = _entries(octree, points_at, sizes)
+    file.seek(nodes_at)
+    file.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(entries), b"EPT Hierarchy") + entries)
+    file.seek(0)
+    bounds_m = low * STEP_M + offset_m, high * STEP_M + offset_m
+    file.write(_header(bounds_m, offset_m, count=len(steps), records=len(records), offsets=(points_at, nodes_at)))
+    file.write(_information(bounds_m[0], octree, nodes_at + 60, len(entries)))
+    path.write_bytes(file.getbuffer())
 
 
 def coordinates(scene: Scene) -> tuple[Floats, Ints32]:
@@ -124,7 +130,7 @@ def _chunks(scene: Scene, steps: Ints32, octree: Octree) -> Iterator[NDArray[np.
         yield points
 
 
-def _compress(file: BinaryIO, laszip: lazrs.LazVlr, chunks: Iterator[NDArray[np.void]]) -> None:
+def _compress(file: BytesIO, laszip: lazrs.LazVlr, chunks: Iterator[NDArray[np.void]]) -> None:
     compressor = lazrs.LasZipCompressor(file, laszip)
     compressor.reserve_offset_to_chunk_table()
     for number, points in enumerate(chunks):

@@ -229,10 +229,9 @@ def _points(scene: Scene, found: CopcFile) -> Rows:
         code = utm.epsg_code(place.origin_latitude_deg, place.origin_longitude_deg)
         yield Row("its coordinate reference system", text, utm.well_known_text(code).encode() + b"\0")
         system = _transformer(text)
-    if system is None:
-        yield Row("its offset", offset_m, np.zeros(3))
-    else:
-        yield Row("its offset", offset_m, np.floor(_projected(scene, np.zeros((1, 3)), system)[0]))
+    origin_m = np.zeros(3) if system is None else _projected(scene, np.zeros((1, 3)), system)[0] - 0.5
+    yield Row("its offset, whole metres,", offset_m, np.rint(offset_m))
+    yield Row("its offset", offset_m, origin_m, 0.0 if system is None else 0.5 + 1e-6)
     lengths = np.bincount(scene.observation_point, minlength=len(scene.points_m))
     low, high = np.full(3, np.iinfo(np.int32).max), np.full(3, np.iinfo(np.int32).min)
     unseen = np.ones(len(scene.points_m), dtype=np.bool_)

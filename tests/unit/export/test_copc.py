@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import copc, copc_readback, octree, ply
 from mrasfm_engine.export.copc import write_copc
 from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import COPC_FILE
@@ -191,6 +193,27 @@ def test_a_file_of_other_points_is_refused_by_name(
     with pytest.raises(MrasfmError, match=r"points\.copc\.laz was written but does not read back"):
         write_scene(scene, tmp_path / "scene", {})
     assert_nothing_published(tmp_path / "scene")
+
+
+def test_a_file_that_cannot_grow_is_an_os_error(scene: Scene, tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_copc(scene, tmp_path / COPC_FILE)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_an_origin_on_a_central_meridian_is_no_matter_of_rounding(tmp_path: Path) -> None:
+    scene = make_scene()
+    for longitude_deg in (9.0, 15.0, 8.999999999999998):
+        matrix = geodesy.ecef_from_local([48.1, longitude_deg, 520.0])
+        place = replace(scene.georeference, origin_longitude_deg=longitude_deg, ecef_from_local=matrix)
+        there = replace(scene, georeference=place)
+        write_copc(there, tmp_path / COPC_FILE)
+        assert laspy.read(tmp_path / COPC_FILE).header.offsets[0] in (499_999, 500_000)
+        assert disagreement(there, tmp_path / COPC_FILE) is None
 
 
 def test_a_point_too_far_away_withholds_the_file(tmp_path: Path) -> None:
