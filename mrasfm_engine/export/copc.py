@@ -67,7 +67,7 @@ def write_copc(scene: Scene, path: Path) -> None:
     wkt = "" if place is None else utm.well_known_text(_zone(place))
     offset_m, steps = coordinates(scene)
     low, high = steps.min(axis=0), steps.max(axis=0)
-    octree = build_octree(steps - low)
+    octree = build_octree((steps - low).view(np.uint32))  # without a sign: they may be 400 km apart
     laszip = lazrs.LazVlr.new_for_compression(POINT_FORMAT, POINT["point_id"].itemsize * len(EXTRA), True)
     records = [
         _record("laszip encoded", 22204, "lazrs", bytes(laszip.record_data())),

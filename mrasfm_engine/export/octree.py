@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from mrasfm_engine.types import Ints, Ints32
 
@@ -29,7 +30,7 @@ class Octree(NamedTuple):
     order: Ints32  # (n,) the points
 
 
-def build_octree(steps: Ints32, *, leaf_points: int = LEAF_POINTS) -> Octree:
+def build_octree(steps: NDArray[np.uint32], *, leaf_points: int = LEAF_POINTS) -> Octree:
     """Sort points (n, 3), coordinates in whole steps from 0 on, into nodes; the cube ends at the largest coordinate.
 
     A node with at most `leaf_points` points keeps them. Of others, one point stays for each of `GRID`^3 cells, and the

@@ -227,6 +227,17 @@ def test_a_point_too_far_away_withholds_the_file(tmp_path: Path) -> None:
     assert not (out / COPC_FILE).exists()
     note = json.loads((out / "report.json").read_text())["summary"]["notes"][-1]
     assert note == "points.copc.laz is withheld: it holds points up to 200 km from the origin"
-    far[3] = [140_000.0, -140_000.0, 0.0]
+    far[3:5] = [140_000.0, -140_000.0, 0.0], [-140_000.0, 140_000.0, 0.0]
     write_scene(replace(scene, points_m=far), out, {})
-    assert 0 < np.ptp(laspy.read(out / COPC_FILE).x) < 200_000
+    assert np.ptp(laspy.read(out / COPC_FILE).x) == pytest.approx(280_000, rel=0.05)
+
+
+def test_points_at_both_ends_of_the_reach(tmp_path: Path) -> None:
+    """400 km are more steps than 32 bits with a sign count."""
+    scene, path = street_of_points(50_000), tmp_path / COPC_FILE
+    points_m = scene.points_m.copy()
+    points_m[0], points_m[-1] = [-199_999.0, 0.0, 0.0], [199_999.0, 0.0, 0.0]
+    far = replace(scene, points_m=points_m, georeference=None)
+    write_copc(far, path)
+    assert disagreement(far, path) is None
+    assert np.ptp(laspy.read(path).x) == pytest.approx(399_998.0)

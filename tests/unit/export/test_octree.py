@@ -11,7 +11,7 @@ def street(count: int) -> np.ndarray:
     rng = np.random.default_rng(2)
     along = 4_000_000 * rng.random(count) ** 2
     points = np.column_stack([along, 90_000 + rng.normal(0, 9_000, count), 50_000 * rng.random(count) ** 3])
-    return (points - points.min(axis=0)).astype(np.int32)
+    return (points - points.min(axis=0)).astype(np.uint32)
 
 
 def nodes_with_points(octree: Octree, steps: np.ndarray) -> list[tuple[tuple[int, ...], np.ndarray]]:
@@ -62,7 +62,7 @@ def test_leaves_are_large() -> None:
     assert len(build_octree(steps[:LEAF_POINTS]).nodes) == 1
 
 
-@pytest.mark.parametrize("steps", [np.zeros((3, 3), np.int32), np.full((30_000, 3), [5, 0, 9], np.int32)])
+@pytest.mark.parametrize("steps", [np.zeros((3, 3), np.uint32), np.full((30_000, 3), [5, 0, 9], np.uint32)])
 def test_points_at_one_place_are_one_node(steps: np.ndarray) -> None:
     octree = build_octree(steps, leaf_points=2)
     assert octree.nodes.tolist() == [[0, 0, 0, 0]]
@@ -70,9 +70,9 @@ def test_points_at_one_place_are_one_node(steps: np.ndarray) -> None:
 
 
 def test_coordinates_up_to_the_largest_number_fit() -> None:
-    steps = np.array([[0, 0, 0], [2**31 - 2, 5, 2**31 - 3]] * 300, np.int32)
+    steps = np.array([[0, 0, 0], [2**32 - 2, 5, 2**32 - 3]] * 300, np.uint32)
     octree = build_octree(steps, leaf_points=2)
-    assert octree.side == 2**31 - 2
+    assert octree.side == 2**32 - 2
     for (level, *place), points in nodes_with_points(octree, steps):
         side = octree.side / 2**level
         assert (np.abs(points - (np.array(place) + 0.5) * side) <= side / 2).all()
