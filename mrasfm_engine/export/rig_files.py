@@ -1,7 +1,7 @@
 """A vehicle's cameras in other people's formats: Kalibr's camera chain, ROS's CameraInfo, and the rig as URDF.
 
-They hold the refined calibration. What none of them can say is in `calibration.json` only: sigmas and verdicts, time
-offsets, and the readout of a rolling shutter.
+They hold the refined calibration. None of them can say sigmas, verdicts and time offsets, which `calibration.json` has,
+or the readout of a rolling shutter.
 
 Their pixel coordinates count from the centre of the top left pixel, ours from its corner: the principal point is less
 by half a pixel. All of our camera models are one of two of theirs, without any loss.
