@@ -35,14 +35,17 @@ class Interchange:
     def write(self, folder: Path) -> list[str]:
         """Write the files into a scene's or map's folder; which are withheld, and why."""
         geopackage.write_geopackage(self.scene, self.scene_of_unit, folder / TRAJECTORY_FILE)
+        notes = []
         for rig, prefix in self.rigs.items():
-            rig_files.write_rig(rig_files.rig_cameras(self.scene, prefix), folder / rig)
+            lacking = rig_files.write_rig(rig_files.rig_cameras(self.scene, prefix), folder / rig)
+            notes += [f"{rig}/{what}" for what in lacking]
         if autoware.fits(self.scene):
             autoware.write_autoware(self.scene, folder / AUTOWARE_FOLDER)
-        if not copc.fits(self.scene):
-            return [f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"]
-        copc.write_copc(self.scene, folder / COPC_FILE)
-        return []
+        if copc.fits(self.scene):
+            copc.write_copc(self.scene, folder / COPC_FILE)
+        else:
+            notes += [f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"]
+        return notes
 
     def checks(self) -> list[Check]:
         """Checks of what `write` writes."""
@@ -58,10 +61,11 @@ class Interchange:
 
 
 def _rig_checks(scene: Scene, folder: str, prefix: str) -> Iterator[Check]:
-    read = rig_files_readback.read_text
-    yield Check(f"{folder}/{rig_files.CAMCHAIN}", read, partial(rig_files_readback.camchain, scene, prefix))
+    read, cameras = rig_files_readback.read_text, rig_files.rig_cameras(scene, prefix)
+    if any(map(rig_files.known_to_kalibr, cameras)):
+        yield Check(f"{folder}/{rig_files.CAMCHAIN}", read, partial(rig_files_readback.camchain, scene, prefix))
     yield Check(f"{folder}/{rig_files.DESCRIPTION}", read, partial(rig_files_readback.description, scene, prefix))
-    for camera in rig_files.rig_cameras(scene, prefix):
+    for camera in filter(rig_files.known_to_ros, cameras):
         file = f"{folder}/{rig_files.CAMERA_INFO}/{camera.name}.yaml"
         yield Check(file, read, partial(rig_files_readback.camera_info, scene, prefix, camera.name))
 

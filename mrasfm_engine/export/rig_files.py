@@ -4,7 +4,8 @@ They hold the refined calibration. None of them can say sigmas, verdicts and tim
 or the readout of a rolling shutter.
 
 Their pixel coordinates count from the centre of the top left pixel, ours from its corner: the principal point is less
-by half a pixel. All of our camera models are one of two of theirs, without any loss.
+by half a pixel. What a format has no model for is not in it: Kalibr knows no rational distortion, ROS no unified model
+of omnidirectional cameras. All other cameras are there without loss.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from schemas import CAMERA_MODELS
 CAMCHAIN, DESCRIPTION, CAMERA_INFO = "camchain.yaml", "rig.urdf", "camera_info"
 ROBOT = "rig"
 BASE_LINK, OPTICAL_FRAME = "base_link", "_optical_frame"  # REP 103: x forward, y left, z up; z forward, x right, y down
-# Polynomials of the tangent and of the angle: k1, k2, p1, p2 and k1 to k4
-RADTAN, EQUIDISTANT = "radtan", "equidistant"
+# Coefficients: k1, k2, p1, p2; of the angle's polynomial k1 to k4; k1, k2, p1, p2, k3 to k6; k1, k2, p1, p2
+RADTAN, EQUIDISTANT, RATIONAL, OMNIDIRECTIONAL = "radtan", "equidistant", "rational", "omnidirectional"
 PIXEL_CENTRE_PX = 0.5
 
 
@@ -40,8 +41,9 @@ class RigCamera:
     width: int
     height: int
     intrinsics: list[float]  # fx, fy, cx, cy; the centre of the top left pixel is at (0, 0)
-    distortion: str  # RADTAN or EQUIDISTANT
-    coefficients: list[float]  # four
+    distortion: str
+    coefficients: list[float]
+    xi: float = 0.0  # of an omnidirectional one
     rig_from_cam: Floats  # (4, 4)
 
 
@@ -61,28 +63,46 @@ def rig_cameras(scene: Scene, prefix: str = "") -> list[RigCamera]:
 
 
 def _lens(model: str, params: Floats) -> dict[str, Any]:
-    """Intrinsics and distortion of one of COLMAP's models."""
+    """Intrinsics and distortion of one of the manifest's models; a polynomial of one in `k` begins with k1."""
     value = dict(zip(CAMERA_MODELS[model], params.tolist(), strict=True))
-    fx, fy = value.get("fx", value.get("f")), value.get("fy", value.get("f"))
-    is_fisheye = model == "OPENCV_FISHEYE"
-    k1 = value.get("k", value.get("k1", 0.0))
+    names = ["k2", "k3", "k4"] if model == "OPENCV_FISHEYE" else ["k2", "p1", "p2"]
+    coefficients = [value.get("k", value.get("k1", 0.0)), *(value.get(name, 0.0) for name in names)]
+    distortion = {"OPENCV_FISHEYE": EQUIDISTANT, "MEI": OMNIDIRECTIONAL}.get(model, RADTAN)
+    higher = [value[name] for name in ("k3", "k4", "k5", "k6")] if model == "FULL_OPENCV" else []
+    if any(higher):
+        distortion, coefficients = RATIONAL, coefficients + higher
+    fx, fy = (value.get(name, value.get("f")) for name in ("fx", "fy"))
     return {
         "intrinsics": [fx, fy, value["cx"] - PIXEL_CENTRE_PX, value["cy"] - PIXEL_CENTRE_PX],
-        "distortion": EQUIDISTANT if is_fisheye else RADTAN,
-        "coefficients": [
-            k1,
-            *(value.get(name, 0.0) for name in (("k2", "k3", "k4") if is_fisheye else ("k2", "p1", "p2"))),
-        ],
+        "distortion": distortion,
+        "coefficients": coefficients,
+        "xi": value.get("xi", 0.0),
     }
 
 
-def write_rig(cameras: Sequence[RigCamera], folder: Path) -> None:
-    """Write `camchain.yaml`, `rig.urdf` and `camera_info/CAMERA.yaml` into a new folder."""
-    (folder / CAMERA_INFO).mkdir(parents=True)
-    (folder / CAMCHAIN).write_text(camchain_text(cameras), encoding="utf-8")
+def known_to_kalibr(camera: RigCamera) -> bool:
+    """Return whether Kalibr has a model for the camera."""
+    return camera.distortion != RATIONAL
+
+
+def known_to_ros(camera: RigCamera) -> bool:
+    """Return whether CameraInfo has a model for the camera."""
+    return camera.distortion != OMNIDIRECTIONAL
+
+
+def write_rig(cameras: Sequence[RigCamera], folder: Path) -> list[str]:
+    """Write `rig.urdf`, `camchain.yaml` and `camera_info/CAMERA.yaml` into a new folder; what these lack, and why."""
+    folder.mkdir(parents=True)
     (folder / DESCRIPTION).write_text(description_text(cameras), encoding="utf-8")
-    for camera in cameras:
+    if for_kalibr := list(filter(known_to_kalibr, cameras)):
+        (folder / CAMCHAIN).write_text(camchain_text(for_kalibr), encoding="utf-8")
+    for camera in filter(known_to_ros, cameras):
+        (folder / CAMERA_INFO).mkdir(exist_ok=True)
         (folder / CAMERA_INFO / f"{camera.name}.yaml").write_text(camera_info_text(camera), encoding="utf-8")
+    return [
+        *(f"{CAMCHAIN} lacks {c.name}: Kalibr has no model for it" for c in cameras if not known_to_kalibr(c)),
+        *(f"{CAMERA_INFO} lacks {c.name}: ROS has no model for it" for c in cameras if not known_to_ros(c)),
+    ]
 
 
 def camchain_text(cameras: Sequence[RigCamera]) -> str:
@@ -96,11 +116,13 @@ def camchain_text(cameras: Sequence[RigCamera]) -> str:
         if number:
             cam_from_last = se3.inverse(camera.rig_from_cam) @ cameras[number - 1].rig_from_cam
             lines += ["  T_cn_cnm1:", *(f"  - {_floats(row)}" for row in cam_from_last.tolist())]
+        is_omnidirectional = camera.distortion == OMNIDIRECTIONAL
+        intrinsics = [camera.xi, *camera.intrinsics] if is_omnidirectional else camera.intrinsics
         lines += [
-            "  camera_model: pinhole",
+            f"  camera_model: {'omni' if is_omnidirectional else 'pinhole'}",
             f"  distortion_coeffs: {_floats(camera.coefficients)}",
-            f"  distortion_model: {camera.distortion}",
-            f"  intrinsics: {_floats(camera.intrinsics)}",
+            f"  distortion_model: {EQUIDISTANT if camera.distortion == EQUIDISTANT else RADTAN}",
+            f"  intrinsics: {_floats(intrinsics)}",
             f"  resolution: [{camera.width}, {camera.height}]",
             f"  rostopic: {json.dumps(f'/{camera.name}/image_raw')}",
         ]
@@ -110,22 +132,28 @@ def camchain_text(cameras: Sequence[RigCamera]) -> str:
 def camera_info_text(camera: RigCamera) -> str:
     """ROS's CameraInfo as `camera_calibration_parsers` reads it."""
     fx, fy, cx, cy = camera.intrinsics
-    # plumb_bob has a third radial coefficient.
-    is_fisheye = camera.distortion == EQUIDISTANT
-    distortion = camera.coefficients if is_fisheye else [*camera.coefficients, 0.0]
+    model, coefficients = _ros_distortion(camera)
     return "\n".join(
         [
             f"image_width: {camera.width}",
             f"image_height: {camera.height}",
             f"camera_name: {json.dumps(camera.name)}",
             *_matrix("camera_matrix", 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-            f"distortion_model: {'equidistant' if is_fisheye else 'plumb_bob'}",
-            *_matrix("distortion_coefficients", 1, distortion),
+            f"distortion_model: {model}",
+            *_matrix("distortion_coefficients", 1, coefficients),
             *_matrix("rectification_matrix", 3, np.eye(3).ravel().tolist()),
             *_matrix("projection_matrix", 3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
             "",
         ]
     )
+
+
+def _ros_distortion(camera: RigCamera) -> tuple[str, list[float]]:
+    """Name of ROS's model and its coefficients; `plumb_bob` has k3, too, as its fifth."""
+    if camera.distortion == EQUIDISTANT:
+        return "equidistant", camera.coefficients
+    coefficients = [*camera.coefficients, *[0.0] * (8 - len(camera.coefficients))]
+    return ("rational_polynomial", coefficients) if any(coefficients[5:]) else ("plumb_bob", coefficients[:5])
 
 
 def description_text(cameras: Sequence[RigCamera]) -> str:

@@ -22,7 +22,7 @@ from schemas import Camera
 
 _LINE = re.compile(r"(?P<indent>|  )(?:(?P<key>\w+):(?: (?P<value>.+))?|- (?P<item>\[.*\]))")
 _WORD = re.compile(r"[A-Za-z]\w*")
-# Where a model's parameters are: fx, fy, cx, cy, then the four coefficients; None: zero
+# Places of a model's parameters: fx, fy, cx, cy, then k1, k2, p1, p2, k3 to k6, or a fisheye's k1 to k4; None: zero
 _PLACES: dict[str, tuple[int | None, ...]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2, None, None, None, None),
     "PINHOLE": (0, 1, 2, 3, None, None, None, None),
@@ -30,6 +30,8 @@ _PLACES: dict[str, tuple[int | None, ...]] = {
     "RADIAL": (0, 0, 1, 2, 3, 4, None, None),
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),
+    "FULL_OPENCV": tuple(range(12)),
+    "MEI": (0, 1, 2, 3, 4, 5, 6, 7),
 }
 
 
@@ -61,8 +63,11 @@ def _value(text: str | None) -> Any:
 
 def camchain(scene: Scene, prefix: str, text: str) -> Rows:
     """Kalibr's camera chain: the poses that it composes to, and every camera's lens."""
-    yield Row("its text", text, rig_files.camchain_text(rig_files.rig_cameras(scene, prefix)))
-    cameras, found = _cameras(scene, prefix), parsed_yaml(text)
+    known = [camera for camera in rig_files.rig_cameras(scene, prefix) if rig_files.known_to_kalibr(camera)]
+    yield Row("its text", text, rig_files.camchain_text(known))
+    # No rational distortion: more than four coefficients
+    cameras = [pair for pair in _cameras(scene, prefix) if not any(_lens(*pair)[8:])]
+    found = parsed_yaml(text)
     yield Row("its cameras", list(found), [f"cam{number}" for number in range(len(cameras))])
     chained = cameras[0][1].rig_from_cam
     for number, ((given, refined), camera) in enumerate(zip(cameras, found.values(), strict=True)):
@@ -77,10 +82,12 @@ def camchain(scene: Scene, prefix: str, text: str) -> Rows:
             chained = chained @ np.linalg.inv(step)
         yield Row(f"{given.name}'s pose", chained, refined.rig_from_cam, ROUNDING)
         described = [camera[name] for name in ("camera_model", "distortion_model", "resolution", "rostopic")]
-        model = "equidistant" if given.model == "OPENCV_FISHEYE" else "radtan"
-        topic = f"/{given.name.removeprefix(prefix)}/image_raw"
-        yield Row(f"{given.name}'s model", described, ["pinhole", model, [given.width, given.height], topic])
-        yield Row(f"{given.name}'s lens", [*camera["intrinsics"], *camera["distortion_coeffs"]], _lens(given, refined))
+        is_mei, topic = given.model == "MEI", f"/{given.name.removeprefix(prefix)}/image_raw"
+        models = ["omni" if is_mei else "pinhole", "equidistant" if given.model == "OPENCV_FISHEYE" else "radtan"]
+        yield Row(f"{given.name}'s model", described, [*models, [given.width, given.height], topic])
+        xi = refined.params[8:].tolist() if is_mei else []
+        lens = [*camera["intrinsics"], *camera["distortion_coeffs"]]
+        yield Row(f"{given.name}'s lens", lens, [*xi, *_lens(given, refined)[:8]])
 
 
 def camera_info(scene: Scene, prefix: str, name: str, text: str) -> Rows:
@@ -90,12 +97,17 @@ def camera_info(scene: Scene, prefix: str, name: str, text: str) -> Rows:
     (given, refined), found = next(p for p in _cameras(scene, prefix) if p[0].name == prefix + name), parsed_yaml(text)
     yield Row("its size", [found["image_width"], found["image_height"]], [given.width, given.height])
     yield Row("its name", found["camera_name"], name)
-    is_fisheye = given.model == "OPENCV_FISHEYE"
-    yield Row("its distortion model", found["distortion_model"], "equidistant" if is_fisheye else "plumb_bob")
     fx, fy, cx, cy, *coefficients = _lens(given, refined)
+    if given.model == "OPENCV_FISHEYE":
+        model = "equidistant"
+    else:
+        coefficients += [0.0] * (8 - len(coefficients))
+        model = "rational_polynomial" if any(coefficients[5:]) else "plumb_bob"
+        coefficients = coefficients if any(coefficients[5:]) else coefficients[:5]
+    yield Row("its distortion model", found["distortion_model"], model)
     matrices = {
         "camera_matrix": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-        "distortion_coefficients": np.array([coefficients if is_fisheye else [*coefficients, 0.0]]),
+        "distortion_coefficients": np.array([coefficients]),
         "rectification_matrix": np.eye(3),
         "projection_matrix": np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]]),
     }

@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -22,10 +21,11 @@ from mrasfm_engine.export.rig_files import RigCamera, rig_cameras, roll_pitch_ya
 from mrasfm_engine.export.rig_files_readback import parsed_yaml
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_camera, project_points
 from mrasfm_engine.scene.drive import Drive, pose_from_matrix
 from mrasfm_engine.scene.scene import CameraCalibration, Scene
 from schemas import Camera, Rig
-from tests.helpers.export_example import assert_nothing_published, make_scene
+from tests.helpers.export_example import FOREIGN_MODEL, assert_nothing_published, make_scene
 
 WIDTH, HEIGHT = 960, 600
 PARAMS = {
@@ -36,6 +36,9 @@ PARAMS = {
     "OPENCV": [805.5, 811.0, 481.25, 300.5, -0.05, 0.01, 1e-3, -5e-4],
     "OPENCV_FISHEYE": [405.5, 411.0, 481.25, 300.5, -0.03, 0.004, 2e-3, -1e-4],
 }
+RATIONAL = [805.5, 811.0, 481.25, 300.5, -0.05, 0.01, 1e-3, -5e-4, 2e-3, 0.01, -0.02, 1e-3]
+WITH_K3 = [*RATIONAL[:9], 0.0, 0.0, 0.0]
+OMNIDIRECTIONAL = [1405.5, 1411.0, 481.25, 300.5, 0.01, 0.5, 1e-3, -5e-4, 1.1]
 
 
 def surround(models: dict[str, list[float]] = PARAMS, *, prefix: str = "") -> Scene:
@@ -57,9 +60,8 @@ def surround(models: dict[str, list[float]] = PARAMS, *, prefix: str = "") -> Sc
     return replace(scene, drive=Drive(Path("nowhere"), manifest), calibration=calibration)
 
 
-def colmap_pixels(camera: Camera, refined: CameraCalibration, points: np.ndarray) -> np.ndarray:
-    model = pycolmap.Camera(model=camera.model, width=WIDTH, height=HEIGHT, params=refined.params)
-    return np.array(model.img_from_cam(points)).reshape(-1, 2)
+def own_pixels(camera: Camera, refined: CameraCalibration, points: np.ndarray) -> np.ndarray:
+    return project_points(*pack_camera(camera.model, refined.params), points)
 
 
 def opencv_pixels(
@@ -81,7 +83,7 @@ def points() -> np.ndarray:
 def test_every_model_projects_as_ours_half_a_pixel_away(points: np.ndarray, k: int) -> None:
     scene = surround()
     camera = rig_cameras(scene)[k]
-    expected = colmap_pixels(scene.drive.cameras[k], scene.calibration[k], points) - 0.5
+    expected = own_pixels(scene.drive.cameras[k], scene.calibration[k], points) - 0.5
     info = parsed_yaml(rig_files.camera_info_text(camera))
     chain = parsed_yaml(rig_files.camchain_text([camera]))["cam0"]
     values = np.array(info["camera_matrix"]["data"]).reshape(3, 3)
@@ -96,6 +98,62 @@ def test_every_model_projects_as_ours_half_a_pixel_away(points: np.ndarray, k: i
         found = opencv_pixels(intrinsics, is_fisheye, coefficients, points)
         np.testing.assert_allclose(found, expected, atol=1e-6)
     assert np.ptp(expected[:, 0]) > 100
+
+
+@pytest.mark.parametrize(
+    ("params", "model", "count"), [(RATIONAL, "rational_polynomial", 8), (WITH_K3, "plumb_bob", 5)]
+)
+def test_higher_coefficients_are_for_ros_only(
+    points: np.ndarray, params: list[float], model: str, count: int, tmp_path: Path
+) -> None:
+    scene = surround({"FULL_OPENCV": params, "PINHOLE": PARAMS["PINHOLE"]})
+    cameras = rig_cameras(scene)
+    info = parsed_yaml(rig_files.camera_info_text(cameras[0]))
+    coefficients = info["distortion_coefficients"]["data"]
+    assert (info["distortion_model"], len(coefficients)) == (model, count)
+    found = opencv_pixels(cameras[0].intrinsics, False, coefficients, points)
+    expected = own_pixels(scene.drive.cameras[0], scene.calibration[0], points) - 0.5
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    notes = rig_files.write_rig(cameras, tmp_path / "rig")
+    assert notes == ["camchain.yaml lacks 0.FULL_OPENCV: Kalibr has no model for it"]
+    text = (tmp_path / "rig" / "camchain.yaml").read_text()
+    assert [camera["rostopic"] for camera in parsed_yaml(text).values()] == ["/1.PINHOLE/image_raw"]
+    assert all(row.agrees for row in rig_files_readback.camchain(scene, "", text))
+
+
+def test_a_full_model_without_higher_coefficients_is_for_all(tmp_path: Path) -> None:
+    scene = surround({"FULL_OPENCV": [*RATIONAL[:8], 0.0, 0.0, 0.0, 0.0]})
+    assert rig_files.write_rig(rig_cameras(scene), tmp_path / "rig") == []
+    assert parsed_yaml((tmp_path / "rig" / "camchain.yaml").read_text())["cam0"]["distortion_coeffs"] == RATIONAL[4:8]
+
+
+def test_an_omnidirectional_camera_is_for_kalibr_only(points: np.ndarray, tmp_path: Path) -> None:
+    scene = surround({"MEI": OMNIDIRECTIONAL})
+    notes = rig_files.write_rig(rig_cameras(scene), tmp_path / "rig")
+    assert notes == ["camera_info lacks 0.MEI: ROS has no model for it"]
+    assert {path.name for path in (tmp_path / "rig").iterdir()} == {"camchain.yaml", "rig.urdf"}
+    text = (tmp_path / "rig" / "camchain.yaml").read_text()
+    camera = parsed_yaml(text)["cam0"]
+    assert (camera["camera_model"], camera["distortion_model"]) == ("omni", "radtan")
+    xi, *intrinsics = camera["intrinsics"]
+    on_sphere = points / np.linalg.norm(points, axis=1, keepdims=True) + [0.0, 0.0, xi]
+    found = opencv_pixels(intrinsics, False, camera["distortion_coeffs"], on_sphere)
+    expected = own_pixels(scene.drive.cameras[0], scene.calibration[0], points) - 0.5
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert all(row.agrees for row in rig_files_readback.camchain(scene, "", text))
+
+
+def test_a_scene_says_which_cameras_a_format_lacks(tmp_path: Path) -> None:
+    scene, out = make_scene(models={**FOREIGN_MODEL, "FULL_OPENCV": RATIONAL}), tmp_path / "scene"
+    write_scene(scene, out, {})
+    notes = json.loads((out / "report.json").read_text())["summary"]["notes"]
+    expected = [
+        "rig/camchain.yaml lacks right: Kalibr has no model for it",
+        "rig/camera_info lacks left: ROS has no model for it",
+    ]
+    assert [note for note in notes if note.startswith("rig/")] == expected
+    files = {path.name for path in (out / "rig").rglob("*.*")}
+    assert files == {"camchain.yaml", "right.yaml", "rig.urdf"}
 
 
 def test_the_chain_composes_to_the_poses_in_the_rig() -> None:
@@ -209,11 +267,12 @@ def test_other_cameras_are_refused_by_name(
 def test_a_flipped_bit_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str) -> None:
     original = rig_files.write_rig
 
-    def flipping(cameras: Any, folder: Path) -> None:
-        original(cameras, folder)
+    def flipping(cameras: Any, folder: Path) -> list[str]:
+        notes = original(cameras, folder)
         data = bytearray((folder / file).read_bytes())
         data[len(data) // 2] ^= 1
         (folder / file).write_bytes(data)
+        return notes
 
     monkeypatch.setattr(rig_files, "write_rig", flipping)
     with pytest.raises(MrasfmError, match=f"{re.escape(Path(file).name)} was written but does not read back"):
