@@ -207,6 +207,7 @@ def test_a_file_that_cannot_grow_is_an_os_error(scene: Scene, tmp_path: Path) ->
 
 def test_an_origin_on_a_central_meridian_is_no_matter_of_rounding(tmp_path: Path) -> None:
     scene = make_scene()
+    assert scene.georeference is not None
     for longitude_deg in (9.0, 15.0, 8.999999999999998):
         matrix = geodesy.ecef_from_local([48.1, longitude_deg, 520.0])
         place = replace(scene.georeference, origin_longitude_deg=longitude_deg, ecef_from_local=matrix)
