@@ -19,9 +19,9 @@ from mrasfm_engine.export import (
 )
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE
+from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, TRAJECTORY_FILE
 
-FILES = (COPC_FILE, TRAJECTORY_FILE, RIG_FOLDER, RIGS_FOLDER, AUTOWARE_FOLDER)
+OPTIONAL = (COPC_FILE, AUTOWARE_FOLDER)  # not of every scene
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,7 +41,7 @@ Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  
 
 
 CALIBRATION_FOLDER = "calibration"
-REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, *interchange.FILES)
+REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, *interchange.OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
