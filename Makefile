@@ -38,12 +38,15 @@ docs: setup ## rewrite the generated pages of docs/
 acceptance: setup ## every figure of README.md and docs/, as a table (real drives needed; ACCEPTANCE="--only 1,2", ACCEPTANCE=--thorough)
 	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)
 
-lock: ## renew the locks from pyproject.toml: all, and what the container image needs (needs uv)
+lock: ## renew the locks: of pyproject.toml all, and what the container image needs; readers of others (needs uv)
 	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet -o requirements.lock
 	uv pip compile pyproject.toml --extra build --constraints requirements.lock --universal --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
 	  -o requirements-runtime.lock
+	uv pip compile tests/foreign_readers/requirements.in --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
+	  -o tests/foreign_readers/requirements.lock
 
 schema: setup ## export the JSON Schema of the drive manifest
 	$(BIN)/python -m schemas.export

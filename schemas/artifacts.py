@@ -35,6 +35,11 @@ CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING})  # seam
 
 REPORT_FILE = "report.json"
 MAP_FILE = "map.json"
+COPC_FILE = "points.copc.laz"
+TRAJECTORY_FILE = "trajectory.gpkg"
+RIG_FOLDER = "rig"  # a scene's cameras in other people's formats; of a map: RIGS_FOLDER/SCENE
+RIGS_FOLDER = "rigs"
+AUTOWARE_FOLDER = "autoware"
 PICTURES_FOLDER = "pictures"
 OWN_CAR_FOLDER = "own_car"  # CAMERA.png, 255 where a camera shows the vehicle itself
 COMPONENTS_FOLDER = "components"  # N/, scenes of the parts of a drive that nothing links to the scene
@@ -81,8 +86,8 @@ def seam_checkpoint(a: str, b: str) -> str:
 
 def is_read_by_aggregation(path: str) -> bool:
     """Return whether an aggregation reads this file of a scene."""
-    unread = (PICTURES_FOLDER, OWN_CAR_FOLDER, TEXT_MODEL_FOLDER, COMPONENTS_FOLDER)
-    return not path.startswith(tuple(f"{folder}/" for folder in unread))
+    unread = (PICTURES_FOLDER, OWN_CAR_FOLDER, TEXT_MODEL_FOLDER, COMPONENTS_FOLDER, RIG_FOLDER, AUTOWARE_FOLDER)
+    return path not in (COPC_FILE, TRAJECTORY_FILE) and not path.startswith(tuple(f"{folder}/" for folder in unread))
 
 
 def is_read_by_next_version(path: str) -> bool:

@@ -26,10 +26,14 @@ CONVENTIONS = {
 FILES = {
     "model": "local (COLMAP writes cam_from_world, quaternions w x y z; its world is local)",
     "points.ply": "local",
+    "points.copc.laz": "its own coordinate reference system: UTM with ellipsoidal heights; without one: local",
     "poses.tum": "local_from_rig, quaternions x y z w",
     "poses.json": "world_from_rig and world_from_cam with world = local, and geodetic positions where georeferenced",
+    "trajectory.gpkg": "longitude, latitude and ellipsoidal height where georeferenced, else local",
     "calibration.json": "rig_from_cam",
+    "rig": "rig_from_cam, relative poses of cameras; pixels count from the centre of the top left one",
 }
+ONLY_GEOREFERENCED = {"autoware": "local, raised by the origin's ellipsoidal height"}
 
 
 def frame_document(scene: Scene) -> dict[str, Any]:
@@ -60,4 +64,5 @@ def frame_document(scene: Scene) -> dict[str, Any]:
         local = "metres, axes and origin of the drive's own choosing, not tied to the earth"
     if scene.rough_world_from_local is not None:
         document["rough_world_from_local"] = scene.rough_world_from_local.tolist()
-    return document | {"axes": {"local": local, **AXES}, "conventions": CONVENTIONS, "files": FILES}
+    files = FILES if place is None else FILES | ONLY_GEOREFERENCED
+    return document | {"axes": {"local": local, **AXES}, "conventions": CONVENTIONS, "files": files}

@@ -1,8 +1,9 @@
 """Writes a map's files, checks them, and puts them in place.
 
 A map's folder holds what a scene's does (`model/`, `points.ply`, `poses.tum`, `poses.json`, `frame.json`, `pictures/`,
-`report.json`), `calibration/NAME.json` of every drive, `map.json` (scenes, transforms, seams, verdicts), and in
-`scenes/` and `seams/` what is needed to add scenes to it and take some out. One with a `report.json` is complete.
+`report.json`, what other programs read), `calibration/NAME.json` of every drive, `map.json` (scenes, transforms, seams,
+verdicts), and in `scenes/` and `seams/` what is needed to add scenes to it and take some out. One with a `report.json`
+is complete.
 """
 
 from __future__ import annotations
@@ -16,22 +17,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.export import comparisons, coordinate_frame, picture_files, pose_files, readers
+from mrasfm_engine.export import comparisons, coordinate_frame, interchange, picture_files, pose_files, readers
 from mrasfm_engine.export.check import Check, ReadBack, common_checks
 from mrasfm_engine.export.comparisons import Row, Rows
+from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.export.scene import check_scene, write_common, write_json
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Ints
-from schemas.artifacts import MAP_FILE, PICTURES_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, checkpoint_file
+from schemas.artifacts import (
+    MAP_FILE,
+    PICTURES_FOLDER,
+    RIG_FOLDER,
+    RIGS_FOLDER,
+    SCENES_FOLDER,
+    SEAMS_FOLDER,
+    checkpoint_file,
+)
 
 Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  # by name: key, arrays, documents
 
 
 CALIBRATION_FOLDER = "calibration"
-REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER)
+REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, *interchange.OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +72,7 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
         array for part in (content.scenes, content.seams) for _, arrays, _ in part.values() for array in arrays.values()
     ]
     rows = len(content.scene.observation_point)
-    needed = sum(array.nbytes for array in kept) + 400 * len(content.scene.points_m) + 200 * rows + 4_000_000
+    needed = sum(array.nbytes for array in kept) + 460 * len(content.scene.points_m) + 200 * rows + 4_000_000
     needed += 60 * sum(len(f.xy_px) for f in content.scene.features) + picture_files.size_bytes(content.pictures)
     with publishing(out, needed, replaced=REPLACED) as work:
         return _write(content, work, report)
@@ -71,6 +81,9 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:
     scene, read_back = content.scene, ReadBack(work)
     figures = write_common(scene, work, content.pictures, read_back)
+    rigs = {f"{RIGS_FOLDER}/{name}": f"{name}/" for name in content.calibrations}
+    others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs)
+    figures["notes"] += others.write(work)
     (work / "poses.tum").write_text(_poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", _poses_document(content))
     write_json(work / "frame.json", _frame_document(scene))
@@ -84,7 +97,7 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
             store.save(name, key, arrays, documents)
     written = {**report, "summary": figures}
     write_json(work / COMPLETE_MARK, written)
-    read_back.check(_checks(content))
+    read_back.check([*_checks(content), *others.checks()])
     read_back.require_all()
     return written
 
@@ -145,5 +158,9 @@ def _poses_document(content: MapContent) -> dict[str, Any]:
 
 def _frame_document(scene: Scene) -> dict[str, Any]:
     document = coordinate_frame.frame_document(scene)
-    files = {name: text for name, text in document["files"].items() if name != "calibration.json"}
-    return document | {"files": files | {"calibration/NAME.json": "rig_from_cam of the drive NAME"}}
+    files = {name: text for name, text in document["files"].items() if name not in ("calibration.json", RIG_FOLDER)}
+    of_drives = {
+        "calibration/NAME.json": "rig_from_cam of the drive NAME",
+        f"{RIGS_FOLDER}/NAME": coordinate_frame.FILES[RIG_FOLDER],
+    }
+    return document | {"files": files | of_drives}

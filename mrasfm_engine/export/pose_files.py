@@ -34,7 +34,8 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
     georeferenced, an unknown sigma) is absent, never zero or null.
     """
     cameras = scene.world_from_cam
-    unit_places, camera_places = _geodetic(scene, scene.world_from_rig), _geodetic(scene, cameras)
+    unit_places = geodetic_positions(scene, scene.world_from_rig)
+    camera_places = geodetic_positions(scene, cameras)
     units = []
     for u, frame in enumerate(scene.drive.manifest.frames):
         registered = bool(scene.unit_registered[u])
@@ -74,7 +75,7 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
     }
 
 
-def _geodetic(scene: Scene, world_from_any: Floats) -> Floats | None:
+def geodetic_positions(scene: Scene, world_from_any: Floats) -> Floats | None:
     """Geodetic coordinates (n, 3) of the poses' origins; NaN where a pose is."""
     if scene.georeference is None:
         return None

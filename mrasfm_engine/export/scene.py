@@ -4,7 +4,8 @@ A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text)
 `poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
 scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a camera shows the
 vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the drive that
-nothing links to this one, and `report.json`. One with a `report.json` is complete.
+nothing links to this one, what other programs read (`export.interchange`), and `report.json`. One with a `report.json`
+is complete.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from mrasfm_engine.export import (
     comparisons,
     coordinate_frame,
     feature_database,
+    interchange,
     picture_files,
     ply,
     pose_files,
@@ -32,16 +34,18 @@ from mrasfm_engine.export import (
     road,
 )
 from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
+from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats, Ints
-from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, component_folder
+from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, RIG_FOLDER, component_folder
 
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
+REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, *interchange.OPTIONAL)
 
 
 def write_scene(
@@ -78,7 +82,7 @@ def write_scene(
     for one in scenes:
         check_scene(one)
     needed = sum(map(_size_bytes, scenes)) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=(PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER)) as work:
+    with publishing(out, needed, replaced=REPLACED) as work:
         _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
         for number, (other, own_report) in enumerate(components, start=1):
             folder = work / component_folder(number)
@@ -113,6 +117,9 @@ def _write(
 ) -> None:
     read_back = ReadBack(work)
     figures = write_common(scene, work, pictures, read_back)
+    names = [scene.drive.manifest.name] * len(scene.unit_registered)
+    others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
+    figures["notes"] += others.write(work)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
     feature_database.write_features(scene, work / "features.db")
     if scene.road is not None:
@@ -124,7 +131,7 @@ def _write(
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
     write_json(work / COMPLETE_MARK, {**report, "summary": figures})
-    read_back.check(_checks(scene, pictures))
+    read_back.check([*_checks(scene, pictures), *others.checks()])
     read_back.require_all()
 
 
@@ -201,7 +208,8 @@ def _size_bytes(scene: Scene) -> int:
     """About what the files take, with the database's write-ahead log."""
     keypoints = sum(len(f.xy_px) for f in scene.features)
     matches = sum(len(p.matches) for p in scene.pairs)
-    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + 300 * len(scene.points_m) + 2_000_000
+    other = 360 * len(scene.points_m) + 300 * len(scene.drive.images)
+    return 2 * (140 * keypoints + 20 * matches) + 80 * keypoints + other + 2_000_000
 
 
 def check_scene(scene: Scene) -> None:

@@ -22,6 +22,10 @@ _MEDIA_TYPES = {
     ".pgw": "text/plain; charset=utf-8",
     ".tif": "image/tiff",
     ".db": "application/vnd.sqlite3",
+    ".laz": "application/vnd.laszip",
+    ".yaml": "application/yaml",
+    ".urdf": "application/xml",
+    ".gpkg": "application/geopackage+sqlite3",
 }
 
 

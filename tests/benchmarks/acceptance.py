@@ -32,6 +32,7 @@
 | 28 | a real drive with grey images: parts that images, positions or nothing links |
 | 29 | a stop of a minute: what it costs, and where its units are |
 | 30 | drives cut into sub-maps, beside the same in one piece |
+| 31 | files for other programs, as readers of others read them; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
@@ -63,6 +64,7 @@ from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fisheyes import fisheyes
+from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.gaps import gaps
 from tests.benchmarks.learned import learned
@@ -133,6 +135,7 @@ LINES = {
     "28": Line(untimed=(gaps,)),
     "29": Line(timed=(stops,)),
     "30": Line(untimed=(submaps,)),
+    "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
 }
 

@@ -22,6 +22,10 @@ MISSING_UNIT, MISSING_IMAGE = 1, 9  # the second camera of the last unit
 FILES = {
     "model",
     "points.ply",
+    "points.copc.laz",
+    "trajectory.gpkg",
+    "rig",
+    "autoware",
     "poses.tum",
     "poses.json",
     "calibration.json",
@@ -188,3 +192,18 @@ def scene_with_road(*, far: bool = False) -> Scene:
     patches = np.full(len(points), -1, np.int32)
     patches[:20] = patch[:20]
     return replace(scene, points_m=points, point_classes=classes, point_patches=patches, road=road)
+
+
+def street_of_points(count: int) -> Scene:
+    """The example with other points, along a street of 600 m dense at one end; of observations, their numbers alone."""
+    rng, scene = np.random.default_rng(5), scene_with_road()
+    along = 600 * rng.random(count) ** 2 - 80
+    return replace(
+        scene,
+        points_m=np.column_stack([along, 30 * np.sin(along / 90) + rng.normal(0, 6, count), 4 * rng.random(count)]),
+        point_colors=rng.integers(0, 256, (count, 3), dtype=np.uint8),
+        point_error_px=rng.gamma(2.0, 0.2, count),
+        point_classes=rng.integers(0, 6, count).astype(np.uint8),
+        point_patches=rng.integers(-1, 2, count).astype(np.int32),
+        observation_point=np.sort(rng.integers(0, count, 4 * count)),
+    )

@@ -52,6 +52,7 @@ def test_accuracy_and_files(street: Path, two: Path, mrasfm: Run) -> None:
     assert 0 < seam["rotation_deg"] < 0.1
     assert seam["coarse"]["translation_m"] > 2 * seam["translation_m"]
     expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration", "frame.json", "map.json", "pictures"}
+    expected |= {"points.copc.laz", "trajectory.gpkg", "rigs", "autoware"}
     assert {p.name for p in two.iterdir()} == {*expected, "scenes", "seams", "report.json", ".stages"}
     assert {p.name for p in (two / "pictures").iterdir()} == {
         f"seam-drive_0~drive_1-{when}.png" for when in ("before", "after")

@@ -48,6 +48,25 @@ def test_a_scene_names_its_files(owner: Client, scene_id: str) -> None:
     assert (job["state"], job["scene_id"], job["progress"]["percent"]) == ("SUCCEEDED", scene_id, 100.0)
 
 
+def test_files_for_other_programs_say_what_they_are(owner: Client) -> None:
+    kinds = {
+        "points.copc.laz": "application/vnd.laszip",
+        "trajectory.gpkg": "application/geopackage+sqlite3",
+        "rig/rig.urdf": "application/xml",
+        "rig/camera_info/front.yaml": "application/yaml",
+        "autoware/pointcloud_map.pcd": "application/octet-stream",
+        "pictures/road.tif": "image/tiff",
+    }
+    shown = owner.get(f"/v1/scenes/{owner.scene(dict.fromkeys(kinds, CONTENT))}").json()
+    assert {file["path"]: file["media_type"] for file in shown["files"]} == kinds
+    for file in shown["files"]:
+        downloaded = owner.get(file["url"], headers={"Range": "bytes=375-588"})
+        assert downloaded.status_code == 206
+        assert downloaded.content == CONTENT[375:589]
+        assert downloaded.headers["content-type"] == file["media_type"]
+        assert downloaded.headers["content-disposition"].startswith("attachment")
+
+
 def test_a_whole_download_says_what_it_is(owner: Client, url: str) -> None:
     answer = owner.get(url)
     assert answer.status_code == 200

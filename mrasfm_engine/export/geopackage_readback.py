@@ -1,0 +1,149 @@
+"""Comparison of `trajectory.gpkg` with the scene, for the check before it is put in place."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from mrasfm_engine.export.comparisons import Row, Rows
+from mrasfm_engine.export.geopackage import DESCRIPTIONS, HEIGHTS, LOCAL, TABLES
+from mrasfm_engine.export.pose_files import geodetic_positions
+from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.types import Floats, Ints
+
+Select = Callable[[str], list[tuple[Any, ...]]]
+
+_POINT = np.dtype(
+    [("magic", "S2"), ("version", "u1"), ("flags", "u1"), ("srs", "<i4"), ("order", "u1"), ("kind", "<u4"),
+     ("place", "<f8", 3)]
+)  # fmt: skip
+_LINE = np.dtype(
+    [("magic", "S2"), ("version", "u1"), ("flags", "u1"), ("srs", "<i4"), ("envelope", "<f8", (3, 2)), ("order", "u1"),
+     ("kind", "<u4"), ("count", "<u4")]
+)  # fmt: skip
+
+
+def read_geopackage(path: Path) -> Select:
+    """A function from SQL to all rows."""
+
+    def select(sql: str) -> list[tuple[Any, ...]]:
+        with closing(sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)) as db:
+            return db.execute(sql).fetchall()
+
+    return select
+
+
+def geopackage(scene: Scene, scene_of_unit: Sequence[str], select: Select) -> Rows:
+    """The tables as the standard wants them, and every attribute and coordinate."""
+    yield Row("its application id", select("PRAGMA application_id"), [(0x47504B47,)])
+    yield Row("its version", select("PRAGMA user_version"), [(10300,)])
+    yield Row("its integrity", select("PRAGMA integrity_check"), [("ok",)])
+    tables: dict[str, str] = dict(
+        select("SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%'")
+    )
+    yield Row("its tables", tables, {name: f"CREATE TABLE {name} ({columns})" for name, columns in TABLES.items()})
+    rig, cameras = (_places(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
+    yield from _contents(scene, select, rig=rig, cameras=cameras)
+    for table, places, attributes in (
+        ("unit_positions", rig, list(_units(scene, scene_of_unit))),
+        ("camera_positions", cameras, list(_images(scene, scene_of_unit))),
+    ):
+        rows = select(f"SELECT * FROM {table} ORDER BY fid")
+        yield Row(f"the rows of {table}", [(row[0], *row[2:]) for row in rows], attributes)
+        yield from _points(scene, table, [row[1] for row in rows], places)
+    yield from _lines(scene, scene_of_unit, select("SELECT * FROM trajectory ORDER BY fid"), rig)
+
+
+def _contents(scene: Scene, select: Select, *, rig: Floats, cameras: Floats) -> Rows:
+    srs = _srs(scene)
+    yield Row(
+        "its reference systems",
+        sorted(select("SELECT * FROM gpkg_spatial_ref_sys")),
+        [
+            ("Undefined Cartesian", -1, "NONE", -1, "undefined", LOCAL),
+            ("Undefined geographic", 0, "NONE", 0, "undefined", None),
+            ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), HEIGHTS),
+        ],
+    )
+    changed = _date(max(frame.timestamp_us for frame in scene.drive.manifest.frames)) or "1970-01-01T00:00:00.000Z"
+    extents = {}
+    for table, places in (("trajectory", rig), ("unit_positions", rig), ("camera_positions", cameras)):
+        known = places[~np.isnan(places[:, 0])][:, :2]
+        extents[table] = [*known.min(0).tolist(), *known.max(0).tolist()] if len(known) else [None] * 4
+    described = [(t, "features", t, DESCRIPTIONS[t], changed, *extents[t], srs) for t in sorted(extents)]
+    yield Row("its contents", sorted(select("SELECT * FROM gpkg_contents")), described)
+    geometries = [(t, "geom", "LINESTRING" if t == "trajectory" else "POINT", srs, 1, 0) for t in sorted(extents)]
+    yield Row("its geometry columns", sorted(select("SELECT * FROM gpkg_geometry_columns")), geometries)
+
+
+def _units(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[Any, ...]]:
+    for u, (frame, name) in enumerate(zip(scene.drive.manifest.frames, scene_of_unit, strict=True)):
+        sigma = scene.sigma_position_m[u].tolist()
+        sigma = [None] * 3 if np.isnan(sigma).any() else sigma
+        known = int(scene.unit_registered[u])
+        yield u + 1, name, frame.source_frame, frame.timestamp_us, _date(frame.timestamp_us), known, *sigma
+
+
+def _images(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[Any, ...]]:
+    for i, image in enumerate(scene.drive.images):
+        name, camera = scene_of_unit[image.unit], scene.drive.cameras[image.camera].name
+        when, known = image.timestamp_us, int(scene.image_registered[i])
+        yield i + 1, name, image.unit + 1, camera, image.file, when, _date(when), known
+
+
+def _date(timestamp_us: int) -> str | None:
+    """UTC with three decimals; None before 2000 and from the last second of 9999 on."""
+    if timestamp_us < 946_684_800_000_000 or timestamp_us >= 253_402_300_799_000_000:
+        return None
+    rounded = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=(timestamp_us + 500) // 1000)
+    return rounded.strftime("%Y-%m-%dT%H:%M:%S.") + f"{rounded.microsecond // 1000:03d}Z"
+
+
+def _points(scene: Scene, table: str, blobs: list[bytes | None], places: Floats) -> Rows:
+    known = np.flatnonzero(~np.isnan(places[:, 0]))
+    yield Row(f"which of {table} have a place", [k for k, blob in enumerate(blobs) if blob is not None], known.tolist())
+    found = np.frombuffer(b"".join(blob for blob in blobs if blob is not None), dtype=_POINT)
+    heads = np.unique(found[["magic", "version", "flags", "srs", "order", "kind"]]).tolist()
+    expected = [(b"GP", 0, 1, _srs(scene), 1, 1001)] if len(known) else []
+    yield Row(f"how the geometries of {table} begin", heads, expected)
+    yield Row(f"a place of {table}", found["place"], places[known])
+
+
+def _lines(scene: Scene, scene_of_unit: Sequence[str], rows: list[tuple[Any, ...]], places: Floats) -> Rows:
+    units = {
+        name: _path(scene, np.array([own == name for own in scene_of_unit])) for name in dict.fromkeys(scene_of_unit)
+    }
+    expected = [(name, len(path)) for name, path in units.items() if len(path) > 1]
+    yield Row("the rows of trajectory", [row[2:] for row in rows], expected)
+    yield Row("the ids of trajectory", [row[0] for row in rows], [*range(1, len(rows) + 1)])
+    for _, blob, name, count in rows:
+        head, line = np.frombuffer(blob[: _LINE.itemsize], dtype=_LINE)[0], places[units[name]]
+        described = head[["magic", "version", "flags", "srs", "order", "kind", "count"]].tolist()
+        yield Row(f"the beginning of {name}'s line", described, (b"GP", 0, 5, _srs(scene), 1, 1002, count))
+        yield Row(f"the envelope of {name}'s line", head["envelope"], np.stack([line.min(0), line.max(0)], -1))
+        yield Row(f"{name}'s line", np.frombuffer(blob[_LINE.itemsize :], dtype="<f8").reshape(-1, 3), line)
+
+
+def _path(scene: Scene, of_scene: NDArray[np.bool_]) -> Ints:
+    """Registered units of a scene in order of time."""
+    frames = scene.drive.manifest.frames
+    units = np.flatnonzero(of_scene & scene.unit_registered).tolist()
+    return np.array(sorted(units, key=lambda u: frames[u].timestamp_us), dtype=np.int64)
+
+
+def _places(scene: Scene, poses: Floats) -> Floats:
+    """Origins of poses as `poses.json` has them, as x, y, z; its own check compares them with the poses."""
+    geodetic = geodetic_positions(scene, poses)
+    return poses[:, :3, 3] if geodetic is None else geodetic[:, [1, 0, 2]]
+
+
+def _srs(scene: Scene) -> int:
+    return -1 if scene.georeference is None else 4326

@@ -1,0 +1,18 @@
+from __future__ import annotations
+
+import pytest
+
+from mrasfm_engine.aggregation.load import NEEDED
+from schemas.artifacts import is_read_by_aggregation
+
+
+def test_an_aggregation_fetches_what_it_needs() -> None:
+    assert all(map(is_read_by_aggregation, NEEDED))
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["points.copc.laz", "trajectory.gpkg", "rig/camchain.yaml", "autoware/pointcloud_map.pcd", "pictures/road.tif"],
+)
+def test_an_aggregation_fetches_no_files_for_other_programs(path: str) -> None:
+    assert not is_read_by_aggregation(path)
