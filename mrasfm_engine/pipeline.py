@@ -188,9 +188,9 @@ def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Spa
     stages.load_models(run)
     stages.preflight(run)
     prior = stages.leave_out_standing(run, stages.prior(run))
-    stages.extraction_sizes(run)
     if not stages.is_cut(run):  # else the probe came before
         stages.probe(run)
+    stages.extraction_sizes(run)
     spans = stages.cut_drive(run, workers)
     if spans:
         stages.own_cars(run)

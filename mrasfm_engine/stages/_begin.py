@@ -51,7 +51,7 @@ def probe(run: Run) -> None:
     first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
     features = extract_features(
         Drive(run.drive.root, first),
-        run.extractor,
+        run.components.extractor,
         threads=run.config.threads,
         segmenter=run.components.segmenter,
         cancel=run.cancel,

@@ -9,6 +9,7 @@ import numpy as np
 from mrasfm_engine.features.extraction_size import SizedExtractor, find_sides
 from mrasfm_engine.io.stage_store import fingerprint
 from mrasfm_engine.stages._run import EXTRACTION_SIZE_VERSION, Run
+from schemas.artifacts import Stage
 
 EXTRACTION_SIZE = "extraction-size"
 
@@ -22,6 +23,7 @@ def extraction_sizes(run: Run) -> None:
     stored = run.store.load(EXTRACTION_SIZE, key)
     if stored is None:
         run.require_unplanned()
+        run.begin(Stage.FEATURES)
         started = time.perf_counter()
         found = find_sides(
             run.drive,
