@@ -40,7 +40,9 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "MEI": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "xi"),
 }
 
-FIELDS_OF_VERSION_2 = frozenset({"sigma_principal_point_px", "sigma_distortion", "sigma_time_offset_us"})  # of Camera
+FIELDS_OF_VERSION_2 = frozenset(
+    {"sigma_principal_point_px", "sigma_distortion", "sigma_time_offset_us", "readout_direction"}
+)  # of Camera
 
 MAX_CAMERAS = 64
 MAX_FRAMES = 100_000
@@ -84,6 +86,15 @@ class BodyAxes(StrEnum):
     FLU = "flu"  # forward, left, up: ours, ROS REP 103, nuScenes
     RDF = "rdf"  # right, down, forward: KITTI's cameras
     FRD = "frd"  # forward, right, down: aviation, many inertial units
+
+
+class ReadoutDirection(StrEnum):
+    """Direction in which a rolling shutter reads an image."""
+
+    TOP_TO_BOTTOM = "top_to_bottom"  # row by row, the usual one
+    BOTTOM_TO_TOP = "bottom_to_top"  # a camera mounted upside down whose images were turned
+    LEFT_TO_RIGHT = "left_to_right"  # column by column: a camera mounted on its side, Waymo's
+    RIGHT_TO_LEFT = "right_to_left"
 
 
 class SemanticClass(StrEnum):
@@ -152,6 +163,12 @@ class Camera(_Model):
         None,
         description="rolling shutter: time from the first row to the last, microseconds; an image's timestamp is then "
         "that of its middle row. 0: all rows at once; absent: so it is assumed",
+    )
+    readout_direction: ReadoutDirection | None = Field(
+        None,
+        description="since version 2: direction in which a rolling shutter reads the image as it is stored, by default "
+        "top_to_bottom; for the "
+        "last two, what is said of rows holds for columns",
     )
 
     @field_validator("model")

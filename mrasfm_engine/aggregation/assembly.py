@@ -12,6 +12,7 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.bundle_adjustment.problem import Observations, RowBandMotion
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.scene.row_bands import readout_share
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -153,8 +154,8 @@ class Assembly:
         """Images at times of their own stay where they are relative to their units."""
         if self.simultaneous:
             return None
-        height_px = np.array([camera.height for scene in self.scenes for camera in scene.drive.cameras], dtype=float)
-        return RowBandMotion.held(self.image_unit, height_px)
+        readout = np.stack([readout_share(camera) for scene in self.scenes for camera in scene.drive.cameras])
+        return RowBandMotion.held(self.image_unit, readout)
 
     def observations(self, rows: Ints, point: Ints, num_points: int) -> Observations:
         """Keypoints `rows` (n,) as observations of points `point` (n,), which ascend."""

@@ -74,14 +74,14 @@ class Views(NamedTuple):
 class Bands(NamedTuple):
     """Poses (s, 3, 3) and (s, 3) of row bands in their units, the row band (n,) of every observation, velocities.
 
-    Of these (s, 6) and the heights (c,) of images see `problem.RowBandMotion`.
+    Of these (s, 6) and the readout (c, 3) of images see `problem.RowBandMotion`.
     """
 
     r: Floats
     t: Floats
     of_observation: Ints
     velocity: Floats
-    height_px: Floats
+    readout: Floats
 
 
 class Motion(NamedTuple):
@@ -220,7 +220,9 @@ def linearise(
                     + m1 * (w2 * x0 - w0 * x2 + bands.velocity[band, 4])
                     + m2 * (w0 * x1 - w1 * x0 + bands.velocity[band, 5])
                 )
-                jc[i, 8] = jc[i, 7] * (xy[1] / bands.height_px[c] - 0.5)
+                jc[i, 8] = jc[i, 7] * (
+                    bands.readout[c, 0] * xy[0] + bands.readout[c, 1] * xy[1] + bands.readout[c, 2] - 0.5
+                )
     if jc.shape[1] > 9:
         intrinsics_derivatives(kind, k, cam, proj, s, jc)
     return True

@@ -71,19 +71,19 @@ class RowBandMotion:
     support: Ints  # (s, 3) units whose steps move a row band; -1 where weight is 0
     weight: Floats  # (s, 3) by how much; (1, 0, 0) where it is held to its unit
     velocity: Floats  # (s, 6) of the rig at a row band, in its own axes there: turn (rad/s), motion (m/s)
-    height_px: Floats  # (c,) of the cameras' images
+    readout: Floats  # (c, 3) of the cameras, see `row_bands.readout_share`
     place_bands: Callable[[State], State]  # the state with its row bands computed anew from its units
 
     @staticmethod
-    def held(band_unit: Ints, height_px: Floats) -> RowBandMotion:
-        """Row bands (s,) that stay where they are relative to their units; heights (c,) of the cameras' images."""
+    def held(band_unit: Ints, readout: Floats) -> RowBandMotion:
+        """Row bands (s,) that stay where they are relative to their units, and the readout (c, 3) of the cameras."""
         support = np.full((len(band_unit), 3), -1, dtype=np.int64)
         support[:, 0] = band_unit
         return RowBandMotion(
             support=support,
             weight=np.tile([1.0, 0.0, 0.0], (len(support), 1)),
             velocity=np.zeros((len(support), 6)),
-            height_px=height_px,
+            readout=readout,
             place_bands=lambda s: s,
         )
 

@@ -111,9 +111,9 @@ class Problem:
         if state.simultaneous:
             return views, None
         assert self.observations.band is not None, "a state with row bands has observations in them"
-        held, cameras = np.zeros((len(state.band_rotation), 6)), np.ones(len(self.camera_kind))
-        velocity, height_px = (held, cameras) if self.motion is None else (self.motion.velocity, self.motion.height_px)
-        return views, Bands(state.band_rotation, state.band_position_m, self.observations.band, velocity, height_px)
+        held, cameras = np.zeros((len(state.band_rotation), 6)), np.zeros((len(self.camera_kind), 3))
+        velocity, readout = (held, cameras) if self.motion is None else (self.motion.velocity, self.motion.readout)
+        return views, Bands(state.band_rotation, state.band_position_m, self.observations.band, velocity, readout)
 
     @property
     def _motion(self) -> Motion | None:

@@ -117,7 +117,7 @@ class RigMotion:
         rows = self._bands_of(_with_neighbours(np.flatnonzero(free_units & registered), registered))
         motion = self._motion(state, registered)
         moving = rows[~self._own[self.bands.image[rows]]]
-        held = RowBandMotion.held(self.bands.unit, self.bands.height_px.astype(np.float64))
+        held = RowBandMotion.held(self.bands.unit, self.bands.readout)
         held.support[moving] = motion.support[self.bands.unit[moving]]
         unit, offset_s = self.bands.unit[moving], self._offset_s(state, moving)
         held.weight[moving] = motion.weights(unit, offset_s)

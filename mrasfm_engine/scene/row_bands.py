@@ -1,7 +1,8 @@
 """Row bands: the times at which images were taken. Cameras of a unit need not be simultaneous, nor rows of an image.
 
-A row band is some rows of one image that share one pose: the vehicle hardly moves within its exposure. An image without
-a declared readout time is one row band, and then row bands and images have the same numbers.
+A row band is some rows of one image that share one pose: the vehicle hardly moves within its exposure. Where a camera
+reads columns they take the place of rows. An image without a declared readout time is one row band, and then row bands
+and images have the same numbers.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import numpy as np
 
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import Floats, Ints
+from schemas import Camera
+from schemas.drive import ReadoutDirection
 
 MAX_BAND_S = 0.5e-3  # at 15 m/s a car goes 7 mm in that time
 MAX_BANDS = 65  # an image, which makes 33 ms of bands that short
@@ -27,7 +30,7 @@ class RowBands:
     camera: Ints  # (s,)
     time_offset_s: Floats  # (s,) when the row band's middle row was taken, from its unit's timestamp on
     first_of_image: Ints  # (images + 1,) row bands of image i: first[i]:first[i + 1]
-    height_px: Ints  # (cameras,)
+    readout: Floats  # (cameras, 3) see `readout_share`
     times_vary: bool  # a camera may have a time offset, which moves its row bands from their unit's timestamp
 
     @staticmethod
@@ -55,7 +58,7 @@ class RowBands:
             camera=camera_of_image[image],
             time_offset_s=offset_s,
             first_of_image=first,
-            height_px=np.array([camera.height for camera in drive.cameras], dtype=np.int64),
+            readout=np.stack([readout_share(camera) for camera in drive.cameras]),
             times_vary=compensate and any(camera.sigma_time_offset_us is not None for camera in drive.cameras),
         )
 
@@ -73,13 +76,27 @@ class RowBands:
         result: Ints = (self.first_of_image[:-1] + self.first_of_image[1:]) // 2
         return result
 
-    def of_rows(self, image: Ints, y_px: Floats) -> Ints:
-        """The row bands (n,) that keypoints at heights y_px (n,) of images (n,) belong to."""
+    def of_pixels(self, image: Ints, xy_px: Floats) -> Ints:
+        """The row bands (n,) that keypoints at xy_px (n, 2) of images (n,) belong to."""
         first, count = self.first_of_image[image], np.diff(self.first_of_image)[image]
         camera = self.camera[first] if len(first) else first
-        band = np.floor(y_px / self.height_px[camera] * count).astype(np.int64)
+        readout = self.readout[camera]
+        share = (readout[:, :2] * xy_px).sum(1) + readout[:, 2]
+        band = np.floor(share * count).astype(np.int64)
         result: Ints = first + np.clip(band, 0, count - 1)
         return result
+
+
+def readout_share(camera: Camera) -> Floats:
+    """Weights (3,) of x, y (px) and 1 whose sum is the share of the image that was read before a pixel: 0 to 1."""
+    width, height = float(camera.width), float(camera.height)
+    weights = {
+        ReadoutDirection.TOP_TO_BOTTOM: [0.0, 1.0 / height, 0.0],
+        ReadoutDirection.BOTTOM_TO_TOP: [0.0, -1.0 / height, 1.0],
+        ReadoutDirection.LEFT_TO_RIGHT: [1.0 / width, 0.0, 0.0],
+        ReadoutDirection.RIGHT_TO_LEFT: [-1.0 / width, 0.0, 1.0],
+    }
+    return np.array(weights[camera.readout_direction or ReadoutDirection.TOP_TO_BOTTOM])
 
 
 def _bands(readout_us: int | None) -> int:

@@ -54,7 +54,7 @@ class Keypoints:
             image=image,
             unit=unit_of_image[image],
             camera=camera,
-            band=image if bands is None else bands.of_rows(image, xy[:, 1]),
+            band=image if bands is None else bands.of_pixels(image, xy),
             xy_px=xy,
             rays=rays,
             classes=np.concatenate([f.classes for f in features]),

@@ -87,7 +87,7 @@ def with_bands(case: Case, state: State, seed: int = 0) -> tuple[Problem, State]
     band = o.unit * cameras + o.camera
     seen = project(truth, case.problem.camera_kind, o.unit, o.camera, o.point, band)
     observations = replace(o, xy_px=np.where(np.isfinite(seen), seen, o.xy_px), band=band)
-    held = RowBandMotion.held(np.repeat(np.arange(len(state.unit_rotation)), cameras), np.ones(cameras))
+    held = RowBandMotion.held(np.repeat(np.arange(len(state.unit_rotation)), cameras), np.ones((cameras, 3)))
     return replace(case.problem, observations=observations, motion=held), replace(state, **motion)
 
 
@@ -206,7 +206,7 @@ def following(case: Case) -> tuple[Problem, State]:
             support=motion.support[unit],
             weight=motion.weights(unit, offset_s),
             velocity=motion.velocity_at(unit, offset_s),
-            height_px=np.full(cameras, 720.0),
+            readout=np.tile([0.0, 1 / 720.0, 0.0], (cameras, 1)),
             place_bands=follow,
         ),
         state=truth,
@@ -224,7 +224,7 @@ def test_derivatives_follow_the_trajectory_that_moves_the_bands() -> None:
     # That a unit's rotation bends the way to its neighbours is left out: some percent of a rotation's effect.
     scale = np.sqrt(np.diagonal(h)[:n]) + 1e-9
     np.testing.assert_allclose(system.matrix / np.outer(scale, scale), matrix / np.outer(scale, scale), atol=0.1)
-    held = replace(problem, motion=RowBandMotion.held(np.repeat(np.arange(5), 3), np.ones(3))).normal_equations(
+    held = replace(problem, motion=RowBandMotion.held(np.repeat(np.arange(5), 3), np.ones((3, 3)))).normal_equations(
         state, 0.0
     )
     error, if_held = (np.abs((r.gradient - gradient) / scale).max() for r in (system, held))
