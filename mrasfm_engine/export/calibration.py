@@ -16,7 +16,7 @@ from schemas import CAMERA_MODELS, Camera, Pose
 OBSERVED, ONLY_PRIOR, HELD = "observed", "only the prior", "held"
 
 
-def calibration_document(scene: Scene) -> dict[str, Any]:
+def calibration_document(scene: Scene, component: int = 0) -> dict[str, Any]:
     """The calibration by camera: `given`, `refined`, `difference` about and along the rig's axes, sigma, verdict.
 
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
@@ -25,12 +25,14 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
     say, each camera's against the mean of all unless positions tell that too. Where intrinsics were asked for,
     `observed` and `verdict` have `focal`: of a focal length that the drive does not observe the given value is held.
     `common` are the motions of all cameras together, of which no direction says anything: `observed` of a camera is
-    always among the others.
+    always among the others. `component` is the scene's number where it is one of a drive's smaller components: they
+    take the calibration of the largest, whose observations it rests on.
     """
     cameras = zip(scene.drive.cameras, scene.calibration, strict=True)
     observability = scene.calibration_observability
     return {
         "version": 1,
+        **({"component": component, "from_component": 0} if component else {}),
         **(
             {}
             if observability is None

@@ -226,7 +226,7 @@ def test_ply(scene: Scene, written: Path) -> None:
     head, _, body = (written / "points.ply").read_bytes().partition(b"end_header\n")
     assert b"property float x" in head
     assert f"element vertex {POINTS}\n".encode() in head
-    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4 + 1 + 4)
+    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4 + 1 + 4 + 4)
     np.testing.assert_allclose(np.frombuffer(body[:12], "<f4"), scene.points_m[0], rtol=1e-6)
     assert tuple(body[12:15]) == tuple(scene.point_colors[0])
     assert np.frombuffer(body[15:19], "<i4") == 7
@@ -543,3 +543,38 @@ def test_a_calibration_that_was_adjusted_in_a_map(scene: Scene) -> None:
     kept = ("sigma", "observed", "given", "verdict")
     assert {key: camera[key] for key in kept} == {key: before[key] for key in kept}
     assert change["focal_px"] == before["difference"]["focal_px"]
+
+
+def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
+    """Two units whose points no other one observes are a component of their own, in the same frame."""
+    apart = np.array([0, 0, 0, 2, 2])
+    unit = scene.image_unit[scene.observation_image]
+    first_point_of_others = int(scene.observation_point[-1]) // 2
+    kept = (scene.observation_point < first_point_of_others) == (apart[unit] == 0)
+    split = replace(
+        scene,
+        unit_component=apart,
+        observation_point=scene.observation_point[kept],
+        observation_image=scene.observation_image[kept],
+        observation_keypoint=scene.observation_keypoint[kept],
+    )
+    other = replace(scene, unit_component=np.where(scene.unit_registered, 1, 0))
+    write_scene(split, tmp_path / "out", {}, components=[(other, {"component": 1})])
+    expected = np.where(np.arange(POINTS) < first_point_of_others, 0, 2)
+    rows = readers.ply(tmp_path / "out" / "points.ply")
+    np.testing.assert_array_equal(rows["component"], expected)
+    assert (readers.ply(tmp_path / "out" / "components" / "1" / "points.ply")["component"] == 1).all()
+    listed = load(tmp_path / "out" / "report.json")["components"]
+    assert [(one["component"], one["folder"], one["points"]) for one in listed] == [
+        (0, ".", first_point_of_others),
+        (1, "components/1", POINTS),
+        (2, ".", POINTS - first_point_of_others),
+    ]
+    assert [one["registered_units"] for one in listed] == [2, UNITS - 1, 2]
+    assert [unit.get("component") for unit in load(tmp_path / "out" / "poses.json")["units"]] == [1, None, 1, 1, 1]
+    calibrations = [load(tmp_path / "out" / folder / "calibration.json") for folder in (".", "components/1")]
+    assert "component" not in calibrations[0]
+    assert (calibrations[1]["component"], calibrations[1]["from_component"]) == (1, 0)
+    rows = rows.copy()
+    rows["component"][0] += 1
+    assert [row.agrees for row in comparisons.ply(split, rows) if row.what == "a component"] == [False]
