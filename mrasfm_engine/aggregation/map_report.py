@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,12 +63,18 @@ class MapResult:
     joint_reports: Sequence[Report]
     assembly: Assembly
     adjusted: AdjustedMap
+    left_out: Sequence[Mapping[str, str]]  # names of scenes that are not in the map, and why
 
     @property
     def unconnected(self) -> list[str]:
         """Scenes that no seam connects with the map's other ones."""
         connected = set(self.chains[0].scenes) if len(self.chains[0].scenes) > 1 else set()
         return [scene.name for k, scene in enumerate(self.scenes) if k not in connected]
+
+    @property
+    def component_of_scene(self) -> list[int]:
+        """The number of each scene's chain."""
+        return [next(n for n, chain in enumerate(self.chains) if k in chain.scenes) for k in range(len(self.scenes))]
 
     def ends_of(self, seam: Seam) -> tuple[int, int]:
         """The numbers of a seam's scenes."""
@@ -132,7 +138,7 @@ def loop_findings(loops: Sequence[Loop], scenes: Sequence[str], seams: Sequence[
 def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
     """Content of the map's folder."""
     reference = result.scenes[result.association.reference]
-    scene = map_scene(result.assembly, result.adjusted.model, reference)
+    scene = map_scene(result.assembly, result.adjusted.model, reference, result.component_of_scene)
     by_name = {s.name: s for s in result.scenes}
     return MapContent(
         scene=scene,
@@ -169,6 +175,7 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
         "seams": [_seam(result, number, pictures) for number in range(len(result.seams))],
         "loops": [_loop(result, loop) for loop in result.loops],
         "unconnected": result.unconnected,
+        "left_out": [dict(scene) for scene in result.left_out],
         "joint": [
             {"iterations": r.iterations, "observations": r.observations, "termination": str(r.termination)}
             for r in result.joint_reports
@@ -178,7 +185,6 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
 
 def _scene(result: MapResult, k: int) -> dict[str, Any]:
     scene = result.scenes[k]
-    component = next(n for n, chain in enumerate(result.chains) if k in chain.scenes)
     positions = result.adjusted.positions.get(k)
     connected = scene.name not in result.unconnected
     moved = se3.apply(result.map_from_scene[k], scene.midpoint_m[None])[0]
@@ -188,9 +194,9 @@ def _scene(result: MapResult, k: int) -> dict[str, Any]:
         "fingerprint": scene.fingerprint,
         "drive": scene.manifest.name,
         "verdict": CONNECTED if connected else BY_POSITIONS,
-        "component": component,
+        "component": result.component_of_scene[k],
         "map_from_scene": result.map_from_scene[k],
-        "moved_from_positions_m": float(np.linalg.norm(moved - coarse)),
+        **({"moved_from_positions_m": float(np.linalg.norm(moved - coarse))} if scene.is_placed else {}),
         **({} if positions is None else {"positions_bias_m": positions.bias_m}),
         "registered_units": int(scene.unit_registered.sum()),
         "total_units": len(scene.unit_registered),
@@ -209,7 +215,8 @@ def _seam(result: MapResult, number: int, pictures: Collection[str]) -> dict[str
     if seam.reason:
         document["reason"] = seam.reason
     document |= {key: value for key, value in seam.quality.items() if np.isfinite(value)}
-    document["coarse_a_from_b"] = seam.coarse_a_from_b
+    if np.isfinite(seam.coarse_a_from_b).all():
+        document["coarse_a_from_b"] = seam.coarse_a_from_b
     if seam.accepted:
         document |= {
             "a_from_b": seam.a_from_b,
@@ -273,9 +280,12 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
     coarse = result.map_from_scene[a] @ seam.coarse_a_from_b
     scene_b = result.scenes[b]
     quality = seam.quality
+    by, off = "their first units put them, without positions", ""
+    if "positions_off_m" in quality:
+        by, off = "their positions put them", f"{quality['positions_off_m']:.2f} m off, "
     before = seam_picture(
-        [f"{seam.a} (orange) and {seam.b} (blue), as their positions put them", "before aggregation: "
-         f"{quality['positions_off_m']:.2f} m off, residual {quality['residual_before_px']:.1f} px"],
+        [f"{seam.a} (orange) and {seam.b} (blue), as {by}", "before aggregation: "
+         f"{off}residual {quality['residual_before_px']:.1f} px"],
         (points_a, se3.apply(coarse, scene_b.points_m)),
         (trajectory_a, se3.apply(coarse, scene_b.trajectory_m)),
         centre,

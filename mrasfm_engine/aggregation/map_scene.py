@@ -5,6 +5,8 @@ Cameras and files are called SCENE/NAME; units and images are numbered through, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
@@ -17,7 +19,7 @@ from mrasfm_engine.scene.semantics import majority_class
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
 
 
-def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Scene:
+def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene, component_of_scene: Sequence[int]) -> Scene:
     """The map's poses, points and observations as a scene, in the frame of the reference."""
     rows, point, count = model.rows, model.point, len(model.state.points_m)
     image = assembly.keypoint_image[rows]
@@ -51,6 +53,7 @@ def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Sc
         rough_world_from_local=reference.ecef_from_local if reference.common_world is not None else None,
         unit_from_image=None if assembly.simultaneous else model.state.unit_from_band,
         rig_of_camera=np.repeat(np.arange(len(assembly.scenes)), np.diff(assembly.first_camera)),
+        unit_component=np.array(component_of_scene, dtype=np.int64)[assembly.scene_of_unit],
     )
 
 
@@ -103,7 +106,7 @@ def _features(assembly: Assembly) -> list[ImageFeatures]:
 
 def _georeference(assembly: Assembly, reference: SourceScene) -> Georeference:
     latitude, longitude, height = geodesy.geodetic_from_ecef(reference.ecef_from_local[:3, 3]).tolist()
-    datums = sorted({scene.height_datum for scene in assembly.scenes})
+    datums = sorted({scene.height_datum for scene in assembly.scenes if scene.is_placed})
     return Georeference(
         origin_latitude_deg=latitude,
         origin_longitude_deg=longitude,

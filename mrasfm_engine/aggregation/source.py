@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ class SourceScene:
     features_kind: str  # which extractor, and model, made the descriptors
     height_datum: str  # as declared; heights here are ellipsoidal
     common_world: str | None  # of rough poses, where the scene is not georeferenced
-    ecef_from_local: Floats  # (4, 4); where not georeferenced, rough_world_from_local
+    ecef_from_local: Floats  # (4, 4); where not georeferenced, rough_world_from_local; NaN where not placed
     unit_registered: Bools  # (u,)
     world_from_rig: Floats  # (u, 4, 4), NaN where not registered
     sigma_position_m: Floats  # (u, 3), NaN where not known
@@ -53,6 +53,7 @@ class SourceScene:
     keypoint_xy_px: Floats32  # (n, 2)
     keypoint_point: Ints  # (n,) -1 for none
     descriptors: NDArray[Any]  # (m, D) of the keypoints that observe a point, in their order
+    is_placed: bool = True  # positions, or rough poses of a common world, say where it is
     footprints: dict[float, Floats] = field(default_factory=dict, repr=False, compare=False)  # by depth; see footprint
 
     @cached_property
@@ -128,6 +129,22 @@ class SourceScene:
         half = 0.5 * length[-1]
         return np.array([np.interp(half, length, trajectory[:, k]) for k in range(3)])
 
+    def of_units(self, kept: Bools) -> SourceScene:
+        """The scene as if its drive had only some units (u,); the others have no keypoints."""
+        images = kept[self.image_unit]
+        frames = [frame for frame, keep in zip(self.manifest.frames, kept.tolist(), strict=True) if keep]
+        return replace(
+            self,
+            manifest=self.manifest.model_copy(update={"frames": frames}),
+            unit_registered=self.unit_registered[kept],
+            world_from_rig=self.world_from_rig[kept],
+            sigma_position_m=self.sigma_position_m[kept],
+            image_registered=self.image_registered[images],
+            unit_from_image=self.unit_from_image[images] if len(self.unit_from_image) else self.unit_from_image,
+            keypoint_first=np.concatenate([self.keypoint_first[:-1][images], self.keypoint_first[-1:]]),
+            footprints={},
+        )
+
     def keypoints_with_points(self, image: int) -> Ints:
         """Keypoints (rows of the whole scene) of an image that observe a point."""
         rows = np.arange(self.keypoint_first[image], self.keypoint_first[image + 1])
@@ -141,6 +158,7 @@ class SourceScene:
             "features_kind": self.features_kind,
             "height_datum": self.height_datum,
             "common_world": self.common_world,
+            **({} if self.is_placed else {"is_placed": False}),
         }
 
     def pack(self) -> tuple[Arrays, dict[str, Any]]:

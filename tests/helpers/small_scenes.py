@@ -82,13 +82,16 @@ def drive_along(
     common_world: str | None = None,
     missing_units: Sequence[int] = (),
     cameras_off_deg: float | None = None,
+    own_frame: np.ndarray | None = None,
+    component: int = 0,
     seed: int = 0,
 ) -> Driven:
     """Drive, write the scene, and read it as an aggregation does.
 
     `bias_m` is the receiver's constant error, `bend_m` by how much the scene's ends are bent aside, `scale` its lengths
     in true ones, `offset_ms` when each camera takes its image after its unit's time. With `cameras_off_deg` the scene
-    refined its calibration, and is so uncertain about rotations, and so far off.
+    refined its calibration, and is so uncertain about rotations, and so far off. Without a receiver the scene lies in
+    `own_frame`, street_from_scene (4, 4).
     """
     rng = np.random.default_rng(1000 + seed)
     rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=rng)
@@ -108,6 +111,8 @@ def drive_along(
     believed = se3.inverse(street.ecef_from_street) @ ecef_from_scene
     if common_world is not None:
         believed = se3.transform(np.eye(3), np.round(middle))
+    if own_frame is not None:
+        believed = own_frame
     street_from_scene = se3.transform(np.eye(3), -np.asarray(bias_m)) @ believed
     scene_from_street = se3.inverse(street_from_scene)
 
@@ -144,7 +149,9 @@ def drive_along(
         time_offset_us=None if offset_ms is None else [1000 * ms for ms in offset_ms],
     )
     positions: dict[str, object] = {}
-    if common_world is None:
+    if own_frame is not None:
+        pass
+    elif common_world is None:
         antenna = se3.apply(street_from_rig, np.tile(ANTENNA_M, (units, 1, 1)))[:, 0] + bias_m
         antenna += rng.normal(0.0, gnss_noise_m, antenna.shape)
         positions["gnss"] = _gnss(geodesy.geodetic_from_local(antenna, street.ecef_from_street), gnss_noise_m)
@@ -185,11 +192,11 @@ def drive_along(
         observation_keypoint=keypoint[order],
         features=features,
         pairs=[],
-        georeference=None if common_world is not None else _georeference(biased, ecef_from_scene),
+        georeference=None if positions.keys() != {"gnss"} else _georeference(biased, ecef_from_scene),
         rough_world_from_local=None if common_world is None else believed,
         unit_from_image=unit_from_image if offset_ms is not None else None,
     )
-    write_scene(scene, folder, REPORT)
+    write_scene(scene, folder, {**REPORT, "component": component} if component else REPORT)
     return Driven(
         source=read_scene(folder, folder.name),
         street_from_scene=street_from_scene,
