@@ -26,12 +26,12 @@ class Association:
     map_from_scene: Floats  # (scenes, 4, 4), NaN of scenes that have no positions
     pairs: tuple[tuple[int, int], ...]  # of scenes that are to be compared, the smaller index first
 
-    def of_scenes(self, kept: Sequence[int]) -> Association:
+    def of_scenes(self, chosen: Sequence[int]) -> Association:
         """The same of some scenes, the reference among them, by their new indices."""
-        row = {k: new for new, k in enumerate(kept)}
+        row = {k: new for new, k in enumerate(chosen)}
         return Association(
             reference=row[self.reference],
-            map_from_scene=self.map_from_scene[list(kept)],
+            map_from_scene=self.map_from_scene[list(chosen)],
             pairs=tuple((row[i], row[j]) for i, j in self.pairs if i in row and j in row),
         )
 

@@ -129,16 +129,16 @@ class SourceScene:
         half = 0.5 * length[-1]
         return np.array([np.interp(half, length, trajectory[:, k]) for k in range(3)])
 
-    def of_units(self, kept: Bools) -> SourceScene:
+    def of_units(self, chosen: Bools) -> SourceScene:
         """The scene as if its drive had only some units (u,); the others have no keypoints."""
-        images = kept[self.image_unit]
-        frames = [frame for frame, keep in zip(self.manifest.frames, kept.tolist(), strict=True) if keep]
+        images = chosen[self.image_unit]
+        frames = [frame for frame, keep in zip(self.manifest.frames, chosen.tolist(), strict=True) if keep]
         return replace(
             self,
             manifest=self.manifest.model_copy(update={"frames": frames}),
-            unit_registered=self.unit_registered[kept],
-            world_from_rig=self.world_from_rig[kept],
-            sigma_position_m=self.sigma_position_m[kept],
+            unit_registered=self.unit_registered[chosen],
+            world_from_rig=self.world_from_rig[chosen],
+            sigma_position_m=self.sigma_position_m[chosen],
             image_registered=self.image_registered[images],
             unit_from_image=self.unit_from_image[images] if len(self.unit_from_image) else self.unit_from_image,
             keypoint_first=np.concatenate([self.keypoint_first[:-1][images], self.keypoint_first[-1:]]),

@@ -29,7 +29,7 @@
 | 25 | the own car in images without masks, rendered and real; a bar with the time over a fifth of all images |
 | 26 | traffic without masks: tracks on vehicles that move, and those of the street |
 | 27 | the road's picture of the best views: markings against the painted ones |
-| 28 | a real drive with grey images: parts that images, positions or nothing links |
+| 28 | a real drive with grey images: parts that images, positions or nothing links, and a map that joins them |
 | 29 | a stop of a minute: what it costs, and where its units are |
 | 30 | drives cut into sub-maps, beside the same in one piece |
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
@@ -66,7 +66,7 @@ from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fisheyes import fisheyes
 from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
-from tests.benchmarks.gaps import gaps
+from tests.benchmarks.gaps import components_in_map, gaps
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
 from tests.benchmarks.moving_objects import moving_objects
@@ -132,7 +132,7 @@ LINES = {
     "25": Line(untimed=(real_own_car,), by_seed=(rendered_own_car, bar_with_time)),
     "26": Line(by_seed=(moving_objects,)),
     "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
-    "28": Line(untimed=(gaps,)),
+    "28": Line(untimed=(gaps, components_in_map)),
     "29": Line(timed=(stops,)),
     "30": Line(untimed=(submaps,)),
     "31": Line(timed=(foreign_readers,)),
