@@ -32,6 +32,7 @@ def calibration_document(scene: Scene, component: int = 0) -> dict[str, Any]:
     observability = scene.calibration_observability
     return {
         "version": 1,
+        **({} if scene.drive.manifest.vehicle is None else {"vehicle": scene.drive.manifest.vehicle}),
         **({"component": component, "from_component": 0} if component else {}),
         **(
             {}
