@@ -16,8 +16,9 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.calibrations import calibration_priors
 from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
+from mrasfm_engine.aggregation.vehicles import Vehicle
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
-from mrasfm_engine.bundle_adjustment.priors import Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
@@ -70,6 +71,7 @@ def adjust_map(
     positions: dict[int, DrivePositions],
     config: EngineConfig,
     *,
+    vehicles: Sequence[Vehicle] = (),
     cancel: Callable[[], bool],
 ) -> AdjustedMap:
     """Adjust the units at the seams (or all, or none, as the settings say); then filter what does not fit.
@@ -80,6 +82,8 @@ def adjust_map(
         The joined point (p,) of the assembly's points, -1 for points of one scene alone.
     positions
         Of the assembly's scenes that have any; their bias is estimated here.
+    vehicles
+        Those that several of the scenes' drives name: what the drives tell of their cameras is shared.
     """
     state = assembly.state(world_from_scene)
     owners = all_points(owner)
@@ -96,9 +100,10 @@ def adjust_map(
         motion=assembly.motion,
     )
     free = _free_units(assembly, problem, joined, config)
-    calibrations = calibration_priors(assembly, state, free, config.bundle_adjustment)
+    free, calibrations = _calibrations(assembly, state, free, vehicles, config)
     for prior in calibrations:
         cameras[prior.camera] = True
+    problem = _as_expected(problem, calibrations)
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
     seen[o.point[free[o.unit]]] = True
     reports: list[Report] = []
@@ -128,6 +133,34 @@ def adjust_map(
         dropped_observations=observations,
         dropped_points=points_dropped,
     )
+
+
+def _calibrations(
+    assembly: Assembly, state: State, free: Bools, vehicles: Sequence[Vehicle], config: EngineConfig
+) -> tuple[Bools, list[CameraPosePrior]]:
+    """Units (u,) that vary, all of a scene whose calibration learns from other drives, and priors of calibrations."""
+    if config.aggregation.final_adjustment != "none":
+        expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
+        learning = [k for k, told in expected.items() if told.learns]
+        more = free | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
+        priors = calibration_priors(assembly, state, more, config.bundle_adjustment, expected)
+        if priors:
+            return more, priors
+    return free, calibration_priors(assembly, state, free, config.bundle_adjustment)
+
+
+def _as_expected(problem: Problem, priors: Sequence[CameraPosePrior]) -> Problem:
+    """The problem with cameras where their priors have them, and their points: from far off a prior hardly counts."""
+    state, moved = problem.state, np.zeros(len(problem.camera_kind), dtype=np.bool_)
+    rotation, position_m = state.camera_rotation.copy(), state.camera_position_m.copy()
+    for prior in priors:
+        rotation[prior.camera], position_m[prior.camera] = prior.rotation, prior.position_m
+        off = np.abs(rotation - state.camera_rotation).max((1, 2)) + np.abs(position_m - state.camera_position_m).max(1)
+        moved |= off > 0
+    if not moved.any():
+        return problem
+    moved_state = replace(state, camera_rotation=rotation, camera_position_m=position_m)
+    return _others_refined(replace(problem, state=moved_state), np.zeros(problem.observations.num_points, bool), moved)
 
 
 def _others_refined(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:

@@ -19,6 +19,7 @@ from mrasfm_engine.aggregation.map_scene import map_scene
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.aggregation.vehicles import Knocked, Vehicle
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.export.calibration import document_in_map
@@ -27,7 +28,7 @@ from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
-from schemas.findings import Finding, warning
+from schemas.findings import Finding, listed, warning
 
 MAX_FINDINGS = 5  # of a kind
 MEANINGS = {  # of loops that do not close, and what to do
@@ -63,6 +64,7 @@ class MapResult:
     joint_reports: Sequence[Report]
     assembly: Assembly
     adjusted: AdjustedMap
+    vehicles: Sequence[Vehicle]  # that several drives name
     left_out: Sequence[Mapping[str, str]]  # names of scenes that are not in the map, and why
 
     @property
@@ -93,6 +95,9 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
     """Note scenes that are not connected, and seams that were refused for what they contradict."""
     for finding in loop_findings(result.loops, [s.name for s in result.scenes], [(s.a, s.b) for s in result.seams]):
         run.found(finding)
+    for vehicle in result.vehicles:
+        for one in vehicle.knocked:
+            run.found(_knocked(vehicle, one, [scene.name for scene in result.scenes]))
     names = result.unconnected
     if len(names) == len(result.scenes):
         refused = any(seam.accepted for seam in result.found_seams)
@@ -112,6 +117,21 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Give drives whose trajectories meet theirs.",
             )
         )
+
+
+def _knocked(vehicle: Vehicle, one: Knocked, names: Sequence[str]) -> Finding:
+    """Finding on a camera that contradicts its vehicle."""
+    others = listed([names[k] for k in one.against])
+    if len(one.against) == 1:
+        what = f"in {names[one.scene]} or in {others}: nothing says in which"
+    else:
+        what = f"in {names[one.scene]}: {others} agree on another pose"
+    return warning(
+        "camera-contradicts-vehicle",
+        f"camera {one.camera} of vehicle {vehicle.name} was knocked or exchanged, {what} ({one.sigmas:.1f} sigmas)",
+        "Look at the camera's mount between these drives. Its calibration is not shared between them; if the drives "
+        "are of different vehicles, correct vehicle in their manifests.",
+    )
 
 
 def loop_findings(loops: Sequence[Loop], scenes: Sequence[str], seams: Sequence[tuple[str, str]]) -> list[Finding]:
@@ -175,10 +195,32 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
         "seams": [_seam(result, number, pictures) for number in range(len(result.seams))],
         "loops": [_loop(result, loop) for loop in result.loops],
         "unconnected": result.unconnected,
+        "vehicles": [_vehicle(result, vehicle) for vehicle in result.vehicles],
         "left_out": [dict(scene) for scene in result.left_out],
         "joint": [
             {"iterations": r.iterations, "observations": r.observations, "termination": str(r.termination)}
             for r in result.joint_reports
+        ],
+    }
+
+
+def _vehicle(result: MapResult, vehicle: Vehicle) -> dict[str, Any]:
+    """What was shared of a vehicle's calibration."""
+    names = [scene.name for scene in result.scenes]
+    return {
+        "vehicle": vehicle.name,
+        "scenes": [names[k] for k in vehicle.scenes],
+        "deviation_deg": float(np.degrees(vehicle.deviation_rad)),
+        "deviation_m": vehicle.deviation_m,
+        "learning": [names[k] for k in vehicle.scenes if vehicle.expected[k].learns],
+        "knocked": [
+            {
+                "scene": names[one.scene],
+                "camera": one.camera,
+                "sigmas": one.sigmas,
+                "against": [names[k] for k in one.against],
+            }
+            for one in vehicle.knocked
         ],
     }
 

@@ -21,6 +21,7 @@ from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joi
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.aggregation.vehicles import Vehicle, vehicles_of
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.export.map import write_map
@@ -179,7 +180,8 @@ def _join_scenes(
         chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
     run.ended(Stage.MULTI_SCENE_ADJUSTMENT, started, loops=sum(len(chain.closings) for chain in chains))
-    adjusted = _adjust_map(run, found, known, graph, poses)
+    vehicles = vehicles_of(found, run.config.bundle_adjustment)
+    adjusted = _adjust_map(run, found, known, graph, poses, vehicles)
     return MapResult(
         scenes=found,
         association=known,
@@ -192,6 +194,7 @@ def _join_scenes(
         joint_reports=[r for r in reports if r is not None],
         assembly=Assembly(scenes=found),
         adjusted=adjusted,
+        vehicles=vehicles,
         left_out=[{"name": scene["scene"], "reason": scene["what"]} for scene in run.report["left_out"]],
     )
 
@@ -202,7 +205,12 @@ def _seams_among(graph: SeamGraph, found: Sequence[SourceScene], members: Sequen
 
 
 def _adjust_map(
-    run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
+    run: stages.Run,
+    found: Sequence[SourceScene],
+    known: Association,
+    graph: SeamGraph,
+    poses: Floats,
+    vehicles: Sequence[Vehicle],
 ) -> AdjustedMap:
     started = time.perf_counter()
     run.begin(Stage.MAP_ADJUSTMENT)
@@ -215,7 +223,7 @@ def _adjust_map(
         is not None
     }
     owner = joined_owner(assembly, _seams_among(graph, found, range(len(found))))
-    adjusted = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
+    adjusted = adjust_map(assembly, poses, owner, positions, run.config, vehicles=vehicles, cancel=run.cancel)
     run.ended(
         Stage.MAP_ADJUSTMENT,
         started,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
-from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.drive import Drive, matrix_from_pose
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
-from schemas import DriveManifest
+from schemas import DriveManifest, Pose
 
 ARRAYS = (
     "unit_registered", "world_from_rig", "sigma_position_m", "image_registered", "unit_from_image",
@@ -120,6 +120,12 @@ class SourceScene:
         if not sigmas.shape == known.shape == (len(found), 6) or not ((sigmas > 0) & np.isfinite(sigmas)).all():
             raise ValueError("sigmas of its cameras are not six positive numbers each")
         return sigmas, known
+
+    @cached_property
+    def given_rig_from_cam(self) -> Floats:
+        """Poses (c, 4, 4) of the cameras as the drive's manifest gave them."""
+        given = [self.calibration["cameras"][camera.name]["given"] for camera in self.drive.cameras]
+        return np.stack([matrix_from_pose(Pose(**camera["rig_from_cam"])) for camera in given])
 
     @property
     def midpoint_m(self) -> Floats:
