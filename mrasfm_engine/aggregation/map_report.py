@@ -28,7 +28,7 @@ from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
-from schemas.findings import Finding, listed, warning
+from schemas.findings import Finding, warning
 
 MAX_FINDINGS = 5  # of a kind
 MEANINGS = {  # of loops that do not close, and what to do
@@ -121,11 +121,8 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
 
 def _knocked(vehicle: Vehicle, one: Knocked, names: Sequence[str]) -> Finding:
     """Finding on a camera that contradicts its vehicle."""
-    others = listed([names[k] for k in one.against])
-    if len(one.against) == 1:
-        what = f"in {names[one.scene]} or in {others}: nothing says in which"
-    else:
-        what = f"in {names[one.scene]}: {others} agree on another pose"
+    where = " or in ".join(names[k] for k in one.scenes)
+    what = f"in {where}" + (": nothing says in which" if len(one.scenes) > 1 else ", the other drives agree")
     return warning(
         "camera-contradicts-vehicle",
         f"camera {one.camera} of vehicle {vehicle.name} was knocked or exchanged, {what} ({one.sigmas:.1f} sigmas)",
@@ -214,12 +211,7 @@ def _vehicle(result: MapResult, vehicle: Vehicle) -> dict[str, Any]:
         "deviation_m": vehicle.deviation_m,
         "learning": [names[k] for k in vehicle.scenes if vehicle.expected[k].learns],
         "knocked": [
-            {
-                "scene": names[one.scene],
-                "camera": one.camera,
-                "sigmas": one.sigmas,
-                "against": [names[k] for k in one.against],
-            }
+            {"camera": one.camera, "scenes": [names[k] for k in one.scenes], "sigmas": one.sigmas}
             for one in vehicle.knocked
         ],
     }

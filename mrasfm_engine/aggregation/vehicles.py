@@ -16,7 +16,7 @@ others anything nor is told.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -36,10 +36,11 @@ LEAST_DEVIATION_RAD, LEAST_DEVIATION_M = np.radians(0.01), 0.001
 USUAL_DEVIATION_RAD, USUAL_DEVIATION_M = np.radians(0.03), 0.003
 USUAL_COUNTS = 4.0
 DEVIATIONS = 60  # of which the likeliest is taken
-OUTLIER_DOF = 4.0  # of Student's t: single knocked cameras hardly widen the deviation
+OUTLIER_DOF = 8.0  # of Student's t: single knocked cameras hardly widen the deviation
 NOTHING_OBSERVED = 0.9  # share of the prior's sigma: as in a scene, what leaves more of it says nothing
 LEARNING_SHARE = 0.5  # of a drive's own sigma: where others know that much better, all of its units vary
 COMMON_STEPS = 10
+FAR = 600.0  # a sum of squares beyond this has no probability in floating point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,15 +96,22 @@ class Expected:
 
 @dataclass(frozen=True, kw_only=True)
 class Knocked:
-    """A camera of a drive whose pose contradicts the vehicle's other drives."""
+    """A camera whose pose in one drive contradicts that in the vehicle's other drives.
 
-    scene: int
+    Attributes
+    ----------
+    scenes
+        Where it does; of several, each may be the odd one.
+    sigmas
+        As a normal variable as unlikely.
+    """
+
     camera: str
+    scenes: tuple[int, ...]
     sigmas: float
-    against: tuple[int, ...]  # scenes; of one, nothing says which of the two is the odd one
 
 
-Left = dict[tuple[int, str], Knocked]  # by scene and camera: they tell nothing and are told nothing
+Left = frozenset[tuple[int, str]]  # scenes and cameras that tell nothing and are told nothing
 
 
 @dataclass(kw_only=True)
@@ -147,14 +155,14 @@ def _vehicle(
         deviation_rad=float(deviation[0]),
         deviation_m=float(deviation[3]),
     )
-    knocked: Left = {}
-    while (worst := max(_contradictions(found, deviation, knocked), key=lambda k: k.sigmas, default=None)) is not None:
-        if worst.sigmas <= GATE_SIGMAS:
-            break
-        knocked[worst.scene, worst.camera] = worst
-    vehicle.knocked = list(knocked.values())
+    vehicle.knocked = [
+        one
+        for camera in dict.fromkeys(n for one in found for n in one.names)
+        for one in _knocked(camera, found, deviation)
+    ]
+    left_out = frozenset((scene, one.camera) for one in vehicle.knocked for scene in one.scenes)
     for drive, one in zip(drives, found, strict=True):
-        expected = _expected(one, found, deviation, knocked)
+        expected = _expected(one, found, deviation, left_out)
         vehicle.expected.update(dict.fromkeys(drive, expected))
     return vehicle
 
@@ -202,46 +210,41 @@ def corrected(rig_from_cam: Floats, correction: Floats) -> Floats:
 def _in_one_frame(
     found: Sequence[DriveCalibration], reference: Mapping[str, Floats], deviation: Floats
 ) -> list[DriveCalibration]:
-    """The drives without motions of all cameras together against the first one: images do not show these."""
+    """The drives without motions of all cameras together against the first one: images do not show these.
+
+    In its scene each drive's cameras have no mean correction from the given calibration. So the given ones tell the
+    motion, exactly where they are the same, and else with an error that images correct.
+    """
     first, result = found[0], [found[0]]
     for one in found[1:]:
         rows, others = _shared(one, first)
+        if not rows:
+            result.append(one)
+            continue
+        place_m = np.stack([reference[one.names[row]][:3, 3] for row in rows])
+        off = one.given[rows] - first.given[others]
+        by_given = _common_motion(off, np.ones(off.shape), place_m, np.zeros(6), np.full(6, 1e-9))
+        spread = ((off - _moved_by(by_given, place_m)) ** 2).mean(0) + deviation**2
         seen = (one.information[rows] > 0) & (first.information[others] > 0)
-        difference = np.where(seen, one.by_images[rows] - first.by_images[others], 0.0)
+        off = np.where(seen, one.by_images[rows] - first.by_images[others], 0.0)
         variance = _variance(one.information[rows]) + _variance(first.information[others]) + 2 * deviation**2
-        place = np.stack([reference[one.names[row]][:3, 3] for row in rows]) if len(rows) else np.zeros((0, 3))
-        motion = _common_motion(difference, np.where(seen, 1.0 / variance, 0.0), place, one.sigma_given)
+        motion = _common_motion(off, 1.0 / variance, place_m, by_given, len(rows) / spread)
         moved = _moved_by(motion, np.stack([reference[name][:3, 3] for name in one.names]))
-        result.append(
-            DriveCalibration(
-                scene=one.scene,
-                names=one.names,
-                found=one.found - moved,
-                by_images=one.by_images - moved,
-                information=one.information,
-                given=one.given - moved,
-                sigma_given=one.sigma_given,
-            )
-        )
+        result.append(replace(one, found=one.found - moved, by_images=one.by_images - moved, given=one.given - moved))
     return result
 
 
-def _common_motion(difference: Floats, weight: Floats, place_m: Floats, sigma_given: Floats) -> Floats:
-    """Turn and shift (6,) that all cameras at places (c, 3) have in common, robustly.
-
-    It is as uncertain beforehand as the mean of the cameras is: where nothing is seen of it, it is zero.
-    """
-    design = np.zeros((len(difference), 6, 6))
+def _common_motion(off: Floats, weight: Floats, place_m: Floats, prior: Floats, prior_weight: Floats) -> Floats:
+    """Turn and shift (6,) that cameras at places (c, 3) have in common, robustly, near a prior."""
+    design = np.zeros((len(off), 6, 6))
     design[:, :3, :3] = design[:, 3:, 3:] = np.eye(3)
     design[:, 3:, :3] = -se3.skew(place_m)
-    prior = np.diag(len(sigma_given) / (sigma_given**2).mean(0))
-    motion = np.zeros(6)
+    motion = prior
     for _ in range(COMMON_STEPS):
-        residual = difference - design @ motion
-        whitened = (weight * residual**2).sum(1)
-        robust = weight / (1.0 + whitened / 6.0)[:, None]
-        square = np.einsum("cki,ck,ckj->ij", design, robust, design) + prior
-        motion = np.linalg.solve(square, np.einsum("cki,ck,ck->i", design, robust, difference))
+        usual = max(float(np.median((weight * (off - design @ motion) ** 2).sum(1))), 1e-30)
+        robust = weight / (1.0 + (weight * (off - design @ motion) ** 2).sum(1) / (6.0 * usual))[:, None]
+        square = np.einsum("cki,ck,ckj->ij", design, robust, design) + np.diag(prior_weight)
+        motion = np.linalg.solve(square, np.einsum("cki,ck,ck->i", design, robust, off) + prior_weight * prior)
     return motion
 
 
@@ -289,55 +292,82 @@ def _deviation(found: Sequence[DriveCalibration]) -> Floats:
 
 def _told(
     one: DriveCalibration, camera: str, found: Sequence[DriveCalibration], deviation: Floats, left_out: Left
-) -> tuple[Floats, Floats, Bools, tuple[int, ...]]:
-    """Common pose (6,) of a camera by the images of other drives and the given one, its variance, in which directions
-    any image says something, and the scenes that do.
+) -> tuple[Floats, Floats, Bools]:
+    """Common pose (6,) of a camera by the images of other drives and the given one, its variance, and the directions of
+    which the images say something.
     """
-    others = [
-        (other, other.names.index(camera))
-        for other in found
-        if other.scene != one.scene and camera in other.names and (other.scene, camera) not in left_out
-    ]
     row = one.names.index(camera)
     precision, weighted = one.sigma_given[row] ** -2.0, one.given[row] / one.sigma_given[row] ** 2
     says = np.zeros(6, dtype=np.bool_)
-    for other, k in others:
+    for other in found:
+        if other.scene == one.scene or camera not in other.names or (other.scene, camera) in left_out:
+            continue
+        k = other.names.index(camera)
         known = other.information[k] > 0
         weight = np.where(known, 1.0 / (_variance(other.information[k]) + deviation**2), 0.0)
         precision = precision + weight
         weighted = weighted + weight * np.where(known, other.by_images[k], 0.0)
         says |= known
-    scenes = tuple(other.scene for other, k in others if (other.information[k] > 0).any())
-    return weighted / precision, 1.0 / precision, says, scenes
+    return weighted / precision, 1.0 / precision, says
 
 
-def _contradictions(found: Sequence[DriveCalibration], deviation: Floats, knocked: Left) -> Iterator[Knocked]:
-    """How far the images of each drive are from what the others say of its cameras."""
+def _knocked(camera: str, found: Sequence[DriveCalibration], deviation: Floats) -> Iterator[Knocked]:
+    """Drives in which a camera's pose is not that of the others, one after the other.
+
+    Where leaving out any of several drives makes the others agree, each of them may be the odd one.
+    """
+    left_out: Left = frozenset()
+    while True:
+        sigmas = _contradictions(camera, found, deviation, left_out)
+        odd = {scene: value for scene, value in sigmas.items() if value > GATE_SIGMAS}
+        if not odd:
+            return
+        worst = max(odd, key=lambda scene: odd[scene])
+        enough = [
+            scene
+            for scene in odd
+            if max(_contradictions(camera, found, deviation, left_out | {(scene, camera)}).values(), default=0.0)
+            <= GATE_SIGMAS
+        ]
+        suspects = tuple(sorted({worst, *enough}))
+        yield Knocked(camera=camera, scenes=suspects, sigmas=odd[worst])
+        left_out |= {(scene, camera) for scene in suspects}
+
+
+def _contradictions(
+    camera: str, found: Sequence[DriveCalibration], deviation: Floats, left_out: Left
+) -> dict[int, float]:
+    """Sigmas by scene between what a drive's images say of a camera and what the others say."""
+    result = {}
     for one in found:
-        for row, camera in enumerate(one.names):
-            if (one.scene, camera) in knocked:
-                continue
-            common, variance, says, against = _told(one, camera, found, deviation, knocked)
-            both = says & (one.information[row] > 0)
-            if both.any():
-                off = one.by_images[row] - common
-                total = variance + _variance(one.information[row]) + deviation**2
-                squared = float((off[both] ** 2 / total[both]).sum())
-                sigmas = float(-norm.ppf(chi2.sf(squared, int(both.sum())) / 2.0)) if squared < 600.0 else squared**0.5
-                yield Knocked(scene=one.scene, camera=camera, sigmas=sigmas, against=against)
+        if camera not in one.names or (one.scene, camera) in left_out:
+            continue
+        row = one.names.index(camera)
+        common, variance, says = _told(one, camera, found, deviation, left_out)
+        both = says & (one.information[row] > 0)
+        if both.any():
+            total = variance + _variance(one.information[row]) + deviation**2
+            squared = float(((one.by_images[row] - common)[both] ** 2 / total[both]).sum())
+            result[one.scene] = _as_normal(squared, int(both.sum()))
+    return result
+
+
+def _as_normal(squared: float, dof: int) -> float:
+    """A normal variable as unlikely as a sum of squares."""
+    return float(-norm.ppf(chi2.sf(squared, dof) / 2.0)) if squared < FAR else float(np.sqrt(squared))
 
 
 def _expected(
     one: DriveCalibration,
     found: Sequence[DriveCalibration],
     deviation: Floats,
-    knocked: Left,
+    left_out: Left,
 ) -> Expected:
     correction, sigma = np.zeros(one.found.shape), np.full(one.found.shape, np.inf)
     for row, camera in enumerate(one.names):
-        if (one.scene, camera) in knocked:
+        if (one.scene, camera) in left_out:
             continue
-        common, variance, says, _ = _told(one, camera, found, deviation, knocked)
+        common, variance, says = _told(one, camera, found, deviation, left_out)
         correction[row] = np.where(says, common - one.found[row], 0.0)
         sigma[row] = np.where(says, np.sqrt(variance + deviation**2), np.inf)
     own = np.where(one.information > 0, one.by_images - one.found, 0.0)

@@ -84,6 +84,8 @@ def drive_along(
     cameras_off_deg: float | None = None,
     own_frame: np.ndarray | None = None,
     component: int = 0,
+    vehicle: str | None = None,
+    rig_seed: int | None = None,
     seed: int = 0,
 ) -> Driven:
     """Drive, write the scene, and read it as an aggregation does.
@@ -94,7 +96,8 @@ def drive_along(
     `own_frame`, street_from_scene (4, 4).
     """
     rng = np.random.default_rng(1000 + seed)
-    rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=rng)
+    of_rig = rng if rig_seed is None else np.random.default_rng(1000 + rig_seed)
+    rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=of_rig)
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
     params = np.array([camera.params for camera in rig])
     aside = (TURNED if back else np.eye(4)) @ se3.transform(np.eye(3), [0.0, lateral_m, 0.0])
@@ -157,7 +160,7 @@ def drive_along(
         positions["gnss"] = _gnss(geodesy.geodetic_from_local(antenna, street.ecef_from_street), gnss_noise_m)
     else:
         positions["rough_poses"] = _rough(street_from_rig, np.asarray(bias_m), common_world)
-    manifest = drive.manifest.model_copy(update={"name": folder.name, **positions})
+    manifest = drive.manifest.model_copy(update={"name": folder.name, "version": 2, "vehicle": vehicle, **positions})
     features, keypoint = _features(street, kept[row], image, xy_px, units * cameras, rng)
     order = np.argsort(row, kind="stable")
     scene = Scene(
@@ -203,7 +206,7 @@ def drive_along(
         street_from_rig=street_from_rig,
         point_of_street=kept,
         folder=folder,
-        seed=seed,
+        seed=seed if rig_seed is None else rig_seed,
     )
 
 
