@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.calibrations import calibration_priors
+from mrasfm_engine.aggregation.calibrations import map_calibrations
 from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
 from mrasfm_engine.aggregation.vehicles import Vehicle
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
-from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
@@ -90,20 +90,21 @@ def adjust_map(
     tracks = tracks_of(assembly, owners)
     joined = np.arange(tracks.count) <= int(owner.max(initial=-1))
     state = replace(state, points_m=joined_points_m(state, tracks))
-    cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
+    none = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     problem = Problem(
         state=state,
         camera_kind=assembly.camera_kind,
         observations=assembly.observations(tracks.rows, tracks.point, tracks.count),
-        layout=Layout.from_free(np.zeros(len(assembly.registered), dtype=np.bool_), cameras),
+        layout=Layout.from_free(np.zeros(len(assembly.registered), dtype=np.bool_), none),
         options=_options(config),
         motion=assembly.motion,
     )
     free = _free_units(assembly, problem, joined, config)
-    free, calibrations = _calibrations(assembly, state, free, vehicles, config)
-    for prior in calibrations:
-        cameras[prior.camera] = True
-    problem = _as_expected(problem, calibrations)
+    if config.aggregation.final_adjustment == "none":
+        vehicles = ()
+    calibrations = map_calibrations(assembly, state, free, vehicles, config.bundle_adjustment)
+    free, cameras = calibrations.free_units, calibrations.cameras
+    problem = _with_cameras(problem, calibrations.at_priors(state))
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
     seen[o.point[free[o.unit]]] = True
     reports: list[Report] = []
@@ -111,8 +112,8 @@ def adjust_map(
     for _ in range(ROUNDS if free.any() else 0):
         part = replace(
             problem.of_points(seen),
-            layout=Layout.from_free(free, cameras),
-            terms=[*_terms(assembly, positions, free), *calibrations],
+            layout=Layout.from_free(free, cameras, free_intrinsics=calibrations.free_intrinsics),
+            terms=[*_terms(assembly, positions, free), *calibrations.terms],
         )
         solution, report = solve_with_chosen_points(
             part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
@@ -135,32 +136,14 @@ def adjust_map(
     )
 
 
-def _calibrations(
-    assembly: Assembly, state: State, free: Bools, vehicles: Sequence[Vehicle], config: EngineConfig
-) -> tuple[Bools, list[CameraPosePrior]]:
-    """Units (u,) that vary, all of a scene whose calibration learns from other drives, and priors of calibrations."""
-    if config.aggregation.final_adjustment != "none":
-        expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
-        learning = [k for k, told in expected.items() if told.learns]
-        more = free | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
-        priors = calibration_priors(assembly, state, more, config.bundle_adjustment, expected)
-        if priors:
-            return more, priors
-    return free, calibration_priors(assembly, state, free, config.bundle_adjustment)
-
-
-def _as_expected(problem: Problem, priors: Sequence[CameraPosePrior]) -> Problem:
-    """The problem with cameras where their priors have them, and their points: from far off a prior hardly counts."""
-    state, moved = problem.state, np.zeros(len(problem.camera_kind), dtype=np.bool_)
-    rotation, position_m = state.camera_rotation.copy(), state.camera_position_m.copy()
-    for prior in priors:
-        rotation[prior.camera], position_m[prior.camera] = prior.rotation, prior.position_m
-        off = np.abs(rotation - state.camera_rotation).max((1, 2)) + np.abs(position_m - state.camera_position_m).max(1)
-        moved |= off > 0
-    if not moved.any():
-        return problem
-    moved_state = replace(state, camera_rotation=rotation, camera_position_m=position_m)
-    return _others_refined(replace(problem, state=moved_state), np.zeros(problem.observations.num_points, bool), moved)
+def _with_cameras(problem: Problem, state: State) -> Problem:
+    """The problem with another state's cameras, and the points that those observe which are elsewhere now."""
+    before = problem.state
+    moved = np.zeros(len(problem.camera_kind), dtype=np.bool_)
+    for name in ("camera_rotation", "camera_position_m", "camera_params"):
+        moved |= (getattr(state, name) != getattr(before, name)).reshape(len(moved), -1).any(1)
+    varied = np.zeros(problem.observations.num_points, dtype=np.bool_)
+    return _others_refined(replace(problem, state=state), varied, moved)
 
 
 def _others_refined(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:

@@ -26,6 +26,7 @@ from mrasfm_engine.export.calibration import document_in_map
 from mrasfm_engine.export.map import MapContent
 from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
 from schemas.findings import Finding, warning
@@ -176,9 +177,11 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
 
 def _calibration(result: MapResult, k: int) -> dict[str, Any]:
     scene, first = result.scenes[k], int(result.assembly.first_camera[k])
-    rig_from_cam = result.adjusted.model.state.rig_from_cam[first:]
-    names = [camera.name for camera in scene.drive.cameras]
-    return document_in_map(scene.calibration, dict(zip(names, rig_from_cam, strict=False)))
+    state = result.adjusted.model.state
+    cameras = zip(scene.drive.cameras, state.rig_from_cam[first:], state.camera_params[first:], strict=False)
+    return document_in_map(
+        scene.calibration, {camera.name: (pose, unpack_camera(camera.model, p)) for camera, pose, p in cameras}
+    )
 
 
 def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]:
@@ -209,6 +212,7 @@ def _vehicle(result: MapResult, vehicle: Vehicle) -> dict[str, Any]:
         "scenes": [names[k] for k in vehicle.scenes],
         "deviation_deg": float(np.degrees(vehicle.deviation_rad)),
         "deviation_m": vehicle.deviation_m,
+        "deviation_focal": vehicle.deviation_focal,
         "learning": [names[k] for k in vehicle.scenes if vehicle.expected[k].learns],
         "knocked": [
             {"camera": one.camera, "scenes": [names[k] for k in one.scenes], "sigmas": one.sigmas}

@@ -13,6 +13,7 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.map_adjustment import MapModel
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import geodesy
+from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.scene.semantics import majority_class
@@ -84,13 +85,15 @@ def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]
     return [
         CameraCalibration(
             rig_from_cam=rig_from_cam,
-            params=np.array(camera.params),
+            params=unpack_camera(camera.model, params),
             sigma_rotation_deg=unknown,
             sigma_translation_m=unknown,
             sigma_focal_px=float("nan"),
             observed=np.zeros(6, dtype=np.bool_),
         )
-        for camera, rig_from_cam in zip(cameras, model.state.rig_from_cam, strict=True)
+        for camera, rig_from_cam, params in zip(
+            cameras, model.state.rig_from_cam, model.state.camera_params, strict=True
+        )
     ]
 
 

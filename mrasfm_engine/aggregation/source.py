@@ -127,6 +127,19 @@ class SourceScene:
         given = [self.calibration["cameras"][camera.name]["given"] for camera in self.drive.cameras]
         return np.stack([matrix_from_pose(Pose(**camera["rig_from_cam"])) for camera in given])
 
+    @cached_property
+    def given_focal_px(self) -> Floats:
+        """Focal lengths (c,) of the cameras as the drive's manifest gave them."""
+        given = [self.calibration["cameras"][camera.name]["given"] for camera in self.drive.cameras]
+        return np.array([camera["params"][0] for camera in given], dtype=np.float64)
+
+    @cached_property
+    def sigma_focal_px(self) -> Floats:
+        """Sigmas (c,) of the focal lengths that the drive observed; NaN where it did not, or nobody asked."""
+        found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
+        known = [c["sigma"].get("focal_px", np.nan) if c["observed"].get("focal") else np.nan for c in found]
+        return np.array(known, dtype=np.float64)
+
     @property
     def midpoint_m(self) -> Floats:
         """The middle of the trajectory (3,): half of the trajectory along it."""

@@ -1,7 +1,8 @@
 """Calibrations of one vehicle over its drives: what each drive may expect of its cameras from the others.
 
-The poses of a camera in the drives of one vehicle deviate from a common pose by little: temperature, load, a mount that
-gives way. Direction by direction (rotation about and translation along the rig's x, y, z)
+The calibrations of a camera in the drives of one vehicle deviate from a common one by little: temperature, load, a
+mount that gives way. Direction by direction (rotation about and translation along the rig's x, y, z, logarithm of the
+focal length)
 
     common ~ N(given, sigma_given^2),  of a drive ~ N(common, deviation^2),  as its images say ~ N(of the drive, 1 / w)
 
@@ -29,11 +30,12 @@ from mrasfm_engine.types import Bools, Floats
 from schemas.artifacts import drive_of_scene
 
 GATE_SIGMAS = 4.0
-ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
+ROTATION, TRANSLATION, FOCAL = slice(0, 3), slice(3, 6), slice(6, 7)
+DIRECTIONS = 7
 # Cameras on a frame of metal: no two drives agree better than that.
-LEAST_DEVIATION_RAD, LEAST_DEVIATION_M = np.radians(0.01), 0.001
+LEAST_DEVIATION_RAD, LEAST_DEVIATION_M, LEAST_DEVIATION_FOCAL = np.radians(0.01), 0.001, 0.0002
 # What is expected before any drives were compared; it counts as so many differences.
-USUAL_DEVIATION_RAD, USUAL_DEVIATION_M = np.radians(0.03), 0.003
+USUAL_DEVIATION_RAD, USUAL_DEVIATION_M, USUAL_DEVIATION_FOCAL = np.radians(0.03), 0.003, 0.0005
 USUAL_COUNTS = 4.0
 DEVIATIONS = 60  # of which the likeliest is taken
 OUTLIER_DOF = 8.0  # of Student's t: single knocked cameras hardly widen the deviation
@@ -45,12 +47,12 @@ FAR = 600.0  # a sum of squares beyond this has no probability in floating point
 
 @dataclass(frozen=True, kw_only=True)
 class DriveCalibration:
-    """Calibration of one drive as its scene found it, as corrections (c, 6) from a reference.
+    """Calibration of one drive as its scene found it, as corrections (c, DIRECTIONS) from a reference.
 
     Attributes
     ----------
     found
-        Rotation vectors (rad) and translations (m) in rig axes.
+        Rotation vectors (rad) and translations (m) in rig axes, and logarithms of focal lengths.
     by_images
         What the images alone say; NaN where they say nothing.
     information
@@ -70,7 +72,7 @@ class DriveCalibration:
 
 @dataclass(frozen=True, kw_only=True)
 class Expected:
-    """Expectation of a drive's cameras from the vehicle's other drives, as corrections (c, 6) from its scene's.
+    """Expectation of a drive's cameras from other drives of its vehicle, as corrections (c, DIRECTIONS) of its scene's.
 
     Attributes
     ----------
@@ -122,6 +124,7 @@ class Vehicle:
     scenes: list[int]
     deviation_rad: float
     deviation_m: float
+    deviation_focal: float  # relative
     expected: dict[int, Expected] = field(default_factory=dict)  # by scene
     knocked: list[Knocked] = field(default_factory=list)
 
@@ -140,12 +143,12 @@ def _vehicle(
 ) -> Vehicle:
     """One vehicle; components of a drive have one calibration, that of the first of them."""
     reference = {
-        camera.name: pose
+        camera.name: (pose, camera.params[0])
         for k, *_ in drives
         for camera, pose in zip(scenes[k].drive.cameras, scenes[k].drive.rig_from_cam, strict=True)
     }
     found = [_calibration(k, scenes[k], reference, config) for k, *_ in drives]
-    deviation = np.repeat([USUAL_DEVIATION_RAD, USUAL_DEVIATION_M], 3)
+    deviation = np.repeat([USUAL_DEVIATION_RAD, USUAL_DEVIATION_M, USUAL_DEVIATION_FOCAL], [3, 3, 1])
     for _ in range(2):  # the common motion depends on the deviation a little
         found = _in_one_frame(found, reference, deviation)
         deviation = _deviation(found)
@@ -154,6 +157,7 @@ def _vehicle(
         scenes=[k for drive in drives for k in drive],
         deviation_rad=float(deviation[0]),
         deviation_m=float(deviation[3]),
+        deviation_focal=float(deviation[6]),
     )
     vehicle.knocked = [
         one
@@ -168,19 +172,29 @@ def _vehicle(
 
 
 def _calibration(
-    k: int, scene: SourceScene, reference: Mapping[str, Floats], config: BundleAdjustmentConfig
+    k: int, scene: SourceScene, reference: Mapping[str, tuple[Floats, float]], config: BundleAdjustmentConfig
 ) -> DriveCalibration:
     cameras = scene.drive.cameras
     names = tuple(camera.name for camera in cameras)
-    base = np.stack([reference[name] for name in names])
+    base, base_focal_px = (np.stack([reference[name][part] for name in names]) for part in (0, 1))
+    focal_px, given_focal_px = np.array([camera.params[0] for camera in cameras]), scene.given_focal_px
+    known = [None if c.sigma_focal_px is None else c.sigma_focal_px / f for c, f in zip(cameras, focal_px, strict=True)]
     sigma_given = np.column_stack(
         [
             np.radians([camera.sigma_rotation_deg or config.sigma_rotation_deg for camera in cameras]),
             [camera.sigma_translation_m or config.sigma_translation_m for camera in cameras],
+            [config.sigma_focal if sigma is None else sigma for sigma in known],
         ]
-    ).repeat(3, axis=1)
-    found, given = corrections(scene.drive.rig_from_cam, base), corrections(scene.given_rig_from_cam, base)
-    sigma = sigma_given if scene.certainty_of_cameras is None else scene.certainty_of_cameras[0]
+    ).repeat([3, 3, 1], axis=1)
+    found, given = (
+        np.column_stack([corrections(poses, base), np.log(focal / base_focal_px)])
+        for poses, focal in ((scene.drive.rig_from_cam, focal_px), (scene.given_rig_from_cam, given_focal_px))
+    )
+    sigma = sigma_given.copy()
+    if scene.certainty_of_cameras is not None:
+        sigma[:, :6] = scene.certainty_of_cameras[0]
+    observed = np.isfinite(scene.sigma_focal_px) & config.refine_focal
+    sigma[observed, 6] = (scene.sigma_focal_px / focal_px)[observed]
     says = sigma < NOTHING_OBSERVED * sigma_given
     information = np.where(says, sigma**-2.0 - sigma_given**-2.0, 0.0)
     without_prior = (found - given) / (sigma_given**2 * np.where(says, information, np.inf))
@@ -208,7 +222,7 @@ def corrected(rig_from_cam: Floats, correction: Floats) -> Floats:
 
 
 def _in_one_frame(
-    found: Sequence[DriveCalibration], reference: Mapping[str, Floats], deviation: Floats
+    found: Sequence[DriveCalibration], reference: Mapping[str, tuple[Floats, float]], deviation: Floats
 ) -> list[DriveCalibration]:
     """The drives without motions of all cameras together against the first one: images do not show these.
 
@@ -221,15 +235,15 @@ def _in_one_frame(
         if not rows:
             result.append(one)
             continue
-        place_m = np.stack([reference[one.names[row]][:3, 3] for row in rows])
-        off = one.given[rows] - first.given[others]
+        place_m = np.stack([reference[one.names[row]][0][:3, 3] for row in rows])
+        off = (one.given[rows] - first.given[others])[:, :6]
         by_given = _common_motion(off, np.ones(off.shape), place_m, np.zeros(6), np.full(6, 1e-9))
-        spread = ((off - _moved_by(by_given, place_m)) ** 2).mean(0) + deviation**2
+        spread = ((off - _moved_by(by_given, place_m)[:, :6]) ** 2).mean(0) + deviation[:6] ** 2
         seen = (one.information[rows] > 0) & (first.information[others] > 0)
-        off = np.where(seen, one.by_images[rows] - first.by_images[others], 0.0)
+        off = np.where(seen, one.by_images[rows] - first.by_images[others], 0.0)[:, :6]
         variance = _variance(one.information[rows]) + _variance(first.information[others]) + 2 * deviation**2
-        motion = _common_motion(off, 1.0 / variance, place_m, by_given, len(rows) / spread)
-        moved = _moved_by(motion, np.stack([reference[name][:3, 3] for name in one.names]))
+        motion = _common_motion(off, 1.0 / variance[:, :6], place_m, by_given, len(rows) / spread)
+        moved = _moved_by(motion, np.stack([reference[name][0][:3, 3] for name in one.names]))
         result.append(replace(one, found=one.found - moved, by_images=one.by_images - moved, given=one.given - moved))
     return result
 
@@ -249,8 +263,9 @@ def _common_motion(off: Floats, weight: Floats, place_m: Floats, prior: Floats, 
 
 
 def _moved_by(motion: Floats, place_m: Floats) -> Floats:
+    """Corrections (c, DIRECTIONS) of cameras at places (c, 3) by a motion of all together."""
     turn = np.tile(motion[:3], (len(place_m), 1))
-    return np.concatenate([turn, motion[3:] + np.cross(turn, place_m)], axis=1)
+    return np.concatenate([turn, motion[3:] + np.cross(turn, place_m), np.zeros((len(place_m), 1))], axis=1)
 
 
 def _variance(information: Floats) -> Floats:
@@ -264,14 +279,16 @@ def _shared(one: DriveCalibration, other: DriveCalibration) -> tuple[list[int], 
 
 
 def _deviation(found: Sequence[DriveCalibration]) -> Floats:
-    """Standard deviations (6,) of drives from the common calibration, one for rotations and one for translations.
+    """Standard deviations (DIRECTIONS,) of drives from the common calibration, one each for rotations, translations and
+    focal lengths.
 
     The likeliest ones for the differences of all pairs of drives, which have heavy tails, and for what is usual.
     """
-    result = np.zeros(6)
+    result = np.zeros(DIRECTIONS)
     for kind, usual, least in (
         (ROTATION, USUAL_DEVIATION_RAD, LEAST_DEVIATION_RAD),
         (TRANSLATION, USUAL_DEVIATION_M, LEAST_DEVIATION_M),
+        (FOCAL, USUAL_DEVIATION_FOCAL, LEAST_DEVIATION_FOCAL),
     ):
         squares, variances = np.zeros(0), np.zeros(0)
         for one, other in combinations(found, 2):
@@ -293,12 +310,12 @@ def _deviation(found: Sequence[DriveCalibration]) -> Floats:
 def _told(
     one: DriveCalibration, camera: str, found: Sequence[DriveCalibration], deviation: Floats, left_out: Left
 ) -> tuple[Floats, Floats, Bools]:
-    """Common pose (6,) of a camera by the images of other drives and the given one, its variance, and the directions of
-    which the images say something.
+    """Common calibration (DIRECTIONS,) of a camera by the images of other drives and the given one, its variance, and
+    the directions of which the images say something.
     """
     row = one.names.index(camera)
     precision, weighted = one.sigma_given[row] ** -2.0, one.given[row] / one.sigma_given[row] ** 2
-    says = np.zeros(6, dtype=np.bool_)
+    says = np.zeros(DIRECTIONS, dtype=np.bool_)
     for other in found:
         if other.scene == one.scene or camera not in other.names or (other.scene, camera) in left_out:
             continue

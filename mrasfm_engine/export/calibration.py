@@ -56,25 +56,36 @@ def _common(observability: CalibrationObservability) -> dict[str, Any]:
     }
 
 
-def document_in_map(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
+def document_in_map(document: Mapping[str, Any], found: Mapping[str, tuple[Floats, Floats]]) -> dict[str, Any]:
     """A scene's `calibration.json` after its cameras were adjusted in a map: `refined` and `difference` are the map's.
+
+    They are given by name: poses (4, 4) and COLMAP's parameters.
 
     `since_scene` is by how much that is another pose than the scene found, and absent where nothing moved; everything
     else is as the scene found it.
     """
-    return {**document, "cameras": {k: _camera_in_map(c, rig_from_cam[k]) for k, c in document["cameras"].items()}}
+    return {**document, "cameras": {k: _camera_in_map(c, *found[k]) for k, c in document["cameras"].items()}}
 
 
-def _camera_in_map(camera: Mapping[str, Any], rig_from_cam: Floats) -> dict[str, Any]:
+def _camera_in_map(camera: Mapping[str, Any], rig_from_cam: Floats, params: Floats) -> dict[str, Any]:
     given, found = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("given", "refined"))
-    if np.array_equal(found, rig_from_cam):
+    before = np.array(camera["refined"]["params"])
+    if np.array_equal(found, rig_from_cam) and np.array_equal(before, params):
         return dict(camera)
+    focal = _focal_places(camera["model"])
+    off_px = (float(np.mean((params - np.array(p))[focal])) for p in (camera["given"]["params"], before))
+    since_given, since_scene = ({**_difference(p, rig_from_cam), "focal_px": next(off_px)} for p in (given, found))
+    refined = {"rig_from_cam": pose_from_matrix(rig_from_cam).model_dump(), "params": params.tolist()}
     return {
         **camera,
-        "refined": {**camera["refined"], "rig_from_cam": pose_from_matrix(rig_from_cam).model_dump()},
-        "difference": {**camera["difference"], **_difference(given, rig_from_cam)},
-        "since_scene": _difference(found, rig_from_cam),
+        "refined": {**camera["refined"], **refined},
+        "difference": {**camera["difference"], **since_given},
+        "since_scene": since_scene,
     }
+
+
+def _focal_places(model: str) -> list[int]:
+    return [k for k, name in enumerate(CAMERA_MODELS[model]) if name in ("f", "fx", "fy")]
 
 
 def _difference(given: Floats, refined: Floats) -> dict[str, Any]:
@@ -94,7 +105,7 @@ def verdict_in_words(refined: CameraCalibration) -> list[str]:
 def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
     given = matrix_from_pose(camera.rig_from_cam)
     names = CAMERA_MODELS[camera.model]
-    focal = [k for k, name in enumerate(names) if name in ("f", "fx", "fy")]
+    focal = _focal_places(camera.model)
     words = verdict_in_words(refined)
     sigma = {
         "rotation_deg": refined.sigma_rotation_deg,

@@ -66,7 +66,7 @@ def seen(
     for c, camera in enumerate(base.drive.cameras):
         cameras.append(camera.model_copy(update={"rig_from_cam": pose_from_matrix(poses[c])}))
         entries[camera.name] = {
-            "given": {"rig_from_cam": pose_from_matrix(truth.given[c]).model_dump()},
+            "given": {"rig_from_cam": pose_from_matrix(truth.given[c]).model_dump(), "params": camera.params},
             "sigma": {
                 "rotation_deg": np.degrees(posterior[c, :3]).tolist(),
                 "translation_m": posterior[c, 3:].tolist(),
@@ -99,8 +99,8 @@ def test_a_drive_that_observes_little_learns_from_one_that_observes_much(base: S
         expected = vehicle.expected[2]
         found = corrections(scenes[2].drive.rig_from_cam, truth.given)
         before.append(found - truth.own[2])
-        after.append(found + expected.correction - truth.own[2])
-        whitened.append(after[-1] / expected.sigma)
+        after.append(found + expected.correction[:, :6] - truth.own[2])
+        whitened.append(after[-1] / expected.sigma[:, :6])
     for kind, ratio in ((slice(0, 3), 0.25), (slice(3, 6), 0.35)):
         rms = [float(np.sqrt(np.mean(np.array(errors)[..., kind] ** 2))) for errors in (before, after)]
         assert 0.02 * rms[0] < rms[1] < ratio * rms[0]
@@ -151,7 +151,7 @@ def test_a_common_motion_of_all_cameras_is_no_difference(base: SourceScene) -> N
     entries = {
         camera.name: {
             **scenes[1].calibration["cameras"][camera.name],
-            "given": {"rig_from_cam": pose_from_matrix(moved @ given).model_dump()},
+            "given": {"rig_from_cam": pose_from_matrix(moved @ given).model_dump(), "params": camera.params},
         }
         for camera, given in zip(cameras, truth.given, strict=True)
     }
@@ -161,7 +161,7 @@ def test_a_common_motion_of_all_cameras_is_no_difference(base: SourceScene) -> N
     other = replace(scenes[1], manifest=manifest, calibration={**scenes[1].calibration, "cameras": entries})
     here, there = (one_vehicle([scenes[0], scene]).expected[1] for scene in (scenes[1], other))
     assert 0 < np.abs(there.correction - here.correction)[:, :3].max() < np.radians(0.15)
-    assert 0 < np.abs(there.correction - here.correction)[:, 3:].max() < 0.01
+    assert 0 < np.abs(there.correction - here.correction)[:, 3:6].max() < 0.01
 
 
 def knocked(scene: SourceScene, camera: int, by_deg: float) -> SourceScene:
@@ -199,7 +199,7 @@ def test_two_drives_do_not_tell_in_which_a_camera_was_knocked(base: SourceScene)
     assert [one.scenes for one in vehicle.knocked] == [(0, 1)]
     for expected in vehicle.expected.values():
         assert np.isinf(expected.sigma[3]).all()
-        assert np.isfinite(expected.sigma[[0, 1, 2, 4, 5]]).all()
+        assert np.isfinite(expected.sigma[[0, 1, 2, 4, 5], :6]).all()
 
 
 def test_vehicles_that_differ_and_drives_without_one_share_nothing(base: SourceScene) -> None:
@@ -236,7 +236,42 @@ def test_drives_whose_cameras_are_others_in_part(base: SourceScene) -> None:
     other = replace(other, manifest=manifest, calibration={**other.calibration, "cameras": entries})
     expected = one_vehicle([first, other]).expected[1]
     assert np.isinf(expected.sigma[2]).all()
-    assert np.isfinite(expected.sigma[[0, 1, 3, 4, 5]]).all()
+    assert np.isfinite(expected.sigma[[0, 1, 3, 4, 5], :6]).all()
+
+
+def with_focal(scene: SourceScene, longer: float, sigma: float | None) -> SourceScene:
+    """A scene that found its focal lengths so much longer than given, or held them."""
+    cameras, entries = [], {}
+    for camera in scene.drive.cameras:
+        entry = scene.calibration["cameras"][camera.name]
+        fx, fy, *rest = entry["given"]["params"]
+        cameras.append(camera.model_copy(update={"params": [fx * (1 + longer), fy * (1 + longer), *rest]}))
+        focal = {} if sigma is None else {"focal_px": sigma * fx}
+        entries[camera.name] = {
+            **entry,
+            "sigma": entry["sigma"] | focal,
+            "observed": entry["observed"] | {"focal": sigma is not None},
+        }
+    rig = scene.manifest.rig.model_copy(update={"cameras": cameras})
+    calibration = {**scene.calibration, "cameras": entries}
+    return replace(scene, manifest=scene.manifest.model_copy(update={"rig": rig}), calibration=calibration)
+
+
+def test_focal_lengths_are_shared_where_intrinsics_are_asked_for(base: SourceScene) -> None:
+    rng = np.random.default_rng(10)
+    truth = true_vehicle(base, 2, rng)
+    first, other = (seen(base, str(k), truth, k, WELL, rng) for k in range(2))
+    scenes = [with_focal(first, 0.004, 0.0002), with_focal(other, 0.0, None)]
+    asked = CONFIG.model_copy(update={"refine_focal": True})
+    (vehicle,) = vehicles_of(scenes, asked)
+    expected = vehicle.expected[1]
+    # By the prior of 0.2 % the first found a little less than its images say.
+    np.testing.assert_allclose(expected.correction[:, 6], np.log(1.004), rtol=0.08)
+    assert (expected.sigma[:, 6] > 0.0002).all()
+    assert (expected.sigma[:, 6] < 0.001).all()
+    assert expected.learns
+    assert np.isinf(vehicle.expected[0].sigma[:, 6]).all()
+    assert np.isinf(one_vehicle(scenes).expected[1].sigma[:, 6]).all()
 
 
 def test_no_false_alarms(base: SourceScene) -> None:

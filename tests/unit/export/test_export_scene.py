@@ -526,10 +526,15 @@ def test_a_calibration_that_was_adjusted_in_a_map(scene: Scene) -> None:
     names = list(document["cameras"])
     poses = {name: refined.rig_from_cam.copy() for name, refined in zip(names, scene.calibration, strict=True)}
     found = {name: matrix_from_pose(Pose(**document["cameras"][name]["refined"]["rig_from_cam"])) for name in names}
-    assert document_in_map(document, found) == document
+    params = {name: np.array(document["cameras"][name]["refined"]["params"]) for name in names}
+
+    def in_map(poses: dict[str, np.ndarray], params: dict[str, np.ndarray]) -> dict[str, Any]:
+        return document_in_map(document, {name: (poses[name], params[name]) for name in names})
+
+    assert in_map(found, params) == document
     turn = se3.exp_so3(np.radians([0.0, 0.3, 0.0]))
     poses[names[0]] = se3.transform(turn @ found[names[0]][:3, :3], found[names[0]][:3, 3] + [0.01, 0.0, 0.0])
-    adjusted = document_in_map(document, found | {names[0]: poses[names[0]]})
+    adjusted = in_map(found | {names[0]: poses[names[0]]}, params)
     assert {name for name in names if adjusted["cameras"][name] != document["cameras"][name]} == {names[0]}
     camera, before = adjusted["cameras"][names[0]], document["cameras"][names[0]]
     assert camera["since_scene"]["rotation_vector_deg"] == pytest.approx([0.0, 0.3, 0.0], abs=1e-9)
@@ -543,6 +548,13 @@ def test_a_calibration_that_was_adjusted_in_a_map(scene: Scene) -> None:
     kept = ("sigma", "observed", "given", "verdict")
     assert {key: camera[key] for key in kept} == {key: before[key] for key in kept}
     assert change["focal_px"] == before["difference"]["focal_px"]
+    assert camera["since_scene"]["focal_px"] == 0.0
+    longer = np.array([3.0, 3.0, *np.zeros(len(params[names[1]]) - 2)])
+    focal = in_map(found, params | {names[1]: params[names[1]] + longer})["cameras"][names[1]]
+    assert focal["since_scene"]["focal_px"] == pytest.approx(3.0)
+    assert focal["difference"]["focal_px"] == pytest.approx(document["cameras"][names[1]]["difference"]["focal_px"] + 3)
+    assert focal["refined"]["params"] == pytest.approx((params[names[1]] + longer).tolist())
+    assert focal["since_scene"]["rotation_deg"] == 0.0
 
 
 def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
