@@ -205,7 +205,7 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
 
 
 def _vehicle(result: MapResult, vehicle: Vehicle) -> dict[str, Any]:
-    """What was shared of a vehicle's calibration."""
+    """A vehicle's drives, and the calibration that they share."""
     names = [scene.name for scene in result.scenes]
     return {
         "vehicle": vehicle.name,

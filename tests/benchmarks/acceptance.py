@@ -21,7 +21,7 @@
 | 17 | the service while its processes are killed: nothing lost, twice, stuck, wrong or left |
 | 18 | a real drive whose manifest is wrong: a camera pitched by 1 deg, focal lengths 1 % long |
 | 19 | sigmas: halves of real drives against one another, simulated drives against the truth |
-| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
+| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, vehicles, adding a scene, over HTTP |
 | 21 | real drives with poorer receivers than theirs, and with cameras left out |
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
@@ -88,6 +88,7 @@ from tests.benchmarks.stops import stops
 from tests.benchmarks.submaps import submaps
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
+from tests.benchmarks.vehicles import vehicles
 from tests.benchmarks.wrong_manifests import wrong_manifests
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -124,7 +125,7 @@ LINES = {
     "17": Line(timed=(kills,)),
     "18": Line(untimed=(wrong_manifests,)),
     "19": Line(untimed=(halves, simulated)),
-    "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
+    "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop, vehicles)),
     "21": Line(untimed=(receivers,)),
     "22": Line(timed=(surround_peers,)),
     "23": Line(untimed=(simulated_routes,)),

@@ -72,9 +72,12 @@ def adjusted(
     positions: bool = True,
     owner: np.ndarray | None = None,
     shared: bool = True,
+    refine_focal: bool = False,
 ) -> AdjustedMap:
     """From where scenes truly lie; each as bent as it is."""
     config = configured(final_adjustment=which)
+    bundle_adjustment = config.bundle_adjustment.model_copy(update={"refine_focal": refine_focal})
+    config = config.model_copy(update={"bundle_adjustment": bundle_adjustment})
     assembly = Assembly(scenes=[d.source for d in drives])
     known = {}
     for k, driven in enumerate(drives):
@@ -301,6 +304,32 @@ def test_a_drive_that_shares_no_place_learns_as_well(street: Street, folder: Pat
     units, cameras = len(WAYS[0]), 4
     np.testing.assert_array_equal(shared.model.state.world_from_rig[:units], alone.model.state.world_from_rig[:units])
     np.testing.assert_array_equal(shared.model.state.rig_from_cam[:cameras], alone.model.state.rig_from_cam[:cameras])
+
+
+def with_focal(driven: Driven, longer: float, *, observed: bool) -> Driven:
+    """A drive whose scene has focal lengths so much too long, which it observed or held."""
+    source, cameras, entries = driven.source, [], {}
+    for camera in source.drive.cameras:
+        entry, (fx, fy, *rest) = source.calibration["cameras"][camera.name], camera.params
+        cameras.append(camera.model_copy(update={"params": [fx * (1 + longer), fy * (1 + longer), *rest]}))
+        sigma, seen = {"focal_px": 0.0002 * fx}, {"focal": observed}
+        entries[camera.name] = {**entry, "sigma": entry["sigma"] | sigma, "observed": entry["observed"] | seen}
+    rig = source.manifest.rig.model_copy(update={"cameras": cameras})
+    manifest = source.manifest.model_copy(update={"rig": rig})
+    calibration = {**source.calibration, "cameras": entries}
+    return replace(driven, source=replace(source, manifest=manifest, calibration=calibration))
+
+
+def test_focal_lengths_that_another_drive_observed(street: Street, folder: Path) -> None:
+    well, held = of_vehicles(street, folder, "van-7", "van-7", title="focal")
+    drives = [with_focal(well, 0.0, observed=True), with_focal(held, 0.006, observed=False)]
+    true_px = np.array([camera.params[0] for driven in (well, held) for camera in driven.source.drive.cameras])
+    asked, not_asked = (adjusted(drives, "overlap", refine_focal=refine_focal) for refine_focal in (True, False))
+    off = np.abs(asked.model.state.camera_params[:, 0] / true_px - 1.0)
+    assert (off[:4] < 1e-12).all()  # nobody told the first one anything
+    assert 0 < off[4:].max() < 0.002
+    np.testing.assert_allclose(not_asked.model.state.camera_params[4:, 0], 1.006 * true_px[4:])
+    assert np.median(asked.model.errors_px) < np.median(not_asked.model.errors_px)
 
 
 @pytest.mark.parametrize("names", [("van-7", "van-8"), ("van-7", None), (None, None)])
