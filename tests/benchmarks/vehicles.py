@@ -1,4 +1,7 @@
-"""Line 20f: two drives of one vehicle, a turn and a short straight street, whose given calibration is off."""
+"""Line 20f: two drives of one vehicle, a turn and a short straight street, whose given calibration is off.
+
+The turn is driven with a usual receiver and with a precise one, the straight street with a usual one.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,11 @@ from tests.benchmarks.table import Figure, exactly
 TURN, STRAIGHT = "turn", "straight"
 WORLDS = {TURN: ("--world", "turn", "--units", 30), STRAIGHT: ("--world", "street", "--straight", "--units", 14)}
 CALIBRATION = ("--perturb-rotation-deg", 1.0, "--perturb-translation-m", 0.05, "--declare-sigmas")
+RECEIVERS = {
+    "usual": (),
+    "precise": ("--gnss-noise-m", 0.02, "--gnss-drift-m", 0, "--gnss-bias-m", 0),
+}
+MOST_SHARE = {"usual": 0.8, "precise": 0.3}  # of the straight street's error that is left
 SIZE = ("--cameras", 3, "--width", 640, "--height", 360, "--no-masks")
 TOLERANCE_US = 1000
 
@@ -29,39 +37,53 @@ def vehicles(work: Path, seed: int) -> Iterator[Figure]:
     if seed not in AGGREGATION_SEEDS:
         return
     folder = work / f"vehicle {seed}"
-    drives = {name: folder / name for name in WORLDS}
-    for name, drive in drives.items():
-        mrasfm("synth", *WORLDS[name], *CALIBRATION, *SIZE, "--seed", seed, "--out", drive)
-        mrasfm("reconstruct", drive, "--out", folder / f"scene {name}")
-    rms_mm, rmse_m = {}, {}
-    for title, named in (("apart", ("van-7", "van-8")), ("together", ("van-7", "van-7"))):
-        out = _map(folder, title, dict(zip(WORLDS, named, strict=True)))
-        learning = [n for v in json.loads((out / "map.json").read_text())["vehicles"] for n in v["learning"]]
-        yield exactly("20f", f"vehicle {seed}, {title}: drives that learn", len(learning), int(title == "together"))
+    straight = _scene(folder / STRAIGHT, STRAIGHT, seed)
+    for receiver, options in RECEIVERS.items():
+        own = folder / receiver
+        drives = {TURN: own / TURN, STRAIGHT: folder / STRAIGHT}
+        scenes = {TURN: _scene(drives[TURN], TURN, seed, *options), STRAIGHT: straight}
+        yield from _figures(own, drives, scenes, f"vehicle {seed}, {receiver} receiver", MOST_SHARE[receiver])
+
+
+def _scene(drive: Path, world: str, seed: int, *options: object) -> Path:
+    mrasfm("synth", *WORLDS[world], *CALIBRATION, *SIZE, *options, "--seed", seed, "--out", drive)
+    scene = drive.with_name(f"scene {drive.name}")
+    mrasfm("reconstruct", drive, "--out", scene)
+    return scene
+
+
+def _figures(
+    folder: Path, drives: Mapping[str, Path], scenes: Mapping[str, Path], title: str, most_share: float
+) -> Iterator[Figure]:
+    places_mm, rmse_m = {}, {}
+    for how, named in (("apart", ("van-7", "van-8")), ("together", ("van-7", "van-7"))):
+        out = _map(folder / how, scenes, dict(zip(scenes, named, strict=True)))
+        found = json.loads((out / "map.json").read_text())["vehicles"]
+        learning = [name for vehicle in found for name in vehicle["learning"]]
+        yield exactly("20f", f"{title}, {how}: drives that learn", len(learning), int(how == "together"))
         for name, drive in drives.items():
-            rms_mm[title, name] = _camera_places_mm(out / "calibration" / f"{name}.json", drive)
-            rmse_m[title, name] = _metric_rmse_m(out, name, drive)
-    for name in WORLDS:
-        what = f"vehicle {seed}, {name}"
-        most = 0.8 if name == STRAIGHT else 1.1
-        for kind, values in (("places of cameras", rms_mm), ("metric RMSE", rmse_m)):
+            places_mm[how, name] = _camera_places_mm(out / "calibration" / f"{name}.json", drive)
+            rmse_m[how, name] = _metric_rmse_m(out, name, drive)
+    for name in drives:
+        most = most_share if name == STRAIGHT else 1.001
+        for kind, unit, values in (("places of cameras", "mm", places_mm), ("metric RMSE", "m", rmse_m)):
+            for how in ("apart", "together"):
+                yield Figure(line="20f", what=f"{title}, {name}: {kind}, {how}", value=values[how, name], unit=unit)
             share = values["together", name] / values["apart", name]
-            yield Figure(line="20f", what=f"{what}: {kind}, together of apart", value=share, most=most)
-        yield Figure(line="20f", what=f"{what}: places of cameras, together", value=rms_mm["together", name], unit="mm")
-        yield Figure(line="20f", what=f"{what}: metric RMSE, together", value=rmse_m["together", name], unit="m")
+            most_here = most if kind == "metric RMSE" else max(most, 0.8)
+            yield Figure(line="20f", what=f"{title}, {name}: {kind}, of apart", value=share, most=most_here)
 
 
-def _map(folder: Path, title: str, vehicle_of: Mapping[str, str]) -> Path:
+def _map(folder: Path, scenes: Mapping[str, Path], vehicle_of: Mapping[str, str]) -> Path:
     """The map of the scenes as if their drives had named these vehicles."""
-    scenes = []
-    for name, vehicle in vehicle_of.items():
-        scene = folder / title / name
-        shutil.copytree(folder / f"scene {name}", scene)
+    named = []
+    for name, scene in scenes.items():
+        named.append(folder / name)
+        shutil.copytree(scene, named[-1])
         manifest = json.loads((scene / "manifest.json").read_text())
-        (scene / "manifest.json").write_text(json.dumps({**manifest, "version": 2, "vehicle": vehicle}))
-        scenes.append(scene)
-    mrasfm("aggregate", *scenes, "--out", folder / f"map {title}")
-    return folder / f"map {title}"
+        (named[-1] / "manifest.json").write_text(json.dumps({**manifest, "version": 2, "vehicle": vehicle_of[name]}))
+    mrasfm("aggregate", *named, "--out", folder / "map")
+    return folder / "map"
 
 
 def _camera_places_mm(calibration: Path, drive: Path) -> float:
