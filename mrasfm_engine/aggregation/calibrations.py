@@ -37,9 +37,9 @@ def calibration_priors(
     """Make one prior for each drive whose calibration may vary, from the uncertainty that its scenes state.
 
     They are the drives that have units that vary and whose scenes refined it, or of whose vehicle others did. A scene's
-    certainty rests on all its
-    units; observations of those that vary count in the adjustment anyway, so only the others' share is kept. In a map
-    of very many drives calibrations stay as their scenes found them, as they do where the settings hold them.
+    certainty rests on all its units; observations of those that vary count in the adjustment anyway, so only the
+    others' share is kept. In a map of very many drives calibrations stay as their scenes found them, as they do where
+    the settings hold them.
 
     Parameters
     ----------
@@ -137,12 +137,15 @@ class MapCalibrations:
         (c, INTRINSICS) of these.
     terms
         Their priors.
+    learning
+        Indices of the scenes whose calibration learns from other drives.
     """
 
     free_units: Bools
     cameras: Bools
     free_intrinsics: Bools
     terms: Sequence[CameraPosePrior | IntrinsicsPrior]
+    learning: tuple[int, ...] = ()
 
     def at_priors(self, state: State) -> State:
         """The state with cameras where their priors have them: from far off a prior hardly counts."""
@@ -161,20 +164,20 @@ def map_calibrations(
 ) -> MapCalibrations:
     """Calibrations that vary with units (u,) of a map, by what drives know themselves and of their vehicles."""
     expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
-    learning = [k for k, told in expected.items() if told.learns]
+    learning = tuple(k for k, told in expected.items() if told.learns)
     more = free_units | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
     priors = calibration_priors(assembly, state, more, config, expected)
     cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     intrinsics = np.zeros((len(cameras), INTRINSICS), dtype=np.bool_)
     if not priors:  # too many for the solver, or none is to vary
         more, priors = free_units, calibration_priors(assembly, state, free_units, config)
-        expected = {}
+        expected, learning = {}, ()
     for prior in priors:
         cameras[prior.camera] = True
     focal, observed = _focal_prior(assembly, state, more, expected)
     intrinsics[:, 0] = observed & cameras
     terms: list[CameraPosePrior | IntrinsicsPrior] = [*priors, *([focal] if intrinsics.any() else [])]
-    return MapCalibrations(free_units=more, cameras=cameras, free_intrinsics=intrinsics, terms=terms)
+    return MapCalibrations(free_units=more, cameras=cameras, free_intrinsics=intrinsics, terms=terms, learning=learning)
 
 
 def _share_that_varies(assembly: Assembly, free_units: Bools, k: int) -> float:

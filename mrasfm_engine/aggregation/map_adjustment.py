@@ -52,6 +52,7 @@ class AdjustedMap:
     reports: tuple[Report, ...]
     free_units: int
     free_cameras: int
+    learning: tuple[int, ...]  # scenes whose calibration took what other drives of their vehicle observed
     dropped_observations: int
     dropped_points: int
 
@@ -131,6 +132,7 @@ def adjust_map(
         reports=tuple(reports),
         free_units=int(free.sum()),
         free_cameras=int(cameras.sum()),
+        learning=calibrations.learning,
         dropped_observations=observations,
         dropped_points=points_dropped,
     )

@@ -213,7 +213,7 @@ def _vehicle(result: MapResult, vehicle: Vehicle) -> dict[str, Any]:
         "deviation_deg": float(np.degrees(vehicle.deviation_rad)),
         "deviation_m": vehicle.deviation_m,
         "deviation_focal": vehicle.deviation_focal,
-        "learning": [names[k] for k in vehicle.scenes if vehicle.expected[k].learns],
+        "learning": [names[k] for k in vehicle.scenes if k in result.adjusted.learning],
         "knocked": [
             {"camera": one.camera, "scenes": [names[k] for k in one.scenes], "sigmas": one.sigmas}
             for one in vehicle.knocked

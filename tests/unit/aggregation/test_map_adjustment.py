@@ -284,6 +284,8 @@ def test_a_drive_takes_what_another_of_its_vehicle_observed(street: Street, fold
     assert 0 < np.median(own_shared) < 1.5 * np.median(own)
     assert 0 < mean_error_m(shared, drives) < 0.8 * mean_error_m(alone, drives)
     assert np.median(shared.model.errors_px) < np.median(alone.model.errors_px)
+    assert (alone.learning, shared.learning) == ((), (1,))
+    assert adjusted(drives, "none").learning == ()
     assert shared.free_cameras == 8
     assert shared.free_units >= alone.free_units
 
