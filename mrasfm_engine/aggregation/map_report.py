@@ -15,7 +15,7 @@ from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain
 from mrasfm_engine.aggregation.loops import Loop
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap
-from mrasfm_engine.aggregation.map_scene import map_scene
+from mrasfm_engine.aggregation.map_scene import map_scene, params_of
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
@@ -26,7 +26,6 @@ from mrasfm_engine.export.calibration import document_in_map
 from mrasfm_engine.export.map import MapContent
 from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.types import Floats
 from schemas.artifacts import PICTURES_FOLDER, Stage, seam_name
 from schemas.findings import Finding, warning
@@ -180,7 +179,7 @@ def _calibration(result: MapResult, k: int) -> dict[str, Any]:
     state = result.adjusted.model.state
     cameras = zip(scene.drive.cameras, state.rig_from_cam[first:], state.camera_params[first:], strict=False)
     return document_in_map(
-        scene.calibration, {camera.name: (pose, unpack_camera(camera.model, p)) for camera, pose, p in cameras}
+        scene.calibration, {camera.name: (pose, params_of(camera, p)) for camera, pose, p in cameras}
     )
 
 

@@ -13,10 +13,11 @@ from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.map_adjustment import MapModel
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import geodesy
-from mrasfm_engine.geometry.camera_model import unpack_camera
+from mrasfm_engine.geometry.camera_model import pack_camera, unpack_camera
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.scene.semantics import majority_class
+from mrasfm_engine.types import Floats
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
 
 
@@ -85,7 +86,7 @@ def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]
     return [
         CameraCalibration(
             rig_from_cam=rig_from_cam,
-            params=unpack_camera(camera.model, params),
+            params=params_of(camera, params),
             sigma_rotation_deg=unknown,
             sigma_translation_m=unknown,
             sigma_focal_px=float("nan"),
@@ -95,6 +96,13 @@ def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]
             cameras, model.state.rig_from_cam, model.state.camera_params, strict=True
         )
     ]
+
+
+def params_of(camera: Camera, packed: Floats) -> Floats:
+    """A camera's parameters in a state, exactly the camera's own where they have not changed."""
+    if np.array_equal(packed, pack_camera(camera.model, camera.params)[1]):
+        return np.array(camera.params)
+    return unpack_camera(camera.model, packed)
 
 
 def _features(assembly: Assembly) -> list[ImageFeatures]:

@@ -128,10 +128,10 @@ class SourceScene:
         return np.stack([matrix_from_pose(Pose(**camera["rig_from_cam"])) for camera in given])
 
     @cached_property
-    def given_focal_px(self) -> Floats:
-        """Focal lengths (c,) of the cameras as the drive's manifest gave them."""
-        given = [self.calibration["cameras"][camera.name]["given"] for camera in self.drive.cameras]
-        return np.array([camera["params"][0] for camera in given], dtype=np.float64)
+    def focal_given_of_found(self) -> Floats:
+        """Focal lengths (c,) of the cameras as the drive's manifest gave them, in those that the scene found."""
+        cameras, documents = self.drive.cameras, self.calibration["cameras"]
+        return np.array([documents[c.name]["given"]["params"][0] / c.params[0] for c in cameras], dtype=np.float64)
 
     @cached_property
     def sigma_focal_px(self) -> Floats:

@@ -26,6 +26,7 @@ from scipy.stats import chi2, norm
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import BundleAdjustmentConfig
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_camera, pack_cameras
 from mrasfm_engine.types import Bools, Floats
 from schemas.artifacts import drive_of_scene
 
@@ -143,7 +144,7 @@ def _vehicle(
 ) -> Vehicle:
     """One vehicle; components of a drive have one calibration, that of the first of them."""
     reference = {
-        camera.name: (pose, camera.params[0])
+        camera.name: (pose, pack_camera(camera.model, camera.params)[1][0])
         for k, *_ in drives
         for camera, pose in zip(scenes[k].drive.cameras, scenes[k].drive.rig_from_cam, strict=True)
     }
@@ -177,7 +178,8 @@ def _calibration(
     cameras = scene.drive.cameras
     names = tuple(camera.name for camera in cameras)
     base, base_focal_px = (np.stack([reference[name][part] for name in names]) for part in (0, 1))
-    focal_px, given_focal_px = np.array([camera.params[0] for camera in cameras]), scene.given_focal_px
+    focal_px = pack_cameras(cameras)[1][:, 0]
+    given_focal_px = focal_px * scene.focal_given_of_found
     known = [None if c.sigma_focal_px is None else c.sigma_focal_px / f for c, f in zip(cameras, focal_px, strict=True)]
     sigma_given = np.column_stack(
         [
