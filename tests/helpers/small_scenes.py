@@ -86,6 +86,7 @@ def drive_along(
     component: int = 0,
     vehicle: str | None = None,
     rig_seed: int | None = None,
+    knocked_deg: dict[int, float] | None = None,
     seed: int = 0,
 ) -> Driven:
     """Drive, write the scene, and read it as an aggregation does.
@@ -93,12 +94,15 @@ def drive_along(
     `bias_m` is the receiver's constant error, `bend_m` by how much the scene's ends are bent aside, `scale` its lengths
     in true ones, `offset_ms` when each camera takes its image after its unit's time. With `cameras_off_deg` the scene
     refined its calibration, and is so uncertain about rotations, and so far off. Without a receiver the scene lies in
-    `own_frame`, street_from_scene (4, 4).
+    `own_frame`, street_from_scene (4, 4). Drives of one `rig_seed` have the same cameras, but for those that were
+    knocked by an angle.
     """
     rng = np.random.default_rng(1000 + seed)
     of_rig = rng if rig_seed is None else np.random.default_rng(1000 + rig_seed)
     rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=of_rig)
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
+    for camera, by_deg in (knocked_deg or {}).items():
+        rig_from_cam[camera, :3, :3] = se3.exp_so3(np.radians([0.0, by_deg, 0.0])) @ rig_from_cam[camera, :3, :3]
     params = np.array([camera.params for camera in rig])
     aside = (TURNED if back else np.eye(4)) @ se3.transform(np.eye(3), [0.0, lateral_m, 0.0])
     street_from_rig = poses_along(travelled_m) @ aside
