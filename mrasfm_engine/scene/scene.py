@@ -152,6 +152,8 @@ class Scene:
     def point_component(self) -> Ints:
         """Component (p,) of every point: that of the first unit that observes it, 0 for a point without any."""
         result = np.zeros(len(self.points_m), np.int64)
+        if not self.unit_component.any():
+            return result
         points, first = np.unique(self.observation_point, return_index=True)
         result[points] = self.unit_component[self.image_unit[self.observation_image[first]]]
         return result
