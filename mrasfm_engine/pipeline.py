@@ -89,7 +89,7 @@ def reconstruct(
                 raise CancelledError
             run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
             run.begin(Stage.EXPORT)
-            whole, parts = stages.all_units(run, scene, components)
+            whole, parts = stages.numbered_components(run, *stages.all_units(run, scene, components))
             write_scene(whole, out, run.report, pictures, parts)
     run.progress(Stage.EXPORT, 1, 1)
     return run.report

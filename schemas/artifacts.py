@@ -46,6 +46,7 @@ COMPONENTS_FOLDER = "components"  # N/, scenes of the parts of a drive that noth
 TEXT_MODEL_FOLDER = "model/text"
 SCENES_FOLDER = "scenes"  # of a map: its scenes as an aggregation reads them
 SEAMS_FOLDER = "seams"  # of a map: its seams, for the next version
+COMPONENT_MARK = "#"  # NAME#N in a map: the component N of NAME; no name that is given to a scene has it
 BETWEEN_SCENES = "~"  # no name of a scene has it, and URLs and shells take it as it is
 
 
@@ -74,6 +75,16 @@ def component_folder(number: int) -> str:
     return f"{COMPONENTS_FOLDER}/{number}"
 
 
+def component_scene(name: str, number: int) -> str:
+    """Name a component, counted from 1, as a scene of a map beside the largest one, which has the given name."""
+    return f"{name}{COMPONENT_MARK}{number}"
+
+
+def drive_of_scene(name: str) -> str:
+    """Name, in a map, of the largest component of the drive that a scene is a component of."""
+    return name.partition(COMPONENT_MARK)[0]
+
+
 def seam_name(a: str, b: str) -> str:
     """Name the seam of two scenes, as no other two scenes' is named."""
     return f"{a}{BETWEEN_SCENES}{b}"
@@ -86,7 +97,8 @@ def seam_checkpoint(a: str, b: str) -> str:
 
 def is_read_by_aggregation(path: str) -> bool:
     """Return whether an aggregation reads this file of a scene."""
-    unread = (PICTURES_FOLDER, OWN_CAR_FOLDER, TEXT_MODEL_FOLDER, COMPONENTS_FOLDER, RIG_FOLDER, AUTOWARE_FOLDER)
+    unread = (PICTURES_FOLDER, OWN_CAR_FOLDER, TEXT_MODEL_FOLDER, RIG_FOLDER, AUTOWARE_FOLDER)
+    path = re.sub(rf"^{COMPONENTS_FOLDER}/\d+/", "", path)
     return path not in (COPC_FILE, TRAJECTORY_FILE) and not path.startswith(tuple(f"{folder}/" for folder in unread))
 
 

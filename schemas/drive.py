@@ -1,6 +1,6 @@
 """The drive manifest, `drive.json`, version 2: one recording of one vehicle, ready to be reconstructed.
 
-Version 1 is read as well: it has none of `FIELDS_OF_VERSION_2`.
+Version 1 is read as well: it has none of `FIELDS_OF_VERSION_2` and `DRIVE_FIELDS_OF_VERSION_2`.
 
 Conventions: a transform is named `a_from_b` and maps coordinates of frame b into frame a; rotations are unit
 quaternions in the order x, y, z, w; lengths are metres, angles degrees, times integer microseconds.
@@ -43,6 +43,7 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
 FIELDS_OF_VERSION_2 = frozenset(
     {"sigma_principal_point_px", "sigma_distortion", "sigma_time_offset_us", "readout_direction"}
 )  # of Camera
+DRIVE_FIELDS_OF_VERSION_2 = frozenset({"vehicle"})
 
 MAX_CAMERAS = 64
 MAX_FRAMES = 100_000
@@ -60,6 +61,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=1e6)]
 TimestampUs = Annotated[int, Field(ge=0, le=2**62, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+VEHICLE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$"
+Vehicle = Annotated[str, Field(pattern=VEHICLE_PATTERN)]
 
 
 def _relative_path(value: str) -> str:
@@ -374,6 +377,11 @@ class DriveManifest(_Model):
 
     version: Literal[1, 2] = Field(1, description="of this contract")
     name: Annotated[str, Field(min_length=1, max_length=200)] = Field(description="what results are called")
+    vehicle: Vehicle | None = Field(
+        None,
+        description="since version 2: which vehicle drove, as its number plate or fleet number; drives of one vehicle "
+        "share what they tell of its calibration",
+    )
     rig: Rig = Field(description="the vehicle's cameras")
     frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()] = Field(
         description="the instants, in order of time"
@@ -391,6 +399,8 @@ class DriveManifest(_Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> DriveManifest:
+        for name in sorted(DRIVE_FIELDS_OF_VERSION_2 & self.model_fields_set if self.version == 1 else ()):
+            raise ValueError(f"{name} is of version 2 of the contract: set version to 2")
         for i, camera in enumerate(self.rig.cameras if self.version == 1 else ()):
             for name in sorted(FIELDS_OF_VERSION_2 & camera.model_fields_set):
                 raise ValueError(f"rig.cameras.{i}.{name} is of version 2 of the contract: set version to 2")

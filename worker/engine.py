@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage
+from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage, drive_of_scene
 from schemas.findings import as_json, error
 from worker.child_protocol import ChildError, ChildRequest, ChildResult, SubmapPlan, Work
 from worker.engine_settings import engine_config
@@ -119,7 +119,10 @@ def _aggregate(
 ) -> dict[str, Any]:
     def complete(report: dict[str, Any]) -> None:
         """Name the drives without a scene: the engine knows of those alone that fit into no map."""
-        unfit = [{**request.members[found["scene"]], "problem": _problem(found)} for found in report.pop("left_out")]
+        unfit = [
+            {**_member(request, found["scene"]), "name": found["scene"], "problem": _problem(found)}
+            for found in report.pop("left_out")
+        ]
         report["failed_drives"] = [*request.failed, *unfit]
 
     aggregate(
@@ -135,6 +138,11 @@ def _aggregate(
     )
     figures = _figures(json.loads((request.out / MAP_FILE).read_text(encoding="utf-8")))
     return {**_written_report(request.out), "map": figures}
+
+
+def _member(request: ChildRequest, name: str) -> Mapping[str, Any]:
+    """The drive that a scene, or a component, was made of."""
+    return request.members[name] if name in request.members else request.members[drive_of_scene(name)]
 
 
 def _problem(found: dict[str, Any]) -> dict[str, Any]:
@@ -153,6 +161,7 @@ def _figures(document: dict[str, Any]) -> dict[str, Any]:
     """The figures of `map.json` that are recorded with the map's version."""
     return {
         "scenes": len(document["scenes"]),
+        "names": [scene["name"] for scene in document["scenes"]],
         "seams": sum(bool(seam["accepted"]) for seam in document["seams"]),
         "unconnected": document["unconnected"],
     }

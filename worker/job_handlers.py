@@ -137,7 +137,7 @@ class ReconstructionHandler(_StagesHandler):
             session,
             self._held,
             files=files,
-            summary=SceneSummary(**_figures(done.report)),
+            summary=SceneSummary(**_figures(done.report), components=done.report["components"]),
             expires_us=_expires_us(settings.scene_retention_days),
             reused=_reused(done.report),
         )
@@ -223,6 +223,7 @@ class AggregationHandler:
             self._held,
             files=files,
             summary=_map_summary(done.report),
+            names=done.report["map"]["names"],
             unconnected=done.report["map"]["unconnected"],
             failed=done.report["failed_drives"],
             expires_us=_expires_us(settings.map_retention_days),

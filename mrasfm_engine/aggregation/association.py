@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mrasfm_engine.aggregation.image_search import similar_scenes
 from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, common_view, nearest_distance_m
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
@@ -22,20 +23,31 @@ class Association:
     """Scenes as their positions place them."""
 
     reference: int  # whose frame is the map's
-    map_from_scene: Floats  # (scenes, 4, 4)
+    map_from_scene: Floats  # (scenes, 4, 4), NaN of scenes that have no positions
     pairs: tuple[tuple[int, int], ...]  # of scenes that are to be compared, the smaller index first
+
+    def of_scenes(self, chosen: Sequence[int]) -> Association:
+        """The same of some scenes, the reference among them, by their new indices."""
+        row = {k: new for new, k in enumerate(chosen)}
+        return Association(
+            reference=row[self.reference],
+            map_from_scene=self.map_from_scene[list(chosen)],
+            pairs=tuple((row[i], row[j]) for i, j in self.pairs if i in row and j in row),
+        )
 
 
 def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Association:
     """Put scenes into one frame by their positions, and say which are to be compared.
 
     The reference is the scene whose midpoint is nearest to the geometric centre of all (ties: more units, then the
-    smaller name). Frames of different origins are combined through earth-centred coordinates.
+    smaller name). Frames of different origins are combined through earth-centred coordinates. Scenes without positions
+    are compared with those whose images look most like theirs.
     """
+    placed = [k for k, scene in enumerate(scenes) if scene.is_placed]
     middle = np.stack([se3.apply(s.ecef_from_local, s.midpoint_m[None])[0] for s in scenes])
-    away = np.linalg.norm(middle - middle.mean(0), axis=1)
+    away = np.linalg.norm(middle - middle[placed].mean(0), axis=1)
     reference = min(
-        range(len(scenes)),
+        placed,
         key=lambda k: (round(float(away[k]), 2), -int(scenes[k].unit_registered.sum()), scenes[k].name),
     )
     map_from_ecef = se3.inverse(scenes[reference].ecef_from_local)
@@ -43,7 +55,7 @@ def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Assoc
     return Association(
         reference=reference,
         map_from_scene=map_from_scene,
-        pairs=tuple(_pairs(scenes, config)),
+        pairs=tuple(sorted([*_pairs(scenes, placed, config), *similar_scenes(scenes, config)])),
     )
 
 
@@ -59,11 +71,11 @@ def _composed(local_from_ecef: Floats, ecef_from_other: Floats) -> Floats:
     return se3.transform(rotation @ ecef_from_other[:3, :3], rotation @ (ecef_from_other[:3, 3] - origin))
 
 
-def _pairs(scenes: Sequence[SourceScene], config: AggregationConfig) -> list[tuple[int, int]]:
-    """Pairs of scenes that are to be compared, of those within reach, by how much their footprints overlap."""
+def _pairs(scenes: Sequence[SourceScene], placed: Sequence[int], config: AggregationConfig) -> list[tuple[int, int]]:
+    """Pairs of placed scenes that are to be compared, of those within reach, by how much their footprints overlap."""
     reach = config.position_error_m + SIGHT_SHIFT_M
     scores: dict[tuple[int, int], tuple[float, float]] = {}
-    for i, j in combinations(range(len(scenes)), 2):
+    for i, j in combinations(placed, 2):
         a_from_b = coarse_transform(scenes[i], scenes[j])
         apart = nearest_distance_m(scenes[i], scenes[j], a_from_b)
         if apart <= reach:

@@ -3,30 +3,43 @@
 Each drive keeps its own extrinsics. A short drive determines them weakly, and the shape of its scene depends on them:
 two scenes whose extrinsics are off by a tenth of a degree in different ways cannot both stay rigid where they share
 points, and scale gives way. So extrinsics are refined with the units, only in directions that the drive's own
-reconstruction observed, with that reconstruction's uncertainty as prior.
+reconstruction observed, with that reconstruction's uncertainty as prior. Where other drives of its vehicle tell more,
+what they let it expect is the prior (see `vehicles`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior
+from mrasfm_engine.aggregation.vehicles import Expected, Vehicle, corrected
+from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior, IntrinsicsPrior
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.config import BundleAdjustmentConfig
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.types import Bools
+from mrasfm_engine.types import Bools, Floats
 
+NOTHING_EXPECTED: Mapping[int, Expected] = MappingProxyType({})
 MAX_COUPLINGS = 500_000  # of cameras that vary with units and with one another: the solver holds some 400 bytes of each
 
 
 def calibration_priors(
-    assembly: Assembly, state: State, free_units: Bools, config: BundleAdjustmentConfig
+    assembly: Assembly,
+    state: State,
+    free_units: Bools,
+    config: BundleAdjustmentConfig,
+    expected: Mapping[int, Expected] = NOTHING_EXPECTED,
 ) -> list[CameraPosePrior]:
     """Make one prior for each drive whose calibration may vary, from the uncertainty that its scenes state.
 
-    They are the drives whose scenes refined it and that have units that vary. A scene's certainty rests on all its
-    units; observations of those that vary count in the adjustment anyway, so only the others' share is kept. In a map
-    of very many drives calibrations stay as their scenes found them, as they do where the settings hold them.
+    They are the drives that have units that vary and whose scenes refined it, or of whose vehicle others did. A scene's
+    certainty rests on all its units; observations of those that vary count in the adjustment anyway, so only the
+    others' share is kept. In a map of very many drives calibrations stay as their scenes found them, as they do where
+    the settings hold them.
 
     Parameters
     ----------
@@ -34,16 +47,16 @@ def calibration_priors(
         With the calibrations that the scenes found.
     free_units
         Units (u,) that vary.
+    expected
+        What other drives of its vehicle let a scene's cameras expect, by scene.
     """
     if not config.refine_calibration:
         return []
     priors = []
     for k, scene in enumerate(assembly.scenes):
-        units = assembly.scene_of_unit == k
-        vary = (free_units & units).sum() / max((assembly.registered & units).sum(), 1)
-        if not vary or scene.certainty_of_cameras is None:
+        vary, told = _share_that_varies(assembly, free_units, k), expected.get(k)
+        if not vary or (scene.certainty_of_cameras is None and told is None):
             continue
-        sigma, observed = scene.certainty_of_cameras
         cameras = scene.drive.cameras
         given = np.column_stack(
             [
@@ -51,16 +64,123 @@ def calibration_priors(
                 [camera.sigma_translation_m or config.sigma_translation_m for camera in cameras],
             ]
         ).repeat(3, axis=1)
-        known = np.minimum(sigma / np.sqrt(max(1.0 - vary, 1e-12)), given)
+        sigma, observed = scene.certainty_of_cameras or (given, np.zeros(given.shape, dtype=np.bool_))
+        left = max(1.0 - vary, 1e-12)
+        known = np.where(observed, np.minimum(sigma / np.sqrt(left), given), given)
         number = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
+        poses, held = scene.drive.rig_from_cam, ~observed
+        if told is not None:
+            poses, known, held = _with_expected(poses, known, held, told, left)
         priors.append(
             CameraPosePrior(
-                camera=number,
-                rotation=state.camera_rotation[number],
-                position_m=state.camera_position_m[number],
-                sigma=np.where(observed, known, given),
-                held=~observed,
+                camera=number, rotation=poses[:, :3, :3], position_m=poses[:, :3, 3], sigma=known, held=held
             )
         )
     refined = sum(len(prior.camera) for prior in priors)
     return priors if refined * (int(free_units.sum()) + refined) <= MAX_COUPLINGS else []
+
+
+def _with_expected(
+    poses: Floats, sigma: Floats, held: Bools, told: Expected, left: float
+) -> tuple[Floats, Floats, Bools]:
+    """Means (c, 4, 4), sigmas (c, 6) and held directions of cameras with what the vehicle's other drives say.
+
+    Of directions of which they say nothing, all stays.
+
+    Parameters
+    ----------
+    left
+        Share of the scene's units whose observations do not count in the adjustment anyway.
+    """
+    mean, own_sigma = _combined(told, left)
+    says = np.isfinite(own_sigma[:, :6])
+    return corrected(poses, mean[:, :6]), np.where(says, own_sigma[:, :6], sigma), held & ~says
+
+
+def _combined(told: Expected, left: float) -> tuple[Floats, Floats]:
+    """Corrections and sigmas (c, DIRECTIONS) by all images, the drive's own and the others'; infinite where these are
+    silent.
+    """
+    says = np.isfinite(told.sigma)
+    own, others = left * told.information, told.sigma**-2.0
+    precision = np.where(says, own + others, 1.0)
+    mean = np.where(says, (own * told.own + others * told.correction) / precision, 0.0)
+    return mean, np.where(says, precision**-0.5, np.inf)
+
+
+def _focal_prior(
+    assembly: Assembly, state: State, free_units: Bools, expected: Mapping[int, Expected]
+) -> tuple[IntrinsicsPrior, Bools]:
+    """Prior of the focal lengths that other drives of a vehicle observed, and the cameras (c,) of which they did."""
+    params, sigma = state.camera_params.copy(), np.ones((len(state.camera_params), INTRINSICS))
+    observed = np.zeros(len(params), dtype=np.bool_)
+    for k, told in expected.items():
+        mean, own_sigma = _combined(told, 1.0 - _share_that_varies(assembly, free_units, k))
+        rows = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
+        observed[rows] = np.isfinite(own_sigma[:, 6])
+        params[rows, :2] *= np.exp(mean[:, 6:])
+        sigma[rows, 0] = np.where(observed[rows], own_sigma[:, 6], 1.0)
+    return IntrinsicsPrior(params=params, sigma=sigma), observed
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapCalibrations:
+    """Calibrations in a map's last adjustment.
+
+    Attributes
+    ----------
+    free_units
+        (u,) units that vary: those of the map, and all of a scene whose calibration learns from other drives.
+    cameras
+        (c,) that vary.
+    free_intrinsics
+        (c, INTRINSICS) of these.
+    terms
+        Their priors.
+    learning
+        Indices of the scenes whose calibration learns from other drives.
+    """
+
+    free_units: Bools
+    cameras: Bools
+    free_intrinsics: Bools
+    terms: Sequence[CameraPosePrior | IntrinsicsPrior]
+    learning: tuple[int, ...] = ()
+
+    def at_priors(self, state: State) -> State:
+        """The state with cameras where their priors have them: from far off a prior hardly counts."""
+        rotation, position_m = state.camera_rotation.copy(), state.camera_position_m.copy()
+        params = state.camera_params
+        for term in self.terms:
+            if isinstance(term, IntrinsicsPrior):
+                params = term.params
+            else:
+                rotation[term.camera], position_m[term.camera] = term.rotation, term.position_m
+        return replace(state, camera_rotation=rotation, camera_position_m=position_m, camera_params=params)
+
+
+def map_calibrations(
+    assembly: Assembly, state: State, free_units: Bools, vehicles: Sequence[Vehicle], config: BundleAdjustmentConfig
+) -> MapCalibrations:
+    """Calibrations that vary with units (u,) of a map, by what drives know themselves and of their vehicles."""
+    expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
+    learning = tuple(k for k, told in expected.items() if told.learns)
+    more = free_units | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
+    priors = calibration_priors(assembly, state, more, config, expected)
+    cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
+    intrinsics = np.zeros((len(cameras), INTRINSICS), dtype=np.bool_)
+    if not priors:  # too many for the solver, or none is to vary
+        more, priors = free_units, calibration_priors(assembly, state, free_units, config)
+        expected, learning = {}, ()
+    for prior in priors:
+        cameras[prior.camera] = True
+    focal, observed = _focal_prior(assembly, state, more, expected)
+    intrinsics[:, 0] = observed & cameras
+    terms: list[CameraPosePrior | IntrinsicsPrior] = [*priors, *([focal] if intrinsics.any() else [])]
+    return MapCalibrations(free_units=more, cameras=cameras, free_intrinsics=intrinsics, terms=terms, learning=learning)
+
+
+def _share_that_varies(assembly: Assembly, free_units: Bools, k: int) -> float:
+    """Share of a scene's registered units that are among the free ones (u,)."""
+    units = assembly.scene_of_unit == k
+    return float((free_units & units).sum() / max((assembly.registered & units).sum(), 1))

@@ -17,11 +17,13 @@ from mrasfm_engine.aggregation.source import SourceScene, unit_from_images
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.read_model import ModelImage, read_images, read_points, read_vertices
 from mrasfm_engine.scene.drive import matrix_from_pose
-from mrasfm_engine.types import Bytes, Floats, Floats32, Ints
+from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from schemas import Camera, DriveManifest, Pose
+from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, component_folder, component_scene
 
 SCHEMA_VERSION = 1
 MIN_UNITS = 2
+NUMBER = re.compile(r"[1-9][0-9]{0,8}")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 NEEDED = (
     "report.json", "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply", "features.db",
@@ -60,13 +62,32 @@ def name_scenes(scenes: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
     return result
 
 
+def components_of(folder: Path, name: str) -> dict[str, Path]:
+    """Folders of a scene's smaller components by the names that they have in a map."""
+    found = (folder / COMPONENTS_FOLDER).glob("*") if (folder / COMPONENTS_FOLDER).is_dir() else ()
+    numbers = sorted(int(path.name) for path in found if NUMBER.fullmatch(path.name))
+    return {component_scene(name, number): folder / component_folder(number) for number in numbers}
+
+
+def not_georeferenced(name: str, found: str = "") -> InputError:
+    """Refusal of a scene that nothing places on the earth, with what was `found` of its images."""
+    return InputError(
+        f"scene {name} is not georeferenced{found}",
+        remedy="Reconstruct the drive with GNSS, give it rough_poses with a common_world that all drives declare, or "
+        "add a georeferenced drive that sees the same places.",
+        code="not-georeferenced",
+    )
+
+
 def read_scene(folder: Path, name: str) -> SourceScene:
     """Read what aggregation needs of a scene's folder.
+
+    Units that have their pose in another component are left out.
 
     Raises
     ------
     InputError
-        Where it is no scene, not placed on the earth, of another schema, damaged, or too small.
+        Where it is no scene, of another schema, damaged, or too small.
     """
     folder = Path(folder)
     _require_files(folder, name)
@@ -81,17 +102,18 @@ def read_scene(folder: Path, name: str) -> SourceScene:
                 remedy=AGAIN,
                 code="scene-version",
             )
-    ecef_from_local, common_world = _place(frame, manifest, name)
+    place = _place(frame, manifest, name)
     with _damaged(folder, name):
         scene = _arrays(
             folder,
             name=name,
             manifest=_with_refined(manifest, calibration),
             documents=(frame, poses, calibration, report),
-            place=(ecef_from_local, common_world),
+            place=place,
         )
+        scene = scene.of_units(_own_units(poses, scene.unit_registered, is_component=COMPONENT_MARK in name))
     with _damaged(folder / "calibration.json", name):
-        _ = scene.certainty_of_cameras
+        _ = scene.certainty_of_cameras, scene.given_rig_from_cam, scene.focal_given_of_found, scene.sigma_focal_px
     if scene.unit_registered.sum() < MIN_UNITS or not len(scene.points_m):
         raise InputError(
             f"scene {name} has {int(scene.unit_registered.sum())} registered units and {len(scene.points_m)} points",
@@ -164,20 +186,21 @@ def _manifest(folder: Path, name: str) -> DriveManifest:
             raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
-def _place(frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[Floats, str | None]:
-    """ecef_from_local and None, or rough_world_from_local and the common world's name."""
+def _own_units(poses: dict[str, Any], registered: Bools, *, is_component: bool) -> Bools:
+    """Units (u,) that are the scene's, registered or not: not those of other components of its drive."""
+    unposed = np.array([not is_component and "component" not in unit for unit in poses["units"]], dtype=np.bool_)
+    return registered | unposed
+
+
+def _place(frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[Floats | None, str | None]:
+    """ecef_from_local and None, rough_world_from_local and the common world's name, or nothing."""
     if frame.get("georeferenced") is True:
         matrix = frame.get("ecef_from_local")
     else:
         rough = manifest.rough_poses
         world = None if rough is None else rough.common_world
         if world is None or "rough_world_from_local" not in frame:
-            raise InputError(
-                f"scene {name} is not georeferenced",
-                remedy="Reconstruct the drive with GNSS, or give it rough_poses with a common_world that all drives "
-                "declare.",
-                code="not-georeferenced",
-            )
+            return None, None
         matrix = frame["rough_world_from_local"]
     with _damaged(Path("frame.json"), name):
         result = np.array(matrix, dtype=np.float64)
@@ -208,7 +231,7 @@ def _arrays(
     name: str,
     manifest: DriveManifest,
     documents: tuple[dict[str, Any], ...],
-    place: tuple[Floats, str | None],
+    place: tuple[Floats | None, str | None],
 ) -> SourceScene:
     frame, poses, calibration, report = documents
     units, images = poses["units"], poses["images"]
@@ -232,7 +255,8 @@ def _arrays(
         features_kind=kind,
         height_datum=str(frame.get("height_datum", "")),
         common_world=place[1],
-        ecef_from_local=place[0],
+        is_placed=place[0] is not None,
+        ecef_from_local=np.full((4, 4), np.nan) if place[0] is None else place[0],
         unit_registered=unit_registered,
         world_from_rig=world_from_rig,
         sigma_position_m=np.array(sigma, dtype=np.float64).reshape(-1, 3),

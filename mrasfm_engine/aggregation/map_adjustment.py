@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.calibrations import calibration_priors
+from mrasfm_engine.aggregation.calibrations import map_calibrations
 from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
+from mrasfm_engine.aggregation.vehicles import Vehicle
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.priors import Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout
@@ -51,6 +52,7 @@ class AdjustedMap:
     reports: tuple[Report, ...]
     free_units: int
     free_cameras: int
+    learning: tuple[int, ...]  # scenes whose calibration took what other drives of their vehicle observed
     dropped_observations: int
     dropped_points: int
 
@@ -70,6 +72,7 @@ def adjust_map(
     positions: dict[int, DrivePositions],
     config: EngineConfig,
     *,
+    vehicles: Sequence[Vehicle] = (),
     cancel: Callable[[], bool],
 ) -> AdjustedMap:
     """Adjust the units at the seams (or all, or none, as the settings say); then filter what does not fit.
@@ -80,25 +83,29 @@ def adjust_map(
         The joined point (p,) of the assembly's points, -1 for points of one scene alone.
     positions
         Of the assembly's scenes that have any; their bias is estimated here.
+    vehicles
+        Those that several of the scenes' drives name: what the drives tell of their cameras is shared.
     """
     state = assembly.state(world_from_scene)
     owners = all_points(owner)
     tracks = tracks_of(assembly, owners)
     joined = np.arange(tracks.count) <= int(owner.max(initial=-1))
     state = replace(state, points_m=joined_points_m(state, tracks))
-    cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
+    none = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     problem = Problem(
         state=state,
         camera_kind=assembly.camera_kind,
         observations=assembly.observations(tracks.rows, tracks.point, tracks.count),
-        layout=Layout.from_free(np.zeros(len(assembly.registered), dtype=np.bool_), cameras),
+        layout=Layout.from_free(np.zeros(len(assembly.registered), dtype=np.bool_), none),
         options=_options(config),
         motion=assembly.motion,
     )
     free = _free_units(assembly, problem, joined, config)
-    calibrations = calibration_priors(assembly, state, free, config.bundle_adjustment)
-    for prior in calibrations:
-        cameras[prior.camera] = True
+    if config.aggregation.final_adjustment == "none":
+        vehicles = ()
+    calibrations = map_calibrations(assembly, state, free, vehicles, config.bundle_adjustment)
+    free, cameras = calibrations.free_units, calibrations.cameras
+    problem = _with_cameras(problem, calibrations.at_priors(state))
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
     seen[o.point[free[o.unit]]] = True
     reports: list[Report] = []
@@ -106,8 +113,8 @@ def adjust_map(
     for _ in range(ROUNDS if free.any() else 0):
         part = replace(
             problem.of_points(seen),
-            layout=Layout.from_free(free, cameras),
-            terms=[*_terms(assembly, positions, free), *calibrations],
+            layout=Layout.from_free(free, cameras, free_intrinsics=calibrations.free_intrinsics),
+            terms=[*_terms(assembly, positions, free), *calibrations.terms],
         )
         solution, report = solve_with_chosen_points(
             part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
@@ -125,9 +132,20 @@ def adjust_map(
         reports=tuple(reports),
         free_units=int(free.sum()),
         free_cameras=int(cameras.sum()),
+        learning=calibrations.learning,
         dropped_observations=observations,
         dropped_points=points_dropped,
     )
+
+
+def _with_cameras(problem: Problem, state: State) -> Problem:
+    """The problem with another state's cameras, and the points that those observe which are elsewhere now."""
+    before = problem.state
+    moved = np.zeros(len(problem.camera_kind), dtype=np.bool_)
+    for name in ("camera_rotation", "camera_position_m", "camera_params"):
+        moved |= (getattr(state, name) != getattr(before, name)).reshape(len(moved), -1).any(1)
+    varied = np.zeros(problem.observations.num_points, dtype=np.bool_)
+    return _others_refined(replace(problem, state=state), varied, moved)
 
 
 def _others_refined(problem: Problem, varied: Bools, free_cameras: Bools) -> Problem:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,11 @@ from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain
 from mrasfm_engine.aggregation.loops import Loop
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap
-from mrasfm_engine.aggregation.map_scene import map_scene
+from mrasfm_engine.aggregation.map_scene import map_scene, params_of
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.aggregation.vehicles import Knocked, Vehicle
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.export.calibration import document_in_map
@@ -63,12 +64,19 @@ class MapResult:
     joint_reports: Sequence[Report]
     assembly: Assembly
     adjusted: AdjustedMap
+    vehicles: Sequence[Vehicle]  # that several drives name
+    left_out: Sequence[Mapping[str, str]]  # names of scenes that are not in the map, and why
 
     @property
     def unconnected(self) -> list[str]:
         """Scenes that no seam connects with the map's other ones."""
         connected = set(self.chains[0].scenes) if len(self.chains[0].scenes) > 1 else set()
         return [scene.name for k, scene in enumerate(self.scenes) if k not in connected]
+
+    @property
+    def component_of_scene(self) -> list[int]:
+        """The number of each scene's chain."""
+        return [next(n for n, chain in enumerate(self.chains) if k in chain.scenes) for k in range(len(self.scenes))]
 
     def ends_of(self, seam: Seam) -> tuple[int, int]:
         """The numbers of a seam's scenes."""
@@ -87,6 +95,9 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
     """Note scenes that are not connected, and seams that were refused for what they contradict."""
     for finding in loop_findings(result.loops, [s.name for s in result.scenes], [(s.a, s.b) for s in result.seams]):
         run.found(finding)
+    for vehicle in result.vehicles:
+        for one in vehicle.knocked:
+            run.found(_knocked(vehicle, one, [scene.name for scene in result.scenes]))
     names = result.unconnected
     if len(names) == len(result.scenes):
         refused = any(seam.accepted for seam in result.found_seams)
@@ -106,6 +117,18 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Give drives whose trajectories meet theirs.",
             )
         )
+
+
+def _knocked(vehicle: Vehicle, one: Knocked, names: Sequence[str]) -> Finding:
+    """Finding on a camera that contradicts its vehicle."""
+    where = " or in ".join(names[k] for k in one.scenes)
+    what = f"in {where}" + (": nothing says in which" if len(one.scenes) > 1 else ", the other drives agree")
+    return warning(
+        "camera-contradicts-vehicle",
+        f"camera {one.camera} of vehicle {vehicle.name} was knocked or exchanged, {what} ({one.sigmas:.1f} sigmas)",
+        "Look at the camera's mount between these drives. Its calibration is not shared between them; if the drives "
+        "are of different vehicles, correct vehicle in their manifests.",
+    )
 
 
 def loop_findings(loops: Sequence[Loop], scenes: Sequence[str], seams: Sequence[tuple[str, str]]) -> list[Finding]:
@@ -132,7 +155,7 @@ def loop_findings(loops: Sequence[Loop], scenes: Sequence[str], seams: Sequence[
 def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) -> MapContent:
     """Content of the map's folder."""
     reference = result.scenes[result.association.reference]
-    scene = map_scene(result.assembly, result.adjusted.model, reference)
+    scene = map_scene(result.assembly, result.adjusted.model, reference, result.component_of_scene)
     by_name = {s.name: s for s in result.scenes}
     return MapContent(
         scene=scene,
@@ -153,9 +176,11 @@ def map_content(run: stages.Run, result: MapResult, pictures: dict[str, bytes]) 
 
 def _calibration(result: MapResult, k: int) -> dict[str, Any]:
     scene, first = result.scenes[k], int(result.assembly.first_camera[k])
-    rig_from_cam = result.adjusted.model.state.rig_from_cam[first:]
-    names = [camera.name for camera in scene.drive.cameras]
-    return document_in_map(scene.calibration, dict(zip(names, rig_from_cam, strict=False)))
+    state = result.adjusted.model.state
+    cameras = zip(scene.drive.cameras, state.rig_from_cam[first:], state.camera_params[first:], strict=False)
+    return document_in_map(
+        scene.calibration, {camera.name: (pose, params_of(camera, p)) for camera, pose, p in cameras}
+    )
 
 
 def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]:
@@ -169,6 +194,8 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
         "seams": [_seam(result, number, pictures) for number in range(len(result.seams))],
         "loops": [_loop(result, loop) for loop in result.loops],
         "unconnected": result.unconnected,
+        "vehicles": [_vehicle(result, vehicle) for vehicle in result.vehicles],
+        "left_out": [dict(scene) for scene in result.left_out],
         "joint": [
             {"iterations": r.iterations, "observations": r.observations, "termination": str(r.termination)}
             for r in result.joint_reports
@@ -176,9 +203,25 @@ def map_document(result: MapResult, pictures: Collection[str]) -> dict[str, Any]
     }
 
 
+def _vehicle(result: MapResult, vehicle: Vehicle) -> dict[str, Any]:
+    """A vehicle's drives, and the calibration that they share."""
+    names = [scene.name for scene in result.scenes]
+    return {
+        "vehicle": vehicle.name,
+        "scenes": [names[k] for k in vehicle.scenes],
+        "deviation_deg": float(np.degrees(vehicle.deviation_rad)),
+        "deviation_m": vehicle.deviation_m,
+        "deviation_focal": vehicle.deviation_focal,
+        "learning": [names[k] for k in vehicle.scenes if k in result.adjusted.learning],
+        "knocked": [
+            {"camera": one.camera, "scenes": [names[k] for k in one.scenes], "sigmas": one.sigmas}
+            for one in vehicle.knocked
+        ],
+    }
+
+
 def _scene(result: MapResult, k: int) -> dict[str, Any]:
     scene = result.scenes[k]
-    component = next(n for n, chain in enumerate(result.chains) if k in chain.scenes)
     positions = result.adjusted.positions.get(k)
     connected = scene.name not in result.unconnected
     moved = se3.apply(result.map_from_scene[k], scene.midpoint_m[None])[0]
@@ -188,9 +231,9 @@ def _scene(result: MapResult, k: int) -> dict[str, Any]:
         "fingerprint": scene.fingerprint,
         "drive": scene.manifest.name,
         "verdict": CONNECTED if connected else BY_POSITIONS,
-        "component": component,
+        "component": result.component_of_scene[k],
         "map_from_scene": result.map_from_scene[k],
-        "moved_from_positions_m": float(np.linalg.norm(moved - coarse)),
+        **({"moved_from_positions_m": float(np.linalg.norm(moved - coarse))} if scene.is_placed else {}),
         **({} if positions is None else {"positions_bias_m": positions.bias_m}),
         "registered_units": int(scene.unit_registered.sum()),
         "total_units": len(scene.unit_registered),
@@ -209,7 +252,8 @@ def _seam(result: MapResult, number: int, pictures: Collection[str]) -> dict[str
     if seam.reason:
         document["reason"] = seam.reason
     document |= {key: value for key, value in seam.quality.items() if np.isfinite(value)}
-    document["coarse_a_from_b"] = seam.coarse_a_from_b
+    if np.isfinite(seam.coarse_a_from_b).all():
+        document["coarse_a_from_b"] = seam.coarse_a_from_b
     if seam.accepted:
         document |= {
             "a_from_b": seam.a_from_b,
@@ -273,9 +317,12 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
     coarse = result.map_from_scene[a] @ seam.coarse_a_from_b
     scene_b = result.scenes[b]
     quality = seam.quality
+    by, off = "their first units put them, without positions", ""
+    if "positions_off_m" in quality:
+        by, off = "their positions put them", f"{quality['positions_off_m']:.2f} m off, "
     before = seam_picture(
-        [f"{seam.a} (orange) and {seam.b} (blue), as their positions put them", "before aggregation: "
-         f"{quality['positions_off_m']:.2f} m off, residual {quality['residual_before_px']:.1f} px"],
+        [f"{seam.a} (orange) and {seam.b} (blue), as {by}", "before aggregation: "
+         f"{off}residual {quality['residual_before_px']:.1f} px"],
         (points_a, se3.apply(coarse, scene_b.points_m)),
         (trajectory_a, se3.apply(coarse, scene_b.trajectory_m)),
         centre,

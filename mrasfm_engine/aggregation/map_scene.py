@@ -5,19 +5,23 @@ Cameras and files are called SCENE/NAME; units and images are numbered through, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.map_adjustment import MapModel
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import geodesy
+from mrasfm_engine.geometry.camera_model import pack_camera, unpack_camera
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.scene.semantics import majority_class
+from mrasfm_engine.types import Floats
 from schemas import Camera, DriveManifest, Frame, FrameImage, Rig
 
 
-def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Scene:
+def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene, component_of_scene: Sequence[int]) -> Scene:
     """The map's poses, points and observations as a scene, in the frame of the reference."""
     rows, point, count = model.rows, model.point, len(model.state.points_m)
     image = assembly.keypoint_image[rows]
@@ -51,6 +55,7 @@ def map_scene(assembly: Assembly, model: MapModel, reference: SourceScene) -> Sc
         rough_world_from_local=reference.ecef_from_local if reference.common_world is not None else None,
         unit_from_image=None if assembly.simultaneous else model.state.unit_from_band,
         rig_of_camera=np.repeat(np.arange(len(assembly.scenes)), np.diff(assembly.first_camera)),
+        unit_component=np.array(component_of_scene, dtype=np.int64)[assembly.scene_of_unit],
     )
 
 
@@ -81,14 +86,23 @@ def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]
     return [
         CameraCalibration(
             rig_from_cam=rig_from_cam,
-            params=np.array(camera.params),
+            params=params_of(camera, params),
             sigma_rotation_deg=unknown,
             sigma_translation_m=unknown,
             sigma_focal_px=float("nan"),
             observed=np.zeros(6, dtype=np.bool_),
         )
-        for camera, rig_from_cam in zip(cameras, model.state.rig_from_cam, strict=True)
+        for camera, rig_from_cam, params in zip(
+            cameras, model.state.rig_from_cam, model.state.camera_params, strict=True
+        )
     ]
+
+
+def params_of(camera: Camera, packed: Floats) -> Floats:
+    """A camera's parameters in a state, exactly the camera's own where they have not changed."""
+    if np.array_equal(packed, pack_camera(camera.model, camera.params)[1]):
+        return np.array(camera.params)
+    return unpack_camera(camera.model, packed)
 
 
 def _features(assembly: Assembly) -> list[ImageFeatures]:
@@ -103,7 +117,7 @@ def _features(assembly: Assembly) -> list[ImageFeatures]:
 
 def _georeference(assembly: Assembly, reference: SourceScene) -> Georeference:
     latitude, longitude, height = geodesy.geodetic_from_ecef(reference.ecef_from_local[:3, 3]).tolist()
-    datums = sorted({scene.height_datum for scene in assembly.scenes})
+    datums = sorted({scene.height_datum for scene in assembly.scenes if scene.is_placed})
     return Georeference(
         origin_latitude_deg=latitude,
         origin_longitude_deg=longitude,

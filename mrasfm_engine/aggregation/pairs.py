@@ -64,10 +64,8 @@ def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggregation
         How the scenes lie by their positions (4, 4).
     """
     reach = config.position_error_m + SIGHT_SHIFT_M
-    units_a, units_b = (
-        thinned(s, min(config.probe_spacing_m * f, _length_m(s) / LEAST_PROBES)) for s, f in ((a, 0.75), (b, 1))
-    )
-    images_a, images_b = _images_of(a, units_a), _images_of(b, units_b)
+    units_a, units_b = probe_units(a, b, config)
+    images_a, images_b = images_of(a, units_a), images_of(b, units_b)
     if not len(images_a) or not len(images_b):
         return []
     poses_a, poses_b = a.world_from_cam[images_a], a_from_b @ b.world_from_cam[images_b]
@@ -86,7 +84,16 @@ def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: Aggregation
     return [Probe(unit=unit, pairs=np.stack([pair for _, pair in rows])) for unit, rows in ranked]
 
 
-def _images_of(scene: SourceScene, units: Ints) -> Ints:
+def probe_units(a: SourceScene, b: SourceScene, config: AggregationConfig) -> tuple[Ints, Ints]:
+    """Units of a that are looked at, and units of b that are looked for."""
+    units_a, units_b = (
+        thinned(s, min(config.probe_spacing_m * f, _length_m(s) / LEAST_PROBES)) for s, f in ((a, 0.75), (b, 1))
+    )
+    return units_a, units_b
+
+
+def images_of(scene: SourceScene, units: Ints) -> Ints:
+    """Images with keypoints of some units."""
     return np.flatnonzero(np.isin(scene.image_unit, units) & scene.image_matchable)
 
 

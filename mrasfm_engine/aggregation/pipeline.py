@@ -21,6 +21,7 @@ from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joi
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.aggregation.vehicles import Vehicle, vehicles_of
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.export.map import write_map
@@ -91,6 +92,12 @@ def aggregate(
     known = stages.association(run, found)
     seams = stages.seams(run, found, known)
     graph, loops, chains = _graph(found, known, seams, config)
+    kept = stages.without_unplaced(run, found, seams, [chain.scenes for chain in chains], leave_out=leave_out)
+    if len(kept) < len(found):
+        found, known = [found[k] for k in kept], known.of_scenes(kept)
+        names = {scene.name for scene in found}
+        seams = [seam for seam in seams if {seam.a, seam.b} <= names]
+        graph, loops, chains = _graph(found, known, seams, config)
     result = _join_scenes(run, found, known, seams, graph, loops, chains)
     say_findings(run, result)
     pictures = map_pictures(run, result) if config.output.pictures else {}
@@ -116,11 +123,7 @@ def _graph(
         list(by_name),
         seams,
         paths=[ScenePaths.from_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
-        off_positions=lambda k: off_positions(
-            seams[k],
-            by_name[seams[k].a].sigma_position_m[seams[k].units_a],
-            by_name[seams[k].b].sigma_position_m[seams[k].units_b],
-        ),
+        off_positions=lambda k: _off_positions(seams[k], by_name[seams[k].a], by_name[seams[k].b]),
     ).without_contradictions()
     done: set[int] = set()
     chains: list[Chain] = []
@@ -135,6 +138,12 @@ def _graph(
         chains.append(chain)
         done.update(chain.scenes)
     return graph, loops, chains
+
+
+def _off_positions(seam: Seam, a: SourceScene, b: SourceScene) -> float:
+    if not (a.is_placed and b.is_placed):
+        return 0.0
+    return off_positions(seam, a.sigma_position_m[seam.units_a], b.sigma_position_m[seam.units_b])
 
 
 def _join_scenes(
@@ -165,13 +174,14 @@ def _join_scenes(
             run.config,
             cancel=run.cancel,
         )
-        own = dict(zip(members, joint.first_from_scene, strict=True))
+        own = {k: m for k, m in zip(members, joint.first_from_scene, strict=True) if found[k].is_placed}
         map_from_first = placed(own, known.map_from_scene, middle)
         poses[members] = map_from_first @ joint.first_from_scene
         chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
     run.ended(Stage.MULTI_SCENE_ADJUSTMENT, started, loops=sum(len(chain.closings) for chain in chains))
-    adjusted = _adjust_map(run, found, known, graph, poses)
+    vehicles = vehicles_of(found, run.config.bundle_adjustment)
+    adjusted = _adjust_map(run, found, known, graph, poses, vehicles)
     return MapResult(
         scenes=found,
         association=known,
@@ -184,6 +194,8 @@ def _join_scenes(
         joint_reports=[r for r in reports if r is not None],
         assembly=Assembly(scenes=found),
         adjusted=adjusted,
+        vehicles=vehicles,
+        left_out=[{"name": scene["scene"], "reason": scene["what"]} for scene in run.report["left_out"]],
     )
 
 
@@ -193,7 +205,12 @@ def _seams_among(graph: SeamGraph, found: Sequence[SourceScene], members: Sequen
 
 
 def _adjust_map(
-    run: stages.Run, found: Sequence[SourceScene], known: Association, graph: SeamGraph, poses: Floats
+    run: stages.Run,
+    found: Sequence[SourceScene],
+    known: Association,
+    graph: SeamGraph,
+    poses: Floats,
+    vehicles: Sequence[Vehicle],
 ) -> AdjustedMap:
     started = time.perf_counter()
     run.begin(Stage.MAP_ADJUSTMENT)
@@ -201,11 +218,12 @@ def _adjust_map(
     positions = {
         k: p
         for k, scene in enumerate(found)
-        if (p := drive_positions(scene, known.map_from_scene[k], int(assembly.first_unit[k]), run.config.gnss))
+        if scene.is_placed
+        and (p := drive_positions(scene, known.map_from_scene[k], int(assembly.first_unit[k]), run.config.gnss))
         is not None
     }
     owner = joined_owner(assembly, _seams_among(graph, found, range(len(found))))
-    adjusted = adjust_map(assembly, poses, owner, positions, run.config, cancel=run.cancel)
+    adjusted = adjust_map(assembly, poses, owner, positions, run.config, vehicles=vehicles, cancel=run.cancel)
     run.ended(
         Stage.MAP_ADJUSTMENT,
         started,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.pairs import guided_pairs, probes
+from mrasfm_engine.aggregation.image_search import similar_images
+from mrasfm_engine.aggregation.pairs import Probe, guided_pairs, probes
 from mrasfm_engine.aggregation.relocalization import Matches2D3D, Relocaliser, Relocalization, matches_2d3d
 from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
 from mrasfm_engine.aggregation.seam_refinement import (
@@ -43,8 +44,8 @@ class Seam:
     b: str
     accepted: bool
     reason: str
-    coarse_a_from_b: Floats  # (4, 4) by positions
-    a_from_b: Floats  # (4, 4); the coarse one where nothing better is known
+    coarse_a_from_b: Floats  # (4, 4) by positions; where a scene has none, by the units that were relocalised first
+    a_from_b: Floats  # (4, 4); the coarse one where nothing better is known, NaN where nothing is
     covariance: Floats  # (6, 6) of [omega, v] about the middle of b's units at the seam, in a's axes
     shared: Ints  # (n, 2) points of a and of b that are one
     units_a: Ints  # that see shared points
@@ -71,7 +72,7 @@ class Seam:
 def find_seam(
     a: SourceScene,
     b: SourceScene,
-    coarse_a_from_b: Floats,
+    coarse_a_from_b: Floats | None,
     matcher: Matcher,
     config: EngineConfig,
     *,
@@ -80,13 +81,20 @@ def find_seam(
 ) -> Seam:
     """Look for how two scenes lie to one another, from where their positions put them.
 
+    Parameters
+    ----------
+    coarse_a_from_b
+        By positions (4, 4); None where a scene has none: then images that look similar are compared.
+
     Returns
     -------
     Seam
         Not accepted where they share too little, or what they share does not agree.
     """
     cross = CrossMatcher(a, b, matcher, config.matching, threads=config.threads)
-    found, tried = _relocalise(a, b, coarse_a_from_b, cross, config, cancel=cancel, progress=progress)
+    settings, by_positions = config.aggregation, coarse_a_from_b
+    wanted = similar_images(a, b, settings) if by_positions is None else probes(a, b, by_positions, settings)
+    found, tried = _relocalise(a, b, wanted, cross, config, cancel=cancel, progress=progress)
     quality: dict[str, Any] = {
         "units_tried": found.units_tried,
         "units_agreeing": len(found.units_agreeing),
@@ -95,19 +103,19 @@ def find_seam(
     }
     if found.a_from_b is None:
         quality["pairs_compared"] = cross.compared
-        return _unconnected(a, b, coarse_a_from_b, found.reason, quality)
+        return _unconnected(a, b, by_positions, found.reason, quality)
     assembly = Assembly(scenes=(a, b))
     refined = _assemble(assembly, found.a_from_b, cross, config, cancel=cancel, progress=progress)
     quality["pairs_compared"] = cross.compared
     if refined is None:
-        return _unconnected(a, b, coarse_a_from_b, "too few points of both scenes fit together", quality)
-    return _judged(assembly, coarse_a_from_b, found, refined, quality, config)
+        return _unconnected(a, b, by_positions, "too few points of both scenes fit together", quality)
+    return _judged(assembly, by_positions, found, refined, quality, config)
 
 
 def _relocalise(
     a: SourceScene,
     b: SourceScene,
-    coarse: Floats,
+    wanted: Sequence[Probe],
     cross: CrossMatcher,
     config: EngineConfig,
     *,
@@ -115,7 +123,6 @@ def _relocalise(
     progress: CountProgress,
 ) -> tuple[Relocalization, int]:
     """Look for units of b in a, a few at a time, until enough agree; and how many were looked for."""
-    wanted = probes(a, b, coarse, config.aggregation)
     relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
     image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
     parts: list[CrossMatches] = []
@@ -167,13 +174,15 @@ def _assemble(
 
 def _judged(
     assembly: Assembly,
-    coarse: Floats,
+    by_positions: Floats | None,
     found: Relocalization,
     refined: RefinedSeam,
     quality: dict[str, Any],
     config: EngineConfig,
 ) -> Seam:
     a, b = assembly.scenes
+    assert found.a_from_b is not None
+    coarse = found.a_from_b if by_positions is None else by_positions
     settings = config.aggregation
     units_a, units_b = (_units_at(assembly, refined.shared, side) for side in (0, 1))
     scale, sigma_scale = scale_ratio(assembly, refined.a_from_b, refined.shared)
@@ -193,10 +202,9 @@ def _judged(
         "sigma_rotation_deg": float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
         "scale": scale,
         "sigma_scale": sigma_scale,
-        "positions_off_m": shift,
-        "positions_off_deg": turn,
     }
-    assert found.a_from_b is not None
+    if by_positions is not None:
+        quality |= {"positions_off_m": shift, "positions_off_deg": turn}
     reason = _why_not(found, refined, at, quality, settings.agreeing_units, config)
     return Seam(
         a=a.name,
@@ -241,7 +249,7 @@ def _why_not(
     off, unsure = abs(quality["scale"] - 1.0), 3.0 * quality["sigma_scale"]
     if off > settings.max_scale_error + unsure:
         return f"lengths of the scenes differ by {100 * off:.1f} %"
-    if quality["positions_off_m"] > settings.position_error_m:
+    if quality.get("positions_off_m", 0.0) > settings.position_error_m:
         return (
             f"the scenes' positions contradict it by {quality['positions_off_m']:.1f} m, more than "
             f"aggregation.position_error_m"
@@ -286,7 +294,10 @@ def _residual_px(assembly: Assembly, a_from_b: Floats, shared: Shared) -> float:
     return float(np.median(finite)) if len(finite) else float(max(a.drive.cameras[0].width, a.drive.cameras[0].height))
 
 
-def _unconnected(a: SourceScene, b: SourceScene, coarse: Floats, reason: str, quality: dict[str, Any]) -> Seam:
+def _unconnected(
+    a: SourceScene, b: SourceScene, by_positions: Floats | None, reason: str, quality: dict[str, Any]
+) -> Seam:
+    coarse = np.full((4, 4), np.nan) if by_positions is None else by_positions
     none = np.zeros(0, dtype=np.int64)
     return Seam(
         a=a.name,

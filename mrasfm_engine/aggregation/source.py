@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
-from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.drive import Drive, matrix_from_pose
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
-from schemas import DriveManifest
+from schemas import DriveManifest, Pose
 
 ARRAYS = (
     "unit_registered", "world_from_rig", "sigma_position_m", "image_registered", "unit_from_image",
@@ -39,7 +39,7 @@ class SourceScene:
     features_kind: str  # which extractor, and model, made the descriptors
     height_datum: str  # as declared; heights here are ellipsoidal
     common_world: str | None  # of rough poses, where the scene is not georeferenced
-    ecef_from_local: Floats  # (4, 4); where not georeferenced, rough_world_from_local
+    ecef_from_local: Floats  # (4, 4); where not georeferenced, rough_world_from_local; NaN where not placed
     unit_registered: Bools  # (u,)
     world_from_rig: Floats  # (u, 4, 4), NaN where not registered
     sigma_position_m: Floats  # (u, 3), NaN where not known
@@ -53,6 +53,7 @@ class SourceScene:
     keypoint_xy_px: Floats32  # (n, 2)
     keypoint_point: Ints  # (n,) -1 for none
     descriptors: NDArray[Any]  # (m, D) of the keypoints that observe a point, in their order
+    is_placed: bool = True  # positions, or rough poses of a common world, say where it is
     footprints: dict[float, Floats] = field(default_factory=dict, repr=False, compare=False)  # by depth; see footprint
 
     @cached_property
@@ -120,6 +121,25 @@ class SourceScene:
             raise ValueError("sigmas of its cameras are not six positive numbers each")
         return sigmas, known
 
+    @cached_property
+    def given_rig_from_cam(self) -> Floats:
+        """Poses (c, 4, 4) of the cameras as the drive's manifest gave them."""
+        given = [self.calibration["cameras"][camera.name]["given"] for camera in self.drive.cameras]
+        return np.stack([matrix_from_pose(Pose(**camera["rig_from_cam"])) for camera in given])
+
+    @cached_property
+    def focal_given_of_found(self) -> Floats:
+        """Focal lengths (c,) of the cameras as the drive's manifest gave them, in those that the scene found."""
+        cameras, documents = self.drive.cameras, self.calibration["cameras"]
+        return np.array([documents[c.name]["given"]["params"][0] / c.params[0] for c in cameras], dtype=np.float64)
+
+    @cached_property
+    def sigma_focal_px(self) -> Floats:
+        """Sigmas (c,) of the focal lengths that the drive observed; NaN where it did not, or nobody asked."""
+        found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
+        known = [c["sigma"].get("focal_px", np.nan) if c["observed"].get("focal") else np.nan for c in found]
+        return np.array(known, dtype=np.float64)
+
     @property
     def midpoint_m(self) -> Floats:
         """The middle of the trajectory (3,): half of the trajectory along it."""
@@ -127,6 +147,22 @@ class SourceScene:
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(trajectory, axis=0), axis=1))])
         half = 0.5 * length[-1]
         return np.array([np.interp(half, length, trajectory[:, k]) for k in range(3)])
+
+    def of_units(self, chosen: Bools) -> SourceScene:
+        """The scene as if its drive had only some units (u,); the others have no keypoints."""
+        images = chosen[self.image_unit]
+        frames = [frame for frame, keep in zip(self.manifest.frames, chosen.tolist(), strict=True) if keep]
+        return replace(
+            self,
+            manifest=self.manifest.model_copy(update={"frames": frames}),
+            unit_registered=self.unit_registered[chosen],
+            world_from_rig=self.world_from_rig[chosen],
+            sigma_position_m=self.sigma_position_m[chosen],
+            image_registered=self.image_registered[images],
+            unit_from_image=self.unit_from_image[images] if len(self.unit_from_image) else self.unit_from_image,
+            keypoint_first=np.concatenate([self.keypoint_first[:-1][images], self.keypoint_first[-1:]]),
+            footprints={},
+        )
 
     def keypoints_with_points(self, image: int) -> Ints:
         """Keypoints (rows of the whole scene) of an image that observe a point."""
@@ -141,6 +177,7 @@ class SourceScene:
             "features_kind": self.features_kind,
             "height_datum": self.height_datum,
             "common_world": self.common_world,
+            **({} if self.is_placed else {"is_placed": False}),
         }
 
     def pack(self) -> tuple[Arrays, dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 
 from mrasfm_engine import __version__
 from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
-from mrasfm_engine.aggregation.load import read_scene
+from mrasfm_engine.aggregation.load import components_of, not_georeferenced, read_scene
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
@@ -22,8 +22,16 @@ from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.io.stage_store import StageStore, fingerprint
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.types import CountProgress, StageProgress
-from schemas.artifacts import MAP_FILE, SCENES_FOLDER, SEAMS_FOLDER, Stage, seam_checkpoint, seam_name
-from schemas.findings import Finding, as_json, warning
+from schemas.artifacts import (
+    MAP_FILE,
+    SCENES_FOLDER,
+    SEAMS_FOLDER,
+    Stage,
+    drive_of_scene,
+    seam_checkpoint,
+    seam_name,
+)
+from schemas.findings import Finding, as_json, listed, warning
 
 FAR_APART_M = 50_000.0
 MIN_SCENES = 2
@@ -75,20 +83,21 @@ def scenes(
     """All scenes of the map, those that it has already too; checked against one another."""
     started = time.perf_counter()
     run.begin(Stage.SCENES)
-    kept = {} if run.into is None else _scenes_of_map(run.into)
+    before = {} if run.into is None else _scenes_of_map(run.into)
     for number, name in enumerate(remove):
-        if name not in kept or name in remove[:number]:
+        if not _named(name, before) or name in remove[:number]:
             what = "given to --remove twice" if name in remove[:number] else f"not in the map {run.into}"
             raise InputError(
                 f"scene {name} is {what}",
-                remedy=f"The map has {', '.join(sorted(kept)) or 'no scenes'}." if kept else "Give --into MAP.",
+                remedy=f"The map has {', '.join(sorted(before)) or 'no scenes'}." if before else "Give --into MAP.",
                 code="no-such-scene",
             )
-        del kept[name]
+    kept = {name: scene for name, scene in before.items() if not any(_named(gone, [name]) for gone in remove)}
     result = list(kept.values())
     unfit: dict[str, InputError] = {}
-    for done, (name, folder) in enumerate(folders.items(), 1):
-        if name in kept:
+    coming = {name: folder for one in folders.items() for name, folder in _with_components(*one).items()}
+    for done, (name, folder) in enumerate(coming.items(), 1):
+        if _named(name, kept):
             raise InputError(
                 f"the map {run.into} has a scene called {name} already",
                 remedy="Remove it first (--remove), or give the new one another name: NAME=FOLDER.",
@@ -97,19 +106,84 @@ def scenes(
         try:
             result.append(read_scene(folder, name))
         except InputError as error:
-            if not leave_out:
+            if not leave_out and not _is_small_component(name, error):
                 raise
             unfit[name] = error
-        run.progress(Stage.SCENES, done, len(folders))
-    if unfit and (len(unfit) == len(folders) or len(result) < MIN_SCENES):
+        run.progress(Stage.SCENES, done, len(coming))
+    if unfit and (len(unfit) == len(coming) or len(result) < MIN_SCENES):
         raise next(iter(unfit.values()))
-    run.report["left_out"] = [
-        {"scene": name, "code": error.code, "what": error.what, "remedy": error.remedy} for name, error in unfit.items()
-    ]
+    for name, unfit_because in unfit.items():
+        _leave_out(run, name, unfit_because)
     result.sort(key=lambda scene: scene.name)
+    if result and not any(scene.is_placed for scene in result):
+        raise not_georeferenced(result[0].name)
     _check_together(run, result)
     run.ended(Stage.SCENES, started, scenes=len(result), taken_from_the_map=len(kept))
     return result
+
+
+def _named(name: str, scenes: Collection[str]) -> list[str]:
+    """Scenes of these that a name means: the one called so, and the components of the drive of that name."""
+    return [scene for scene in scenes if name in (scene, drive_of_scene(scene))]
+
+
+def _with_components(name: str, folder: Path) -> dict[str, Path]:
+    return {name: folder, **components_of(folder, name)}
+
+
+def _is_small_component(name: str, error: InputError) -> bool:
+    """Return whether a scene is one of those components that are too small for a map, as some of a drive are."""
+    return name != drive_of_scene(name) and error.code == "empty-scene"
+
+
+def _leave_out(run: Run, name: str, because: InputError) -> None:
+    """Note that a scene is not in the map."""
+    run.report["left_out"].append({"scene": name, "code": because.code, "what": because.what, "remedy": because.remedy})
+    run.found(warning("scene-left-out", f"scene {name} is not in the map: {because.what}", because.remedy))
+
+
+def without_unplaced(
+    run: Run,
+    found: Sequence[SourceScene],
+    seams: Sequence[Seam],
+    chains: Iterable[Sequence[int]],
+    *,
+    leave_out: bool,
+) -> list[int]:
+    """Indices of the scenes that the map can place: by positions, or by seams with scenes that have some.
+
+    The others are noted with the best reason that their seams give.
+
+    Parameters
+    ----------
+    chains
+        Indices of scenes that seams connect.
+
+    Raises
+    ------
+    InputError
+        Where nothing places a drive that must not be left out, or fewer scenes are left than a map needs.
+    """
+    lost = sorted(k for chain in chains if not any(found[i].is_placed for i in chain) for k in chain)
+    errors = {k: not_georeferenced(found[k].name, f", and no seam places it: {_tried(found[k], seams)}") for k in lost}
+    for k, error in errors.items():
+        if not leave_out and found[k].name == drive_of_scene(found[k].name):
+            raise error
+        _leave_out(run, found[k].name, error)
+    kept = [k for k in range(len(found)) if k not in errors]
+    if errors and len(kept) < MIN_SCENES:
+        raise next(iter(errors.values()))
+    return kept
+
+
+def _tried(scene: SourceScene, seams: Sequence[Seam]) -> str:
+    """Reasons that were found against the seams of a scene, in words."""
+    ends = [(seam, seam.b if seam.a == scene.name else seam.a) for seam in seams if scene.name in (seam.a, seam.b)]
+    reasons = [
+        f"with {other}: {'accepted, but that one is not placed either' if seam.accepted else seam.reason}"
+        for seam, other in ends
+    ]
+    return listed(reasons) if reasons else "no scene is like it"
 
 
 def _scenes_of_map(folder: Path) -> dict[str, SourceScene]:
@@ -174,7 +248,7 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
         )
     for k, scene in enumerate(found):
         for other in found[:k]:
-            if _of_one_drive(scene, other):
+            if drive_of_scene(scene.name) != drive_of_scene(other.name) and _of_one_drive(scene, other):
                 raise InputError(
                     f"scenes {other.name} and {scene.name} are of the same drive",
                     remedy="Give each drive once.",
@@ -190,7 +264,7 @@ def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
         "worlds",
         "Give all drives GNSS, or rough_poses in one common_world.",
     )
-    datums = sorted({scene.height_datum for scene in found})
+    datums = sorted({scene.height_datum for scene in found if scene.is_placed})
     if len(datums) > 1:
         run.found(
             warning(
@@ -219,13 +293,16 @@ def _of_one_drive(a: SourceScene, b: SourceScene) -> bool:
         return False
     # Clocks that begin at zero and numbered files are those of many drives: where they were tells them apart.
     rough_a, rough_b = (None if s.manifest.rough_poses is None else s.manifest.rough_poses.poses for s in (a, b))
+    if a.manifest.gnss is None and rough_a is None and rough_b is None:
+        return np.array_equal(a.keypoint_xy_px, b.keypoint_xy_px)
     return a.manifest.gnss is not None or rough_a == rough_b
 
 
 def _require_one(found: Sequence[SourceScene], name: str, code: str, what: str, remedy: str) -> None:
     values: dict[Any, str] = {}
     for scene in found:
-        values.setdefault(getattr(scene, name), scene.name)
+        if scene.is_placed or name != "common_world":
+            values.setdefault(getattr(scene, name), scene.name)
     if len(values) > 1:
         (a, first), (b, second) = list(values.items())[:2]
         raise InputError(
@@ -241,7 +318,7 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
     run.begin(Stage.ASSOCIATION)
     result = associate(found, run.config.aggregation)
     middle = np.array([m[:3, 3] for m in result.map_from_scene])
-    if np.abs(middle - middle[result.reference]).max() > FAR_APART_M:
+    if np.nanmax(np.abs(middle - middle[result.reference])) > FAR_APART_M:
         run.found(
             warning(
                 "far-apart",
@@ -273,7 +350,7 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
             seam = find_seam(
                 a,
                 b,
-                coarse_transform(a, b),
+                coarse_transform(a, b) if a.is_placed and b.is_placed else None,
                 run.components.matcher,
                 run.config,
                 cancel=run.cancel,

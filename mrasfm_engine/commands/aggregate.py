@@ -77,11 +77,11 @@ def _say(report: dict[str, Any], document: dict[str, Any], out: Path) -> None:
     print(f"  points:           {summary['points']} in {out / 'points.ply'}")
     for seam in document["seams"]:
         if seam["accepted"]:
+            off = f", positions were {seam['positions_off_m']:.2f} m off" if "positions_off_m" in seam else ""
             print(
                 f"  seam {seam['a']} - {seam['b']}: {seam['inliers']} shared points, "
                 f"residual {seam['residual_before_px']:.1f} -> {seam['residual_after_px']:.2f} px, "
-                f"sigma {100 * seam['sigma_translation_m']:.1f} cm {seam['sigma_rotation_deg']:.3f} deg, "
-                f"positions were {seam['positions_off_m']:.2f} m off"
+                f"sigma {100 * seam['sigma_translation_m']:.1f} cm {seam['sigma_rotation_deg']:.3f} deg{off}"
             )
         else:
             print(f"  no seam {seam['a']} - {seam['b']}: {seam['reason']}")

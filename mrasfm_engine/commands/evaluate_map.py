@@ -18,6 +18,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.read_map import MapPoses, MapSeam, read_map
 from mrasfm_engine.io.trajectory_file import Trajectory, read_tum
 from mrasfm_engine.types import Floats
+from schemas.artifacts import drive_of_scene
 
 TOLERANCE_US = 1000
 
@@ -36,7 +37,7 @@ def evaluate_map(folder: Path, words: list[str]) -> tuple[dict[str, Any], Table]
     Parameters
     ----------
     words
-        One file with the truth of all drives, or SCENE=FILE for each.
+        One file with the truth of all drives, or SCENE=FILE for each; that of a drive serves all of its components.
     """
     poses = read_map(folder)
     matched = _matched(poses, _truths(poses, words), folder)
@@ -60,14 +61,15 @@ def _truths(poses: MapPoses, words: list[str]) -> dict[str, Trajectory]:
             remedy="Give one file for all drives, or SCENE=FILE once for each.",
         )
     for name in named:
-        if name not in poses.trajectories:
+        if name not in {other for scene in poses.trajectories for other in (scene, drive_of_scene(scene))}:
             known = ", ".join(sorted(poses.trajectories))
             raise InputError(
                 f"--truth names {name}, which the map does not have",
                 remedy=f"Its scenes are {known}. Give a file whose name has '=' as ./FILE.",
             )
     if named:
-        return {name: read_tum(file) for name, file in named.items()}
+        files = {name: named.get(name, named.get(drive_of_scene(name))) for name in poses.trajectories}
+        return {name: read_tum(file) for name, file in files.items() if file is not None}
     if len(words) != 1:
         raise InputError(
             f"--truth has {len(words)} files", remedy="Give one file for all drives, or SCENE=FILE once for each."

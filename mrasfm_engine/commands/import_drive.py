@@ -27,6 +27,9 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in FOLDER or the working directory")
     parser.add_argument("--scene", metavar="NAME", help="name of the scene, if the recording holds several")
     parser.add_argument(
+        "--vehicle", metavar="NAME", help="which vehicle drove, where the recording does not say or is wrong"
+    )
+    parser.add_argument(
         "--truth",
         action="store_true",
         help="write truth.tum also where the true poses and the GNSS come from one system (KITTI raw)",
@@ -46,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         frames=arguments.frames,
         gnss_file=arguments.gnss,
         scene=arguments.scene,
+        vehicle=arguments.vehicle,
         truth=arguments.truth,
         copy=arguments.copy,
         force=arguments.force,

@@ -16,7 +16,7 @@ from schemas import CAMERA_MODELS, Camera, Pose
 OBSERVED, ONLY_PRIOR, HELD = "observed", "only the prior", "held"
 
 
-def calibration_document(scene: Scene) -> dict[str, Any]:
+def calibration_document(scene: Scene, component: int = 0) -> dict[str, Any]:
     """The calibration by camera: `given`, `refined`, `difference` about and along the rig's axes, sigma, verdict.
 
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
@@ -25,12 +25,15 @@ def calibration_document(scene: Scene) -> dict[str, Any]:
     say, each camera's against the mean of all unless positions tell that too. Where intrinsics were asked for,
     `observed` and `verdict` have `focal`: of a focal length that the drive does not observe the given value is held.
     `common` are the motions of all cameras together, of which no direction says anything: `observed` of a camera is
-    always among the others.
+    always among the others. `component` is the scene's number where it is one of a drive's smaller components: they
+    take the calibration of the largest, whose observations it rests on.
     """
     cameras = zip(scene.drive.cameras, scene.calibration, strict=True)
     observability = scene.calibration_observability
     return {
         "version": 1,
+        **({} if scene.drive.manifest.vehicle is None else {"vehicle": scene.drive.manifest.vehicle}),
+        **({"component": component, "from_component": 0} if component else {}),
         **(
             {}
             if observability is None
@@ -53,25 +56,36 @@ def _common(observability: CalibrationObservability) -> dict[str, Any]:
     }
 
 
-def document_in_map(document: Mapping[str, Any], rig_from_cam: Mapping[str, Floats]) -> dict[str, Any]:
+def document_in_map(document: Mapping[str, Any], found: Mapping[str, tuple[Floats, Floats]]) -> dict[str, Any]:
     """A scene's `calibration.json` after its cameras were adjusted in a map: `refined` and `difference` are the map's.
+
+    They are given by name: poses (4, 4) and COLMAP's parameters.
 
     `since_scene` is by how much that is another pose than the scene found, and absent where nothing moved; everything
     else is as the scene found it.
     """
-    return {**document, "cameras": {k: _camera_in_map(c, rig_from_cam[k]) for k, c in document["cameras"].items()}}
+    return {**document, "cameras": {k: _camera_in_map(c, *found[k]) for k, c in document["cameras"].items()}}
 
 
-def _camera_in_map(camera: Mapping[str, Any], rig_from_cam: Floats) -> dict[str, Any]:
+def _camera_in_map(camera: Mapping[str, Any], rig_from_cam: Floats, params: Floats) -> dict[str, Any]:
     given, found = (matrix_from_pose(Pose(**camera[key]["rig_from_cam"])) for key in ("given", "refined"))
-    if np.array_equal(found, rig_from_cam):
+    before = np.array(camera["refined"]["params"])
+    if np.array_equal(found, rig_from_cam) and np.array_equal(before, params):
         return dict(camera)
+    focal = _focal_places(camera["model"])
+    off_px = (float(np.mean((params - np.array(p))[focal])) for p in (camera["given"]["params"], before))
+    since_given, since_scene = ({**_difference(p, rig_from_cam), "focal_px": next(off_px)} for p in (given, found))
+    refined = {"rig_from_cam": pose_from_matrix(rig_from_cam).model_dump(), "params": params.tolist()}
     return {
         **camera,
-        "refined": {**camera["refined"], "rig_from_cam": pose_from_matrix(rig_from_cam).model_dump()},
-        "difference": {**camera["difference"], **_difference(given, rig_from_cam)},
-        "since_scene": _difference(found, rig_from_cam),
+        "refined": {**camera["refined"], **refined},
+        "difference": {**camera["difference"], **since_given},
+        "since_scene": since_scene,
     }
+
+
+def _focal_places(model: str) -> list[int]:
+    return [k for k, name in enumerate(CAMERA_MODELS[model]) if name in ("f", "fx", "fy")]
 
 
 def _difference(given: Floats, refined: Floats) -> dict[str, Any]:
@@ -91,7 +105,7 @@ def verdict_in_words(refined: CameraCalibration) -> list[str]:
 def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
     given = matrix_from_pose(camera.rig_from_cam)
     names = CAMERA_MODELS[camera.model]
-    focal = [k for k, name in enumerate(names) if name in ("f", "fx", "fy")]
+    focal = _focal_places(camera.model)
     words = verdict_in_words(refined)
     sigma = {
         "rotation_deg": refined.sigma_rotation_deg,

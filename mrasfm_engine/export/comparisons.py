@@ -152,6 +152,10 @@ def ply(scene: Scene, rows: NDArray[Any]) -> Rows:
     yield Row("a colour", colors, scene.point_colors)
     yield Row("a class", rows["class"], scene.point_classes)
     yield Row("a patch", rows["road_patch"], scene.point_patches)
+    unit = scene.unit_component[[image.unit for image in scene.drive.images]][scene.observation_image]
+    components = np.zeros(len(scene.points_m), dtype=np.int64)
+    components[scene.observation_point[::-1]] = unit[::-1]
+    yield Row("a component", rows["component"], components)
     yield Row("the sum of track lengths", int(rows["track_length"].sum()), len(scene.observation_point))
 
 

@@ -1,4 +1,4 @@
-"""`points.ply`: the scene's points with colour, track length, reprojection error, class and patch of the road."""
+"""`points.ply`: the scene's points with colour, track length, error, class, patch of the road and component."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ PLY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<i4": "int"}
 def write_ply(scene: Scene, path: Path) -> None:
     """Write a binary little-endian PLY in the local frame.
 
-    Properties are x y z, red green blue, track_length, error_px, class (the header's comment names the numbers) and
-    road_patch, the index of the patch in `road.json` whose surface the point lies on, or -1.
+    Properties are x y z, red green blue, track_length, error_px, class (the header's comment names the numbers),
+    road_patch, the index of the patch in `road.json` whose surface the point lies on, or -1, and component, the number
+    of the component whose units observe the point.
     """
     n = len(scene.points_m)
     far = n > 0 and float(np.abs(scene.points_m).max()) > FLOAT32_LIMIT_M
@@ -28,6 +29,7 @@ def write_ply(scene: Scene, path: Path) -> None:
         [(name, coordinate) for name in "xyz"]
         + [(name, "|u1") for name in ("red", "green", "blue")]
         + [("track_length", "<i4"), ("error_px", "<f4"), ("class", "|u1"), ("road_patch", "<i4")]
+        + [("component", "<i4")]
     )
     rows = np.zeros(n, dtype=dtype)
     for k, name in enumerate("xyz"):
@@ -38,12 +40,14 @@ def write_ply(scene: Scene, path: Path) -> None:
     rows["error_px"] = scene.point_error_px
     rows["class"] = scene.point_classes
     rows["road_patch"] = scene.point_patches
+    rows["component"] = scene.point_component
     assert dtype.names is not None
     properties = "".join(f"property {PLY_TYPES[dtype[name].str]} {name}\n" for name in dtype.names)
     classes = ", ".join(f"{code} {name}" for code, name in CLASS_NAMES.items())
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment metres in the local frame of frame.json\n"
         f"comment class: {classes}\ncomment road_patch: index into road.json's patches, -1 off the road\n"
+        "comment component: as report.json numbers them, 0 the largest\n"
         f"element vertex {n}\n{properties}end_header\n"
     )
     with path.open("wb") as file:

@@ -29,6 +29,7 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
     """`poses.json`: every unit and every image of the drive, with a pose where it is registered.
 
     Units of `components`, masks (units,) of the first and so on, have their pose in that component's own `poses.json`.
+    A registered unit with a `component` belongs to the scene's component of that number.
 
     A value that does not exist (the pose of what is not registered, the geodetic position of a scene that is not
     georeferenced, an unknown sigma) is absent, never zero or null.
@@ -49,6 +50,8 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
             if np.isfinite(scene.sigma_position_m[u]).all():
                 unit["sigma_position_m"] = scene.sigma_position_m[u].tolist()
             unit |= _place(unit_places, u)
+            if scene.unit_component[u]:
+                unit["component"] = int(scene.unit_component[u])
         for number, own in enumerate(components, start=1):
             if own[u]:
                 unit["component"] = number

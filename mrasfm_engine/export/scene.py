@@ -81,6 +81,7 @@ def write_scene(
     scenes = [scene, *(other for other, _ in components)]
     for one in scenes:
         check_scene(one)
+    report = {**report, "components": component_list(scenes)}
     needed = sum(map(_size_bytes, scenes)) + picture_files.size_bytes(pictures)
     with publishing(out, needed, replaced=REPLACED) as work:
         _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
@@ -88,6 +89,29 @@ def write_scene(
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
             _write(other, folder, own_report, NO_PICTURES)
+
+
+def component_list(scenes: Sequence[Scene]) -> list[dict[str, Any]]:
+    """`components` of a scene's report: of the scene itself, and of those in its folder `components/`.
+
+    Each has its number, what it has of units and points, and where its files are. Components of one folder share its
+    frame.
+    """
+    found = [
+        {
+            "component": int(number),
+            "folder": component_folder(at) if at else ".",
+            "georeferenced": scene.georeference is not None,
+            "registered_units": int((scene.unit_registered & (scene.unit_component == number)).sum()),
+            "registered_images": int(
+                (scene.image_registered & (scene.unit_component[scene.image_unit] == number)).sum()
+            ),
+            "points": int((scene.point_component == number).sum()),
+        }
+        for at, scene in enumerate(scenes)
+        for number in np.unique(scene.unit_component[scene.unit_registered])
+    ]
+    return sorted(found, key=lambda one: one["component"])
 
 
 def summary(scene: Scene) -> dict[str, Any]:
@@ -126,7 +150,7 @@ def _write(
         write_json(work / ROAD_FILE, road.road_document(scene))
     (work / "poses.tum").write_text(pose_files.poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", pose_files.poses_document(scene, components))
-    write_json(work / "calibration.json", calibration.calibration_document(scene))
+    write_json(work / "calibration.json", calibration.calibration_document(scene, report.get("component", 0)))
     write_json(work / "frame.json", coordinate_frame.frame_document(scene))
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")

@@ -150,6 +150,7 @@ def _manifest(recording: Recording) -> DriveManifest:
     ]
     try:
         manifest = DriveManifest(
+            **({} if recording.vehicle is None else {"version": 2, "vehicle": recording.vehicle}),
             name=recording.name,
             rig=Rig(cameras=recording.cameras),
             frames=frames,
@@ -160,7 +161,7 @@ def _manifest(recording: Recording) -> DriveManifest:
         )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        what = str(first["msg"]).removeprefix("Value error, ")
+        what = ": ".join([*map(str, first["loc"]), str(first["msg"]).removeprefix("Value error, ")])
         raise InputError(f"recording {recording.name}: {what}", remedy="Correct it at its source.") from None
     for problem in file_problems(manifest):
         what = f"the drive's file {problem.path} {problem.what}"

@@ -32,6 +32,7 @@ def import_recording(
     cameras: Sequence[str] | None = None,
     gnss_file: Path | None = None,
     scene: str | None = None,
+    vehicle: str | None = None,
     truth: bool = False,
     copy: bool = False,
     force: bool = False,
@@ -53,6 +54,8 @@ def import_recording(
         directory.
     scene
         Name of the scene, for layouts that hold several.
+    vehicle
+        Which vehicle drove, instead of what the recording says.
     truth
         Whether the units' poses become the truth where they are outputs of the system that the GNSS is of, too.
     copy, force
@@ -74,6 +77,8 @@ def import_recording(
             f"the drive {out} would replace the recording {folder}", remedy="Give another folder.", code="output-in-use"
         )
     recording = select_units(select_cameras(_read(folder, scene), cameras), frames)
+    if vehicle is not None:
+        recording = replace(recording, vehicle=vehicle)
     if recording.truth_is_gnss and not truth:
         recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
     return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)

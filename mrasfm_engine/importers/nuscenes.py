@@ -20,7 +20,7 @@ from mrasfm_engine.importers.rig_folder import checked_camera
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.types import Floats
 from schemas import Camera
-from schemas.drive import Finite, RelativePath, Vector3
+from schemas.drive import Finite, RelativePath, Vector3, Vehicle
 
 DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
 HAS_SCENES = True
@@ -38,6 +38,11 @@ class _Row(BaseModel):
 class _Scene(_Row):
     name: str
     first_sample_token: str
+    log_token: str | None = None
+
+
+class _Log(_Row):
+    vehicle: Vehicle | None = None
 
 
 class _Sample(_Row):
@@ -135,7 +140,16 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         cameras=cameras,
         units=units,
         notes=[FLAT_NOTE],
+        vehicle=_vehicle(chosen, tables),
     )
+
+
+def _vehicle(scene: _Scene, tables: Path) -> str | None:
+    """The vehicle that the scene's log names, where the tables have one."""
+    if scene.log_token is None or not (tables / "log.json").is_file():
+        return None
+    logs = _by_token(_table(tables, "log", _Log))
+    return logs[scene.log_token].vehicle if scene.log_token in logs else None
 
 
 def scene_names(folder: Path) -> list[str]:

@@ -57,6 +57,7 @@ class Recording:
     truth_is_gnss: bool = False  # the units' poses are of the system that the GNSS is of: truth only where asked for
     label_map: LabelMap | None = None
     notes: list[str] = field(default_factory=list)
+    vehicle: str | None = None
 
 
 def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T:

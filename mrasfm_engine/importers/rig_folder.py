@@ -25,7 +25,7 @@ from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera, LabelMap
-from schemas.drive import MAX_CAMERAS, Finite, Name
+from schemas.drive import MAX_CAMERAS, Finite, Name, Vehicle
 
 DESCRIPTION = "rig.json and a folder of numbered images for every camera"
 HAS_SCENES = False
@@ -59,6 +59,7 @@ class _RigFile(BaseModel):
     model_config = ConfigDict(extra="ignore")
 
     body_axes: BodyAxes
+    vehicle: Vehicle | None = None
     cameras: Annotated[dict[Name, _RigCamera], Field(min_length=1, max_length=MAX_CAMERAS)]
 
 
@@ -112,6 +113,7 @@ def read(folder: Path) -> Recording:
         cameras=cameras,
         units=units,
         body_axes=rig.body_axes,
+        vehicle=rig.vehicle,
         default_gnss=gnss if gnss.exists() else None,
         label_map=LabelMap.cityscapes() if any(masks.values()) else None,
     )

@@ -50,7 +50,7 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
     edge = [(i, j) for i in range(len(unit)) if (j := where.get((int(last[unit[i]]), int(camera[i])))) is not None]
     if not edge:
         return np.zeros((0, 2), dtype=np.int64)
-    index = _Index.from_features(features)
+    index = ImageIndex.from_features(features)
     limit = MIN_LIKENESS * float(np.median([index.likeness(i, np.array([j]))[0] for i, j in edge]))
     first = np.searchsorted(unit, np.arange(len(ahead) + 1))  # images are in the order of their units
     behind: list[list[int]] = [[] for _ in ahead]
@@ -91,8 +91,8 @@ def _largest(values: Floats32, count: int, *, above: float) -> tuple[Ints, Ints]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Index:
-    """VLAD vectors of all images: in few directions to find candidates, in bytes to compare these with.
+class ImageIndex:
+    """VLAD vectors of images: in few directions to find candidates, in bytes to compare these with.
 
     Attributes
     ----------
@@ -109,7 +109,8 @@ class _Index:
     steps: Floats32
 
     @staticmethod
-    def from_features(features: Sequence[ImageFeatures]) -> _Index:
+    def from_features(features: Sequence[ImageFeatures]) -> ImageIndex:
+        """Index of some images, with a vocabulary of their own."""
         centres, count = _vocabulary(features), len(features)
         codes, steps = np.zeros((count, centres.size), np.int8), np.zeros(count, np.float32)
         for image, found in enumerate(features):
@@ -127,7 +128,7 @@ class _Index:
             batch = slice(begin, begin + BATCH)
             result[batch] = (codes[batch] * steps[batch, None]) @ basis
         result /= np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-6)
-        return _Index(directions=result, codes=codes, steps=steps)
+        return ImageIndex(directions=result, codes=codes, steps=steps)
 
     def likeness(self, image: int, others: Ints) -> Floats32:
         """Scalar products (n,) of an image's vector with others'."""

@@ -128,6 +128,8 @@ class Scene:
     own_cars: list[Bools | None] = field(default_factory=list)
     # (cameras,) of a map: which vehicle each camera is on; empty where all are on one
     rig_of_camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    # (units,) number of the component that each unit belongs to, 0 the largest; all 0 where not given
+    unit_component: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         if not len(self.point_classes):
@@ -138,11 +140,28 @@ class Scene:
             self.own_cars = [None for _ in self.drive.cameras]
         if not len(self.rig_of_camera):
             self.rig_of_camera = np.zeros(len(self.calibration), np.int64)
+        if not len(self.unit_component):
+            self.unit_component = np.zeros(len(self.unit_registered), np.int64)
+
+    @property
+    def image_unit(self) -> Ints:
+        """Unit (images,) of every image."""
+        return np.array([image.unit for image in self.drive.images], dtype=np.int64)
+
+    @property
+    def point_component(self) -> Ints:
+        """Component (p,) of every point: that of the first unit that observes it, 0 for a point without any."""
+        result = np.zeros(len(self.points_m), np.int64)
+        if not self.unit_component.any():
+            return result
+        points, first = np.unique(self.observation_point, return_index=True)
+        result[points] = self.unit_component[self.image_unit[self.observation_image[first]]]
+        return result
 
     @property
     def world_from_cam(self) -> Floats:
         """Poses (images, 4, 4) of all images at their own timestamps; NaN for images that are not registered."""
-        units = np.array([image.unit for image in self.drive.images], dtype=np.int64)
+        units = self.image_unit
         cameras = np.array([image.camera for image in self.drive.images], dtype=np.int64)
         rig_from_cam = np.stack([camera.rig_from_cam for camera in self.calibration])
         world_from_rig = self.world_from_rig[units]

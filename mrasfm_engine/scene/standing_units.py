@@ -73,6 +73,7 @@ def with_standing_units(scene: Scene, drive: Drive, included: Bools, moved_px: F
             image_registered=image_registered,
             world_from_rig=poses,
             sigma_position_m=sigma,
+            unit_component=np.zeros(units, dtype=np.int64),
             observation_image=new_image[scene.observation_image],
             features=_features(scene, new_image, len(images)),
             pairs=[

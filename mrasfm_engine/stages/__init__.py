@@ -12,7 +12,7 @@ from mrasfm_engine.stages._mapping import mapping
 from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
 from mrasfm_engine.stages._own_car import own_cars
 from mrasfm_engine.stages._run import VERSIONS, Run, store_of
-from mrasfm_engine.stages._scene import components, pictures, scene
+from mrasfm_engine.stages._scene import components, numbered_components, pictures, scene
 from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
 from mrasfm_engine.stages._submaps import SubmapRun, count_of_submaps, cut_drive, is_cut, join_submaps, run_submaps
 
@@ -33,6 +33,7 @@ __all__ = [
     "load_models",
     "mapping",
     "matches",
+    "numbered_components",
     "own_cars",
     "pack_pairs",
     "pictures",

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.export.colmap import approximations
@@ -13,12 +16,14 @@ from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.components import LinkedBy
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.unit_components import connected_units
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.visualization.pictures import draw_pictures
 from schemas.artifacts import Stage
@@ -65,6 +70,24 @@ def components(
         one.pairs = [pair for pair in whole.pairs if inside[[pair.image_a, pair.image_b]].all()]
         result.append((one, {**header, "component": len(result) + 1, "findings": findings, "stages": [stage]}))
     return result
+
+
+def numbered_components(
+    run: Run, whole: Scene, others: Sequence[tuple[Scene, dict[str, Any]]]
+) -> tuple[Scene, list[tuple[Scene, dict[str, Any]]]]:
+    """The scenes with the number of every unit's component.
+
+    Those in frames of their own have the numbers of their folders; those that positions or rough poses alone put into
+    the largest one's frame have the next ones.
+    """
+    mapped = next(stage for stage in run.report["stages"] if stage["stage"] == Stage.MAPPING)["components"]
+    if any(link["by"] != LinkedBy.IMAGES for link in mapped[0]["links"]):
+        whole = replace(whole, unit_component=connected_units(whole, next_number=len(others) + 1))
+    numbered = [
+        (replace(other, unit_component=np.where(other.unit_registered, report["component"], 0)), report)
+        for other, report in others
+    ]
+    return whole, numbered
 
 
 def _without_keypoints(features: ImageFeatures) -> ImageFeatures:

@@ -56,6 +56,7 @@ class DriveResource(Times):
                 {
                     "id": EXAMPLE_DRIVE,
                     "name": "ring-road-2026-05-04",
+                    "vehicle": "van-7",
                     "state": "OPEN",
                     "cameras": 6,
                     "frames": 40,
@@ -75,6 +76,7 @@ class DriveResource(Times):
 
     id: str
     name: str = Field(description="as the manifest says")
+    vehicle: str | None = Field(None, description="as the manifest says; null where it names none")
     state: DriveState = Field(description="OPEN takes files; COMMITTED is frozen and can be reconstructed")
     cameras: int = Field(description="of the rig")
     frames: int = Field(description="instants: all cameras at once")

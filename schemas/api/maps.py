@@ -78,16 +78,16 @@ class MapSceneResource(Resource):
 
     model_config = ConfigDict(json_schema_extra={"examples": [_SCENE]})
 
-    name: str = Field(description="in map.json, seams and the report")
+    name: str = Field(description="in map.json, seams and the report; NAME#N is component N of the scene NAME")
     drive_id: str
     scene_id: str
     connected: bool = Field(description="false: placed by its GNSS alone, as it overlaps nothing")
 
 
 class FailedDrive(Resource):
-    """A drive that was asked for and is not in the map."""
+    """A drive that was asked for and is not in the map, or a component of one."""
 
-    name: str = Field(description="of the drive")
+    name: str = Field(description="of the drive in the map; NAME#N is its component N")
     drive_id: str
     job_id: str | None = Field(None, description="the reconstruction that failed")
     problem: Problem = Field(description="why it has no scene")
@@ -127,7 +127,7 @@ class MapVersionResource(Resource):
     summary: MapSummary
     scenes: list[MapSceneResource] = Field(description="by name")
     unconnected: list[str] = Field(description="names of scenes that overlap no other: placed by GNSS alone")
-    failed: list[FailedDrive] = Field(description="drives that were asked for and could not be reconstructed")
+    failed: list[FailedDrive] = Field(description="drives, or components, that are not in it and why")
     files: list[MapFileResource] = Field(description="empty in lists: ask for the version itself")
     created_at: datetime
 

@@ -50,6 +50,11 @@ class _Plan:
     removed: list[MapScene] = field(default_factory=list)
 
     @property
+    def remaining_drives(self) -> set[str]:
+        """Drives whose scenes stay, in one component or several."""
+        return {scene.drive_id for scene in self.remaining}
+
+    @property
     def missing(self) -> list[Drive]:
         """Drives whose scenes nobody makes yet; those that cannot have one are none of them."""
         known = self.found.keys() | self.under_way.keys()
@@ -105,7 +110,7 @@ def create(
             "asked": asked.model_dump(mode="json", exclude_none=True),
             "require_all": asked.require_all,
             "base_version": of_map.current_version,
-            "kept_scenes": len(plan.remaining),
+            "kept_scenes": len(plan.remaining_drives),
             "remove": [scene.name for scene in plan.removed],
         },
         waiting_for=1,  # until its members are known
@@ -153,21 +158,25 @@ def _checked(session: Session, project_id: str, asked: AggregationRequest, of_ma
     coming = len(plan.scenes) + len(plan.drives)
     if not coming and not plan.removed:
         raise NothingToDo("the request names neither drives nor scenes", remedy="Name what the map is made of.")
-    if coming + len(plan.remaining) < jobs.MIN_SCENES:
-        what = f"{coming + len(plan.remaining)} scene is left, a map needs {jobs.MIN_SCENES}"
+    left = coming + len(plan.remaining_drives)
+    if left < jobs.MIN_SCENES:
+        what = f"{left} scene is left, a map needs {jobs.MIN_SCENES}"
         raise TooFewScenes(what, remedy="Name more drives or scenes; a single scene needs no aggregation.")
     return plan
 
 
 def _take_out(plan: _Plan, remove: Collection[str], of_map: Map | None) -> None:
-    named = {given: scene for scene in plan.remaining for given in (scene.drive_id, scene.scene_id)}
+    named: dict[str, list[MapScene]] = {}
+    for scene in plan.remaining:  # a drive has several where it is in components
+        for given in (scene.drive_id, scene.scene_id):
+            named.setdefault(given, []).append(scene)
     unknown = sorted(set(remove) - named.keys())
     if unknown:
         where = "a new map" if of_map is None else f"the current version of map {of_map.id}"
         errors = [ProblemItem(field="remove", detail=f"{given} is not in it") for given in unknown]
         what = f"{unknown[0]!r} is not in {where}"
         raise NotInMap(what, remedy="See the version's scenes for what can be taken out.", errors=errors)
-    taken = [named[given] for given in remove]
+    taken = [scene for given in remove for scene in named[given]]
     twice = next((scene for i, scene in enumerate(taken) if scene in taken[:i]), None)
     if twice is not None:
         raise RemovedTwice(f"scene {twice.name!r} is to be taken out twice", remedy="Name it once.")

@@ -73,6 +73,7 @@ def create(
         id=new_id("drv"),
         project_id=project_id,
         name=manifest.name,
+        vehicle=manifest.vehicle,
         manifest_blob_id=blob.id,
         cameras=manifest.cameras,
         frames=manifest.frames,

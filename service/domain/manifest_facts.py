@@ -22,6 +22,7 @@ class ManifestFacts:
     """
 
     name: str
+    vehicle: str | None
     cameras: int
     frames: int
     has_gnss: bool
@@ -42,6 +43,7 @@ def facts_of(manifest: DriveManifest) -> ManifestFacts:
         raise _unusable("name", "holds control characters", "Give the drive a name that can be printed.")
     return ManifestFacts(
         name=manifest.name,
+        vehicle=manifest.vehicle,
         cameras=len(manifest.rig.cameras),
         frames=len(manifest.frames),
         has_gnss=manifest.gnss is not None,

@@ -9,6 +9,7 @@ from sqlalchemy import ColumnElement, delete, or_, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.maps import MapSummary
+from schemas.artifacts import drive_of_scene
 from service.database.tables import TERMINAL, Job, JobMember, Map, MapFile, MapScene, MapVersion, Scene
 from service.domain import jobs
 from service.domain.access import require
@@ -82,6 +83,7 @@ def publish(
     *,
     files: Mapping[str, StoredFile],
     summary: MapSummary,
+    names: Collection[str],
     unconnected: Collection[str],
     failed: Sequence[Mapping[str, Any]],
     expires_us: int | None,
@@ -91,6 +93,8 @@ def publish(
 
     Parameters
     ----------
+    names
+        The version's scenes: NAME for a member or a scene that stays, NAME#N for its component N.
     unconnected
         Names of the scenes that overlap no other.
     failed
@@ -123,14 +127,10 @@ def publish(
         )
     )
     session.flush()
-    missing = {drive["name"] for drive in failed}
-    there = [(scene.name, scene.drive_id, scene.scene_id) for scene in kept]
-    there += [
-        (member.name, member.drive_id, member.scene_id)
-        for member in members
-        if member.scene_id is not None and member.name not in missing
-    ]
-    for name, drive_id, scene_id in there:
+    made_of = {scene.name: (scene.drive_id, scene.scene_id) for scene in kept}
+    made_of |= {m.name: (m.drive_id, m.scene_id) for m in members if m.scene_id is not None}
+    for name in names:
+        drive_id, scene_id = made_of.get(name) or made_of[drive_of_scene(name)]
         connected = name not in unconnected
         session.add(
             MapScene(map_id=map_id, number=number, name=name, drive_id=drive_id, scene_id=scene_id, connected=connected)

@@ -21,7 +21,7 @@
 | 17 | the service while its processes are killed: nothing lost, twice, stuck, wrong or left |
 | 18 | a real drive whose manifest is wrong: a camera pitched by 1 deg, focal lengths 1 % long |
 | 19 | sigmas: halves of real drives against one another, simulated drives against the truth |
-| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, adding a scene, time, over HTTP |
+| 20 | aggregation: seams of real and rendered drives, repeated facades, loops, vehicles, adding a scene, over HTTP |
 | 21 | real drives with poorer receivers than theirs, and with cameras left out |
 | 22 | the cameras of a real car beside COLMAP's mappers on the same matches, and the cost of GNSS for their images |
 | 23 | simulated routes whose calibration is slightly off, with receivers from poor to very good |
@@ -29,7 +29,7 @@
 | 25 | the own car in images without masks, rendered and real; a bar with the time over a fifth of all images |
 | 26 | traffic without masks: tracks on vehicles that move, and those of the street |
 | 27 | the road's picture of the best views: markings against the painted ones |
-| 28 | a real drive with grey images: parts that images, positions or nothing links |
+| 28 | a real drive with grey images: parts that images, positions or nothing links, and a map that joins them |
 | 29 | a stop of a minute: what it costs, and where its units are |
 | 30 | drives cut into sub-maps, beside the same in one piece |
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
@@ -66,7 +66,7 @@ from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.fisheyes import fisheyes
 from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
-from tests.benchmarks.gaps import gaps
+from tests.benchmarks.gaps import components_in_map, gaps
 from tests.benchmarks.learned import learned
 from tests.benchmarks.motion import motion
 from tests.benchmarks.moving_objects import moving_objects
@@ -88,6 +88,7 @@ from tests.benchmarks.stops import stops
 from tests.benchmarks.submaps import submaps
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
+from tests.benchmarks.vehicles import vehicles
 from tests.benchmarks.wrong_manifests import wrong_manifests
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -124,7 +125,7 @@ LINES = {
     "17": Line(timed=(kills,)),
     "18": Line(untimed=(wrong_manifests,)),
     "19": Line(untimed=(halves, simulated)),
-    "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop)),
+    "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop, vehicles)),
     "21": Line(untimed=(receivers,)),
     "22": Line(timed=(surround_peers,)),
     "23": Line(untimed=(simulated_routes,)),
@@ -132,7 +133,7 @@ LINES = {
     "25": Line(untimed=(real_own_car,), by_seed=(rendered_own_car, bar_with_time)),
     "26": Line(by_seed=(moving_objects,)),
     "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
-    "28": Line(untimed=(gaps,)),
+    "28": Line(untimed=(gaps, components_in_map)),
     "29": Line(timed=(stops,)),
     "30": Line(untimed=(submaps,)),
     "31": Line(timed=(foreign_readers,)),

@@ -1,4 +1,7 @@
-"""Line 28: a real drive with grey images, so few that others reach over them, and so many that none does."""
+"""Line 28: a real drive with grey images, so few that others reach over them, and so many that none does.
+
+Line 28b: both components of one without GNSS, in the map of another drive that covers the gap.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure, exactly
 
 DRIVE, UNITS, GREY = "kitti06", 51, 128
+LONG_OF_HALF = range(7, 20)
 SHORT, LONG = range(22, 27), range(12, 41)  # 6 m, and 36 m: over half of what is seen 50 m ahead is behind by then
 WITHOUT, WITH = "without GNSS", "with GNSS"
 JOINED_M = {WITHOUT: 0.20, WITH: 0.06}
@@ -34,6 +38,29 @@ def gaps(data: Path, work: Path) -> Iterator[Figure]:
             mrasfm("reconstruct", drive, "--out", scene, *options)
             yield from _figures(what, scene, drive, len(grey), title)
         shutil.rmtree(drive)
+
+
+def components_in_map(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 28b: frames of two halves of a real drive, which share no image; one has grey images and no GNSS."""
+    for name, frames, gnss in (("even", "0:51:2", "a"), ("odd", "1:51:2", "b")):
+        options = ("--frames", frames, "--gnss", f"gnss_drive_{gnss}.csv")
+        mrasfm("import", data / DRIVE, *options, "--out", work / f"frames {name}")
+    drives = {"grey": _with_grey(work / "frames even", LONG_OF_HALF, work / "frames grey"), "odd": work / "frames odd"}
+    mrasfm("reconstruct", drives["grey"], "--no-gnss", "--out", work / "scene grey")
+    mrasfm("reconstruct", drives["odd"], "--out", work / "scene odd")
+    out = work / "map of components"
+    mrasfm("aggregate", *(f"{name}={work / f'scene {name}'}" for name in drives), "--out", out)
+    truths = [f"{name}={drive / 'truth.tum'}" for name, drive in drives.items()]
+    errors = json.loads(mrasfm("evaluate", out, "--json", "--truth", *truths))
+    what = f"{DRIVE} in components and a drive over the gap"
+    names = {scene["name"] for scene in json.loads((out / "map.json").read_text())["scenes"]}
+    yield exactly("28b", f"{what}: scenes of the map", len(names & {"grey", "grey#1", "odd"}), 3)
+    yield exactly("28b", f"{what}: scenes not connected", len(errors["unconnected"]), 0)
+    for seam in errors["seams"]:
+        title = f"{what}: seam {seam['a']} - {seam['b']}"
+        yield Figure(line="28b", what=title, value=seam["translation_m"], unit="m", most=0.05)
+        yield Figure(line="28b", what=title, value=seam["rotation_deg"], unit="deg", most=0.2)
+    yield Figure(line="28b", what=f"{what}: metric RMSE", value=errors["metric"]["rmse_m"], unit="m", most=0.2)
 
 
 def _figures(what: str, scene: Path, drive: Path, grey: int, title: str) -> Iterator[Figure]:

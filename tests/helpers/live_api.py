@@ -48,7 +48,7 @@ SUMMARY = SceneSummary(
     warnings=0,
     engine_version=version("mrasfm"),
 )
-MAP_SUMMARY = MapSummary(**SUMMARY.model_dump(), scenes=2, connected=2, seams=1)
+MAP_SUMMARY = MapSummary(**SUMMARY.model_dump(exclude={"components"}), scenes=2, connected=2, seams=1)
 
 
 def settings_of(data_dir: Path, **changed: Any) -> Settings:
@@ -186,17 +186,26 @@ class Client(httpx.Client):
         assert answer.status_code == 202, answer.text
         return dict(answer.json())
 
-    def publish_map(self, held: jobs.Claim, files: dict[str, bytes], *, unconnected: tuple[str, ...] = ()) -> int:
+    def publish_map(
+        self,
+        held: jobs.Claim,
+        files: dict[str, bytes],
+        *,
+        unconnected: tuple[str, ...] = (),
+        components: tuple[str, ...] = (),
+    ) -> int:
         """Publish a map's version as a worker would; its number."""
         stored = self._store(files)
         with self.api.database.write() as session:
+            inputs = inputs_of(session, held.job_id)
             return maps.publish(
                 session,
                 held,
                 files=stored,
                 summary=MAP_SUMMARY,
+                names=[*inputs.scene_ids, *components],
                 unconnected=unconnected,
-                failed=inputs_of(session, held.job_id).failed,
+                failed=inputs.failed,
                 expires_us=None,
             )
 

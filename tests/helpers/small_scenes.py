@@ -82,17 +82,27 @@ def drive_along(
     common_world: str | None = None,
     missing_units: Sequence[int] = (),
     cameras_off_deg: float | None = None,
+    own_frame: np.ndarray | None = None,
+    component: int = 0,
+    vehicle: str | None = None,
+    rig_seed: int | None = None,
+    knocked_deg: dict[int, float] | None = None,
     seed: int = 0,
 ) -> Driven:
     """Drive, write the scene, and read it as an aggregation does.
 
     `bias_m` is the receiver's constant error, `bend_m` by how much the scene's ends are bent aside, `scale` its lengths
     in true ones, `offset_ms` when each camera takes its image after its unit's time. With `cameras_off_deg` the scene
-    refined its calibration, and is so uncertain about rotations, and so far off.
+    refined its calibration, and is so uncertain about rotations, and so far off. Without a receiver the scene lies in
+    `own_frame`, street_from_scene (4, 4). Drives of one `rig_seed` have the same cameras, but for those that were
+    knocked by an angle.
     """
     rng = np.random.default_rng(1000 + seed)
-    rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=rng)
+    of_rig = rng if rig_seed is None else np.random.default_rng(1000 + rig_seed)
+    rig = true_cameras(cameras, width=SIZE_PX[0], height=SIZE_PX[1], rng=of_rig)
     rig_from_cam = np.stack([camera.rig_from_cam for camera in rig])
+    for camera, by_deg in (knocked_deg or {}).items():
+        rig_from_cam[camera, :3, :3] = se3.exp_so3(np.radians([0.0, by_deg, 0.0])) @ rig_from_cam[camera, :3, :3]
     params = np.array([camera.params for camera in rig])
     aside = (TURNED if back else np.eye(4)) @ se3.transform(np.eye(3), [0.0, lateral_m, 0.0])
     street_from_rig = poses_along(travelled_m) @ aside
@@ -108,6 +118,8 @@ def drive_along(
     believed = se3.inverse(street.ecef_from_street) @ ecef_from_scene
     if common_world is not None:
         believed = se3.transform(np.eye(3), np.round(middle))
+    if own_frame is not None:
+        believed = own_frame
     street_from_scene = se3.transform(np.eye(3), -np.asarray(bias_m)) @ believed
     scene_from_street = se3.inverse(street_from_scene)
 
@@ -144,13 +156,15 @@ def drive_along(
         time_offset_us=None if offset_ms is None else [1000 * ms for ms in offset_ms],
     )
     positions: dict[str, object] = {}
-    if common_world is None:
+    if own_frame is not None:
+        pass
+    elif common_world is None:
         antenna = se3.apply(street_from_rig, np.tile(ANTENNA_M, (units, 1, 1)))[:, 0] + bias_m
         antenna += rng.normal(0.0, gnss_noise_m, antenna.shape)
         positions["gnss"] = _gnss(geodesy.geodetic_from_local(antenna, street.ecef_from_street), gnss_noise_m)
     else:
         positions["rough_poses"] = _rough(street_from_rig, np.asarray(bias_m), common_world)
-    manifest = drive.manifest.model_copy(update={"name": folder.name, **positions})
+    manifest = drive.manifest.model_copy(update={"name": folder.name, "version": 2, "vehicle": vehicle, **positions})
     features, keypoint = _features(street, kept[row], image, xy_px, units * cameras, rng)
     order = np.argsort(row, kind="stable")
     scene = Scene(
@@ -185,18 +199,18 @@ def drive_along(
         observation_keypoint=keypoint[order],
         features=features,
         pairs=[],
-        georeference=None if common_world is not None else _georeference(biased, ecef_from_scene),
+        georeference=None if positions.keys() != {"gnss"} else _georeference(biased, ecef_from_scene),
         rough_world_from_local=None if common_world is None else believed,
         unit_from_image=unit_from_image if offset_ms is not None else None,
     )
-    write_scene(scene, folder, REPORT)
+    write_scene(scene, folder, {**REPORT, "component": component} if component else REPORT)
     return Driven(
         source=read_scene(folder, folder.name),
         street_from_scene=street_from_scene,
         street_from_rig=street_from_rig,
         point_of_street=kept,
         folder=folder,
-        seed=seed,
+        seed=seed if rig_seed is None else rig_seed,
     )
 
 

@@ -6,6 +6,7 @@ import json
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from service.api.manifests import manifest_check
 from service.database.tables import Blob, Drive
 from service.domain import jobs
 from tests.helpers.live_api import Api, Client, problem_of, wait_until
-from tests.helpers.tiny_drive import manifest, tiny_drive
+from tests.helpers.tiny_drive import TinyDrive, manifest, tiny_drive
 from tests.service.conftest import StartApi
 
 MISSING_ID = "drv_" + "0" * 30
@@ -42,6 +43,31 @@ def test_lists_go_page_by_page_newest_first(client: Client) -> None:
         cursor = page["next"]
     assert seen == created[::-1]
     assert cursor is None
+
+
+def test_drives_of_one_vehicle(client: Client) -> None:
+    """Those of others, of none, and of another project are not listed."""
+
+    def of(vehicle: str | None, name: str) -> TinyDrive:
+        drive = tiny_drive(name)
+        named = {} if vehicle is None else {"version": 2, "vehicle": vehicle}
+        return replace(drive, manifest={**drive.manifest, **named})
+
+    ids = {
+        name: client.create(of(vehicle, name))
+        for name, vehicle in (("a", "van-7"), ("b", None), ("c", "van-7"), ("d", "van-77"), ("e", "van-7"))
+    }
+    client.api.client().create(of("van-7", "foreign"))
+    assert client.get(f"/v1/drives/{ids['a']}").json()["vehicle"] == "van-7"
+    assert client.get(f"/v1/drives/{ids['b']}").json()["vehicle"] is None
+    first = client.get("/v1/drives", params={"vehicle": "van-7", "limit": 2}).json()
+    assert [drive["id"] for drive in first["items"]] == [ids["e"], ids["c"]]
+    rest = client.get("/v1/drives", params={"vehicle": "van-7", "limit": 2, "cursor": first["next"]}).json()
+    assert [drive["id"] for drive in rest["items"]] == [ids["a"]]
+    assert client.get("/v1/drives", params={"vehicle": "van-8"}).json()["items"] == []
+    assert client.get("/v1/drives").json()["items"][-1]["id"] == ids["a"]
+    problem = problem_of(client.get("/v1/drives", params={"vehicle": "van 7"}), 422, "invalid-request")
+    assert "vehicle" in json.dumps(problem)
 
 
 @pytest.mark.parametrize("cursor", ["", "x", "bnVsbA", "WzEsIlx1ZDgwMCJd", "WzEsIlx1MDAwMCJd", "WzEuNSwiYSJd", "ÿ"])

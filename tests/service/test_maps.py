@@ -72,6 +72,30 @@ def test_adding_removing_and_going_back(client: Client, drives: list[str], map_i
     problem_of(client.put(f"/v1/maps/{map_id}/current-version", json={"version": 0}), 422, "invalid-document")
 
 
+def test_components_of_a_drive_are_scenes_of_the_version(client: Client, drives: list[str]) -> None:
+    """They come and go with their drive, and their files are downloaded by the URL that the version gives."""
+    job = client.aggregate(drives=drives[:2], name="tunnel")
+    for member in job["members"]:
+        finish(client, member["job_id"])
+    files = {**FILES, "calibration/drive-0#1.json": CONTENT}
+    client.publish_map(client.claim(job["id"]), files, unconnected=("drive-0#1",), components=("drive-0#1",))
+    map_id = job_of(client, job["id"])["map_id"]
+    version = client.get(f"/v1/maps/{map_id}/versions/current").json()
+    assert [(scene["name"], scene["connected"]) for scene in version["scenes"]] == [
+        ("drive-0", True),
+        ("drive-0#1", False),
+        ("drive-1", True),
+    ]
+    assert len({scene["scene_id"] for scene in version["scenes"]}) == 2
+    (file,) = (file for file in version["files"] if "#" in file["path"])
+    assert file["url"].endswith("/files/calibration/drive-0%231.json")
+    assert client.get(file["url"]).content == CONTENT
+    assert new_version(client, map_id=map_id, drives=[drives[2]], remove=[drives[0]])["map_version"] == 2
+    assert names(client, map_id) == ["drive-1", "drive-2"]
+    left = client.post("/v1/aggregations", json={"map_id": map_id, "remove": [drives[1]]})
+    problem_of(left, 422, "too-few-scenes")
+
+
 def test_what_cannot_be_added_or_removed(client: Client, drives: list[str], map_id: str) -> None:
     def refused(status: int, code: str, **asked: Any) -> dict[str, Any]:
         return problem_of(client.post("/v1/aggregations", json={"map_id": map_id, **asked}), status, code)

@@ -15,7 +15,7 @@ from alembic.runtime.migration import MigrationContext
 from sqlalchemy import inspect, text
 
 from service.database.connections import MIGRATIONS, Database, is_current, migrate
-from service.database.tables import Base, Job, JobAttempt, JobEvent, Scene
+from service.database.tables import Base, Drive, Job, JobAttempt, JobEvent, Scene
 from service.settings import Settings
 from tests.helpers.live_api import REPOSITORY, free_port
 
@@ -71,12 +71,17 @@ def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
         assert session.query(JobAttempt).count() == 1
         assert session.query(JobEvent).count() == 1
         assert session.query(Scene).count() == 0
+        assert session.get_one(Drive, "drv_1").vehicle is None
     database.close()
 
 
 _FIRST_RECORDS = (
     "INSERT INTO projects (id, name, used_bytes, max_bytes, max_active_jobs, max_drives, created_us) "
     "VALUES ('prj_1', 'p', 0, 1, 1, 1, 1)",
+    "INSERT INTO blobs (id, project_id, key, sha256, size_bytes, touched_us) VALUES ('blb_1', 'prj_1', 'k', 's', 1, 1)",
+    "INSERT INTO drives (id, project_id, name, state, manifest_blob_id, cameras, frames, files_expected, has_gnss, "
+    "preflight_state, findings, created_us) VALUES "
+    "('drv_1', 'prj_1', 'd', 'OPEN', 'blb_1', 1, 2, 2, false, 'NONE', '[]', 1)",
     "INSERT INTO jobs (id, project_id, kind, drive_id, settings, state, revision, attempt, fence, not_before_us, "
     "percent, reused, created_us) VALUES "
     "('job_1', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'SUCCEEDED', 1, 1, 1, 0, 100, '[]', 1)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from pathlib import Path
@@ -14,9 +15,12 @@ from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.api.aggregations import AggregationRequest
 from service.database.tables import Blob, Job, MapFile, MapScene, MapVersion
-from service.domain import aggregations, jobs
+from service.domain import aggregations, jobs, scenes
 from service.job_queue import JobQueue
+from tests.helpers.live_api import SUMMARY
 from tests.helpers.service_world import TERMINAL, World, is_gone, kill, wait_until
+from tests.helpers.small_scenes import drive_along, make_street
+from tests.unit.aggregation.test_components_in_map import WAY, in_components
 from worker.job_execution import Runner
 
 
@@ -108,12 +112,67 @@ def test_two_drives_become_a_map(unpowered: World, two_drives: list[Path]) -> No
     assert list(world.settings.scratch_dir.iterdir()) == []
 
 
+def publish_scene(world: World, folder: Path, drive: Path) -> tuple[str, str]:
+    """A scene that was made elsewhere, as the result of a drive; ids of both."""
+    drive_id = world.add_drive(drive)
+    job_id = world.ask(drive_id, wake=False)
+    files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    stored = {name: world._store(path) for name, path in files.items()}
+    with world.database.write() as session:
+        held = jobs.claim(session, job_id, owner="worker@test", lease_us=60_000_000)
+        assert held is not None
+        return drive_id, scenes.publish(session, held, files=stored, summary=SUMMARY, expires_us=None)
+
+
+@pytest.mark.slow
+def test_components_are_scenes_of_the_map(unpowered: World, two_drives: list[Path], tmp_path: Path) -> None:
+    """Both components of a drive without positions, by a drive that has some; one elsewhere is left out."""
+    world, folder = unpowered, tmp_path / "made"
+    street, elsewhere = (make_street(length_m=36.0, points=1500, seed=seed) for seed in (0, 2))
+    in_components(street, street, folder / "tunnel")
+    in_components(street, elsewhere, folder / "shaft")
+    drive_along(street, folder / "lit", WAY + 1.0, lateral_m=0.8, seed=2)
+    ids = [publish_scene(world, folder / name, two_drives[0])[1] for name in ("tunnel", "lit")]
+    job, due = ask(world, scenes=ids)
+    run(world, *due)
+    ended = world.job(job.id)
+    assert ended.state == "SUCCEEDED", ended.problem
+    with world.database.read() as session:
+        rows = session.scalars(select(MapScene).order_by(MapScene.name)).all()
+        names = [scene.name for scene in rows]
+        assert [scene.scene_id for scene in rows] == [ids[0], ids[0], ids[1]]
+    tunnel, lit = names[0], names[2]
+    assert names[1] == f"{tunnel}#1"
+    assert {f"calibration/{name}.json" for name in names} <= paths(world, 1)
+    assert {f"seams/{a}~{b}.npz" for a, b in itertools.combinations(names, 2)} <= paths(world, 1)
+
+    # Their seams are found again, those of a component too.
+    again, due = ask(world, scenes=ids, name="again")
+    run(world, *due)
+    assert "seams" in world.job(again.id).reused
+
+    # A drive goes with all of its components; one that nothing places is named with its drive.
+    drive_id, scene_id = publish_scene(world, folder / "shaft", two_drives[1])
+    job, due = ask(world, map_id=ended.map_id, remove=[ids[0]], scenes=[scene_id])
+    run(world, *due)
+    ended = world.job(job.id)
+    assert ended.state == "SUCCEEDED", ended.problem
+    (version,) = (found for found in versions(world) if found.number == 2)
+    placed = [scene["name"] for scene in document(world, 2, "map.json")["scenes"]]
+    assert len(placed) == 2
+    assert lit in placed
+    (failed,) = version.failed
+    assert (failed["name"], failed["drive_id"]) == (f"{next(n for n in placed if n != lit)}#1", drive_id)
+    assert "no seam places it" in failed["problem"]["detail"]
+
+
 @pytest.mark.slow
 def test_a_scene_that_fits_into_no_map_is_left_out(unpowered: World, two_drives: list[Path]) -> None:
-    """As its drive was driven without a receiver. Where all are required, it takes the others with it."""
+    """As its drive was driven without a receiver, elsewhere. Where all are required, it takes the others with it."""
     world = unpowered
     folder = Path(world.settings.data_dir) / "indoors"
-    shutil.copytree(two_drives[1], folder)
+    options = SynthOptions(cameras=4, units=8, seed=7, drives=1, width=480, height=270, texture_px=256)
+    shutil.copytree(render_drives(options, Path(world.settings.data_dir) / "rendered")[0], folder)
     manifest = json.loads((folder / "drive.json").read_text())
     del manifest["gnss"]
     manifest["name"] = "indoors"

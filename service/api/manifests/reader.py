@@ -55,7 +55,9 @@ def main() -> None:
     except ServiceError as error:
         write({"problem": error.problem.model_dump(mode="json")})
         return
-    shown = {name: getattr(facts, name) for name in ("name", "cameras", "frames", "has_gnss", "files_expected")}
+    shown = {
+        name: getattr(facts, name) for name in ("name", "vehicle", "cameras", "frames", "has_gnss", "files_expected")
+    }
     write({"facts": shown})
     # Their names are printable: none holds an end of line.
     lines = (f"{_LETTERS[role]}{path}\n".encode() for path, role in facts.files)

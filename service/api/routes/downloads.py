@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import AsyncIterator, Callable
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
@@ -116,7 +117,7 @@ def files_of(
             size_bytes=blob.size_bytes,
             sha256=blob.sha256,
             media_type=file.media_type,
-            url=f"{url}/files/{file.path}",
+            url=f"{url}/files/{quote(file.path)}",
         )
         for file, blob in session.execute(statement)
     ]

@@ -6,13 +6,13 @@ from functools import partial
 from typing import Annotated
 
 import anyio.to_thread
-from fastapi import APIRouter, BackgroundTasks, Depends, Response
+from fastapi import APIRouter, BackgroundTasks, Depends, Query, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from schemas.api.drives import DriveResource, DriveState, PreflightResource
 from schemas.api.resource import Finding, Page
-from schemas.drive import DriveManifest
+from schemas.drive import VEHICLE_PATTERN, DriveManifest
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us, moment
 from service.api.http.body_reading import parsed_body
@@ -85,11 +85,15 @@ def _store_manifest(context: Context, store: BlobWriter, raw: bytes) -> StoredFi
 
 @router.get("", summary="List drives", responses={**gives(200, "A page of drives"), **problems(401, 422)})
 def list_drives(
-    caller: CallerDep, context: ContextDep, limit: Limit = 50, cursor: Cursor = None
+    caller: CallerDep,
+    context: ContextDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+    vehicle: Annotated[str | None, Query(pattern=VEHICLE_PATTERN, description="only of this vehicle")] = None,
 ) -> Page[DriveResource]:
     """Drives of the project, newest first."""
     with context.database.read() as session:
-        found, following = newest(session, Drive, caller.project_id, cursor=cursor, limit=limit)
+        found, following = newest(session, Drive, caller.project_id, cursor=cursor, limit=limit, vehicle=vehicle)
         stored = drives.stored_of(session, [drive.id for drive in found])
     return Page(items=[shown(drive, stored[drive.id]) for drive in found], next=following)
 
@@ -206,6 +210,7 @@ def shown(drive: Drive, stored: Stored) -> DriveResource:
         {
             "id": drive.id,
             "name": drive.name,
+            "vehicle": drive.vehicle,
             "state": drive.state,
             "cameras": drive.cameras,
             "frames": drive.frames,

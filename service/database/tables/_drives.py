@@ -15,11 +15,15 @@ class Drive(Base):
     """A recorded drive."""
 
     __tablename__ = "drives"
-    __table_args__ = (Index(None, "project_id", "created_us", "id"),)
+    __table_args__ = (
+        Index(None, "project_id", "created_us", "id"),
+        Index(None, "project_id", "vehicle", "created_us", "id"),
+    )
 
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=lambda: new_id("drv"))
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     name: Mapped[str] = mapped_column(Name)
+    vehicle: Mapped[str | None] = mapped_column(String(64))  # as the manifest says
     state: Mapped[str] = mapped_column(String(16), default=DriveState.OPEN)
     manifest_blob_id: Mapped[str] = mapped_column(ForeignKey("blobs.id"), index=True)
     cameras: Mapped[int]

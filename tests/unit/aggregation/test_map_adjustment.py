@@ -16,6 +16,7 @@ from mrasfm_engine.aggregation.association import coarse_transform
 from mrasfm_engine.aggregation.calibrations import calibration_priors
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, MapModel, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
+from mrasfm_engine.aggregation.vehicles import vehicles_of
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.synthetic.rigs import true_cameras
 from tests.helpers.small_scenes import (
@@ -65,10 +66,18 @@ def owner_of(drives: Sequence[Driven]) -> np.ndarray:
 
 
 def adjusted(
-    drives: Sequence[Driven], which: str, *, positions: bool = True, owner: np.ndarray | None = None
+    drives: Sequence[Driven],
+    which: str,
+    *,
+    positions: bool = True,
+    owner: np.ndarray | None = None,
+    shared: bool = True,
+    refine_focal: bool = False,
 ) -> AdjustedMap:
     """From where scenes truly lie; each as bent as it is."""
     config = configured(final_adjustment=which)
+    bundle_adjustment = config.bundle_adjustment.model_copy(update={"refine_focal": refine_focal})
+    config = config.model_copy(update={"bundle_adjustment": bundle_adjustment})
     assembly = Assembly(scenes=[d.source for d in drives])
     known = {}
     for k, driven in enumerate(drives):
@@ -78,9 +87,9 @@ def adjusted(
             assert found is not None
             known[k] = found
     poses = np.stack([d.street_from_scene for d in drives])
-    return adjust_map(
-        assembly, poses, owner_of(drives) if owner is None else owner, known, config, cancel=lambda: False
-    )
+    vehicles = vehicles_of(assembly.scenes, config.bundle_adjustment) if shared else []
+    owner = owner_of(drives) if owner is None else owner
+    return adjust_map(assembly, poses, owner, known, config, vehicles=vehicles, cancel=lambda: False)
 
 
 def errors_m(result: AdjustedMap, drives: Sequence[Driven]) -> list[np.ndarray]:
@@ -252,6 +261,88 @@ def test_calibrations_move_as_far_as_scenes_left_them_uncertain(street: Street, 
     np.testing.assert_array_equal(held.model.state.rig_from_cam, before.model.state.rig_from_cam)
     assert 0 < mean_error_m(after, drives) < 0.7 * mean_error_m(held, drives)
     assert np.median(after.model.errors_px) < np.median(held.model.errors_px)
+
+
+def of_vehicles(street: Street, folder: Path, *names: str | None, title: str) -> list[Driven]:
+    """A drive whose scene found its calibration well, and one whose scene held what was given, 0.3 deg off."""
+    well = drive_along(street, folder / f"{title} well", WAYS[0], cameras_off_deg=0.02, bias_m=BIAS_M[0],
+                       vehicle=names[0], rig_seed=50, seed=50)  # fmt: skip
+    held = drive_along(street, folder / f"{title} held", WAYS[1], cameras_off_deg=0.3, bias_m=BIAS_M[1],
+                       vehicle=names[1], rig_seed=50, seed=51)  # fmt: skip
+    calibration = held.source.calibration | {"adjusted": False}
+    return [well, replace(held, source=replace(held.source, calibration=calibration))]
+
+
+@pytest.mark.parametrize("which", ["overlap", "all"])
+def test_a_drive_takes_what_another_of_its_vehicle_observed(street: Street, folder: Path, which: str) -> None:
+    drives = of_vehicles(street, folder, "van-7", "van-7", title=f"one {which}")
+    alone, shared = adjusted(drives, which, shared=False), adjusted(drives, which)
+    own, other = np.split(camera_errors_deg(alone, drives), 2)
+    assert np.median(other) > 0.2
+    own_shared, learned = np.split(camera_errors_deg(shared, drives), 2)
+    assert 0 < np.median(learned) < 0.2 * np.median(other)
+    assert 0 < np.median(own_shared) < 1.5 * np.median(own)
+    assert 0 < mean_error_m(shared, drives) < 0.8 * mean_error_m(alone, drives)
+    assert np.median(shared.model.errors_px) < np.median(alone.model.errors_px)
+    assert (alone.learning, shared.learning) == ((), (1,))
+    assert adjusted(drives, "none").learning == ()
+    assert shared.free_cameras == 8
+    assert shared.free_units >= alone.free_units
+
+
+def test_a_drive_that_shares_no_place_learns_as_well(street: Street, folder: Path) -> None:
+    """All of its units vary with its cameras, by its own observations."""
+    north = make_street(length_m=20.0, points=700, place=(PLACE[0] + 0.01, *PLACE[1:]), seed=6)
+    well = of_vehicles(street, folder, "van-7", "van-7", title="here")[0]
+    held = of_vehicles(north, folder, "van-7", "van-7", title="there")[1]
+    owner = np.full(len(well.source.points_m) + len(held.source.points_m), -1)
+    alone, shared = (adjusted([well, held], "overlap", owner=owner, shared=shared) for shared in (False, True))
+    assert alone.free_units == 0
+    assert shared.free_units == len(WAYS[1])
+    before, after = (camera_errors_deg(result, [well, held])[4:] for result in (alone, shared))
+    assert 0 < np.median(after) < 0.2 * np.median(before)
+    assert np.median(shared.model.errors_px) < 0.7 * np.median(alone.model.errors_px)
+    # The other one stays as it was.
+    units, cameras = len(WAYS[0]), 4
+    np.testing.assert_array_equal(shared.model.state.world_from_rig[:units], alone.model.state.world_from_rig[:units])
+    np.testing.assert_array_equal(shared.model.state.rig_from_cam[:cameras], alone.model.state.rig_from_cam[:cameras])
+
+
+def with_focal(driven: Driven, longer: float, *, observed: bool) -> Driven:
+    """A drive whose scene has focal lengths so much too long, which it observed or held."""
+    source, cameras, entries = driven.source, [], {}
+    for camera in source.drive.cameras:
+        entry, (fx, fy, *rest) = source.calibration["cameras"][camera.name], camera.params
+        cameras.append(camera.model_copy(update={"params": [fx * (1 + longer), fy * (1 + longer), *rest]}))
+        sigma, seen = {"focal_px": 0.0002 * fx}, {"focal": observed}
+        entries[camera.name] = {**entry, "sigma": entry["sigma"] | sigma, "observed": entry["observed"] | seen}
+    rig = source.manifest.rig.model_copy(update={"cameras": cameras})
+    manifest = source.manifest.model_copy(update={"rig": rig})
+    calibration = {**source.calibration, "cameras": entries}
+    return replace(driven, source=replace(source, manifest=manifest, calibration=calibration))
+
+
+def test_focal_lengths_that_another_drive_observed(street: Street, folder: Path) -> None:
+    well, held = of_vehicles(street, folder, "van-7", "van-7", title="focal")
+    drives = [with_focal(well, 0.0, observed=True), with_focal(held, 0.006, observed=False)]
+    true_px = np.array([camera.params[0] for driven in (well, held) for camera in driven.source.drive.cameras])
+    asked, not_asked = (adjusted(drives, "overlap", refine_focal=refine_focal) for refine_focal in (True, False))
+    off = np.abs(asked.model.state.camera_params[:, 0] / true_px - 1.0)
+    assert (off[:4] < 1e-12).all()  # nobody told the first one anything
+    assert 0 < off[4:].max() < 0.002
+    np.testing.assert_allclose(not_asked.model.state.camera_params[4:, 0], 1.006 * true_px[4:])
+    assert np.median(asked.model.errors_px) < np.median(not_asked.model.errors_px)
+
+
+@pytest.mark.parametrize("names", [("van-7", "van-8"), ("van-7", None), (None, None)])
+def test_drives_of_unlike_vehicles_are_untouched(
+    street: Street, folder: Path, names: tuple[str | None, str | None]
+) -> None:
+    drives = of_vehicles(street, folder, *names, title=f"unlike {names}")
+    alone, shared = (adjusted(drives, "overlap", shared=shared).model.state for shared in (False, True))
+    np.testing.assert_array_equal(shared.rig_from_cam, alone.rig_from_cam)
+    np.testing.assert_array_equal(shared.world_from_rig, alone.world_from_rig)
+    np.testing.assert_array_equal(shared.points_m, alone.points_m)
 
 
 def test_points_that_only_fixed_units_see_follow_their_calibration(folder: Path) -> None:

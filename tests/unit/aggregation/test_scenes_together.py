@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +54,13 @@ def test_rough_poses_of_a_world_of_their_own_place_nothing(street: Street, tmp_p
     manifest = json.loads(path.read_text())
     del manifest["rough_poses"]["common_world"]
     path.write_text(json.dumps(manifest))
-    with pytest.raises(InputError, match="is not georeferenced") as raised:
-        read_scene(scene.folder, "one")
+    assert not read_scene(scene.folder, "one").is_placed
+    two = driven(street, tmp_path, "two")
+    assert together(tmp_path, scene, two)[0] == ["one", "two"]
+    shutil.copytree(scene.folder, tmp_path / "three")
+    other = replace(scene, source=replace(scene.source, name="three"), folder=tmp_path / "three")
+    with pytest.raises(InputError, match="scene one is not georeferenced") as raised:
+        together(tmp_path, scene, other)
     assert raised.value.code == "not-georeferenced"
 
 

@@ -25,10 +25,10 @@ def test_the_road_is_written_with_the_scene(tmp_path: Path, monkeypatch: pytest.
     assert document["patches"][1]["centre_m"] == [8.0, 0.0, -1.5]
     head, _, body = (out / "points.ply").read_bytes().partition(b"end_header\n")
     assert b"comment class: 0 unknown, 1 static, 2 road, 3 dynamic, 4 sky, 5 own_car" in head
-    assert head.rstrip().endswith(b"property uchar class\nproperty int road_patch")
+    assert head.rstrip().endswith(b"property uchar class\nproperty int road_patch\nproperty int component")
     rows = np.frombuffer(body, np.uint8).reshape(len(scene.points_m), -1)
-    assert rows[:, -5].tolist() == scene.point_classes.tolist()
-    assert rows[:, -4:].copy().view("<i4")[:, 0].tolist() == scene.point_patches.tolist()
+    assert rows[:, -9].tolist() == scene.point_classes.tolist()
+    assert rows[:, -8:-4].copy().view("<i4")[:, 0].tolist() == scene.point_patches.tolist()
     # Written again without a road: nothing of the old one stays.
     write_scene(make_scene(), out, {})
     assert {p.name for p in out.iterdir()} == FILES

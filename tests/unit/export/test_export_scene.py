@@ -226,7 +226,7 @@ def test_ply(scene: Scene, written: Path) -> None:
     head, _, body = (written / "points.ply").read_bytes().partition(b"end_header\n")
     assert b"property float x" in head
     assert f"element vertex {POINTS}\n".encode() in head
-    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4 + 1 + 4)
+    assert len(body) == POINTS * (3 * 4 + 3 + 4 + 4 + 1 + 4 + 4)
     np.testing.assert_allclose(np.frombuffer(body[:12], "<f4"), scene.points_m[0], rtol=1e-6)
     assert tuple(body[12:15]) == tuple(scene.point_colors[0])
     assert np.frombuffer(body[15:19], "<i4") == 7
@@ -526,10 +526,15 @@ def test_a_calibration_that_was_adjusted_in_a_map(scene: Scene) -> None:
     names = list(document["cameras"])
     poses = {name: refined.rig_from_cam.copy() for name, refined in zip(names, scene.calibration, strict=True)}
     found = {name: matrix_from_pose(Pose(**document["cameras"][name]["refined"]["rig_from_cam"])) for name in names}
-    assert document_in_map(document, found) == document
+    params = {name: np.array(document["cameras"][name]["refined"]["params"]) for name in names}
+
+    def in_map(poses: dict[str, np.ndarray], params: dict[str, np.ndarray]) -> dict[str, Any]:
+        return document_in_map(document, {name: (poses[name], params[name]) for name in names})
+
+    assert in_map(found, params) == document
     turn = se3.exp_so3(np.radians([0.0, 0.3, 0.0]))
     poses[names[0]] = se3.transform(turn @ found[names[0]][:3, :3], found[names[0]][:3, 3] + [0.01, 0.0, 0.0])
-    adjusted = document_in_map(document, found | {names[0]: poses[names[0]]})
+    adjusted = in_map(found | {names[0]: poses[names[0]]}, params)
     assert {name for name in names if adjusted["cameras"][name] != document["cameras"][name]} == {names[0]}
     camera, before = adjusted["cameras"][names[0]], document["cameras"][names[0]]
     assert camera["since_scene"]["rotation_vector_deg"] == pytest.approx([0.0, 0.3, 0.0], abs=1e-9)
@@ -543,3 +548,45 @@ def test_a_calibration_that_was_adjusted_in_a_map(scene: Scene) -> None:
     kept = ("sigma", "observed", "given", "verdict")
     assert {key: camera[key] for key in kept} == {key: before[key] for key in kept}
     assert change["focal_px"] == before["difference"]["focal_px"]
+    assert camera["since_scene"]["focal_px"] == 0.0
+    longer = np.array([3.0, 3.0, *np.zeros(len(params[names[1]]) - 2)])
+    focal = in_map(found, params | {names[1]: params[names[1]] + longer})["cameras"][names[1]]
+    assert focal["since_scene"]["focal_px"] == pytest.approx(3.0)
+    assert focal["difference"]["focal_px"] == pytest.approx(document["cameras"][names[1]]["difference"]["focal_px"] + 3)
+    assert focal["refined"]["params"] == pytest.approx((params[names[1]] + longer).tolist())
+    assert focal["since_scene"]["rotation_deg"] == 0.0
+
+
+def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
+    """Two units whose points no other one observes are a component of their own, in the same frame."""
+    apart = np.array([0, 0, 0, 2, 2])
+    unit = scene.image_unit[scene.observation_image]
+    first_point_of_others = int(scene.observation_point[-1]) // 2
+    kept = (scene.observation_point < first_point_of_others) == (apart[unit] == 0)
+    split = replace(
+        scene,
+        unit_component=apart,
+        observation_point=scene.observation_point[kept],
+        observation_image=scene.observation_image[kept],
+        observation_keypoint=scene.observation_keypoint[kept],
+    )
+    other = replace(scene, unit_component=np.where(scene.unit_registered, 1, 0))
+    write_scene(split, tmp_path / "out", {}, components=[(other, {"component": 1})])
+    expected = np.where(np.arange(POINTS) < first_point_of_others, 0, 2)
+    rows = readers.ply(tmp_path / "out" / "points.ply")
+    np.testing.assert_array_equal(rows["component"], expected)
+    assert (readers.ply(tmp_path / "out" / "components" / "1" / "points.ply")["component"] == 1).all()
+    listed = load(tmp_path / "out" / "report.json")["components"]
+    assert [(one["component"], one["folder"], one["points"]) for one in listed] == [
+        (0, ".", first_point_of_others),
+        (1, "components/1", POINTS),
+        (2, ".", POINTS - first_point_of_others),
+    ]
+    assert [one["registered_units"] for one in listed] == [2, UNITS - 1, 2]
+    assert [unit.get("component") for unit in load(tmp_path / "out" / "poses.json")["units"]] == [1, None, 1, 1, 1]
+    calibrations = [load(tmp_path / "out" / folder / "calibration.json") for folder in (".", "components/1")]
+    assert "component" not in calibrations[0]
+    assert (calibrations[1]["component"], calibrations[1]["from_component"]) == (1, 0)
+    rows = rows.copy()
+    rows["component"][0] += 1
+    assert [row.agrees for row in comparisons.ply(split, rows) if row.what == "a component"] == [False]

@@ -122,6 +122,21 @@ def test_scene(dataset: Path, tmp_path: Path, inner: str) -> None:
     assert [frame.source_frame for frame in drive.manifest.frames] == [0, 1, 2, 3]
 
 
+def test_the_vehicle_is_that_of_the_scenes_log(dataset: Path, tmp_path: Path) -> None:
+    tables = dataset / "v1.0-mini"
+    import_recording(dataset, tmp_path / "unknown", scene="scene-0103")
+    assert read_drive(tmp_path / "unknown").manifest.vehicle is None
+    scenes = json.loads((tables / "scene.json").read_text())
+    (tables / "scene.json").write_text(json.dumps([{**scene, "log_token": f"log-{scene['name']}"} for scene in scenes]))
+    logs = [{"token": "log-scene-0061", "vehicle": "n008"}, {"token": "log-scene-0103", "vehicle": "n015"}]
+    (tables / "log.json").write_text(json.dumps(logs))
+    import_recording(dataset, tmp_path / "known", scene="scene-0103")
+    manifest = read_drive(tmp_path / "known").manifest
+    assert (manifest.version, manifest.vehicle) == (2, "n015")
+    import_recording(dataset, tmp_path / "given", scene="scene-0103", vehicle="van-7")
+    assert read_drive(tmp_path / "given").manifest.vehicle == "van-7"
+
+
 def test_truth_is_the_laser_scanners_ego_pose(dataset: Path, tmp_path: Path) -> None:
     import_recording(dataset, tmp_path / "drive", scene="scene-0061")
     truth = np.loadtxt(tmp_path / "drive/truth.tum")

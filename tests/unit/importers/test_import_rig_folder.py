@@ -75,6 +75,16 @@ def refused(folder: Path, out: Path, **options: Any) -> InputError:
     return caught.value
 
 
+def test_the_vehicle_of_the_rig(recording: Path, tmp_path: Path) -> None:
+    edit_rig(recording, lambda document: document.update(vehicle="M-AB:1234"))
+    import_recording(recording, tmp_path / "drive")
+    assert read_drive(tmp_path / "drive").manifest.vehicle == "M-AB:1234"
+    edit_rig(recording, lambda document: document.update(vehicle="M AB"))
+    assert "vehicle" in refused(recording, tmp_path / "other").what
+    edit_rig(recording, lambda document: None)
+    assert "vehicle" in refused(recording, tmp_path / "other", vehicle="M AB").what
+
+
 def test_cameras_whose_folders_are_one_on_many_systems(recording: Path, tmp_path: Path) -> None:
     def rename(document: dict[str, Any]) -> None:
         document["cameras"]["CAM_L"] = document["cameras"].pop("cam_r")

@@ -147,7 +147,7 @@ def test_few_directions_find_what_all_do(cameras: int, monkeypatch: pytest.Monke
 
 def test_memory_of_an_image_is_a_quarter_of_its_vector() -> None:
     features = features_of(places_of_a_loop(), 1)
-    index = retrieval._Index.from_features(features)
+    index = retrieval.ImageIndex.from_features(features)
     centres = retrieval._vocabulary(features)
     vectors = np.stack([retrieval._vlad(found, centres) for found in features])
     assert index.codes.nbytes == vectors.nbytes // 4

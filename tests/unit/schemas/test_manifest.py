@@ -232,6 +232,24 @@ def test_version_2_says_how_well_more_of_a_camera_is_known(example: dict[str, An
     assert set(new) == FIELDS_OF_VERSION_2
 
 
+@pytest.mark.parametrize("vehicle", ["n015", "M-AB:1234", "7", "a" * 64])
+def test_version_2_names_the_vehicle(example: dict[str, Any], vehicle: str) -> None:
+    assert parse_new_manifest(encoded(example)).vehicle is None
+    example["vehicle"] = vehicle
+    with pytest.raises(DocumentError, match="vehicle is of version 2 of the contract: set version to 2"):
+        parse_new_manifest(encoded(example))
+    example["version"] = 2
+    assert parse_new_manifest(encoded(example)).vehicle == vehicle
+
+
+@pytest.mark.parametrize("vehicle", ["", "a" * 65, "a b", "-a", "a\n", "ä", "a/b", 7, True])
+def test_vehicles_in_another_form_are_refused(example: dict[str, Any], vehicle: object) -> None:
+    example |= {"version": 2, "vehicle": vehicle}
+    with pytest.raises(DocumentError, match=r"^vehicle: ") as refused:
+        parse_new_manifest(encoded(example))
+    assert [problem.path for problem in refused.value.problems] == ["vehicle"]
+
+
 def test_a_version_may_be_left_out(example: dict[str, Any]) -> None:
     del example["version"]
     assert parse_new_manifest(encoded(example)).version == 1
