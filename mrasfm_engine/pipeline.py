@@ -176,8 +176,8 @@ def reconstruct_submap(
             raise StorageError(
                 f"the plan of the drive has no sub-map {number}", remedy="Ask for the reconstruction again."
             )
-        stages.extraction_sizes(run)
         stages.own_cars(run)
+        stages.extraction_sizes(run)
         submap = stages.SubmapRun(run, span)
         submap.do(Stage.MAPPING)
     return submap.report
@@ -190,8 +190,7 @@ def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Spa
     prior = stages.leave_out_standing(run, stages.prior(run))
     if not stages.is_cut(run):  # else the probe came before
         stages.probe(run)
-    stages.extraction_sizes(run)
     spans = stages.cut_drive(run, workers)
-    if spans:
-        stages.own_cars(run)
+    stages.own_cars(run)
+    stages.extraction_sizes(run)
     return prior, spans

@@ -180,7 +180,9 @@ def _calibration(
     base, base_focal_px = (np.stack([reference[name][part] for name in names]) for part in (0, 1))
     focal_px = pack_cameras(cameras)[1][:, 0]
     given_focal_px = focal_px * scene.focal_given_of_found
-    known = [None if c.sigma_focal_px is None else c.sigma_focal_px / f for c, f in zip(cameras, focal_px, strict=True)]
+    # In the manifest's units, which of a MEI camera are others than at the axis.
+    manifest_focal_px = np.array([c.params[0] for c in cameras])
+    known = [None if c.sigma_focal_px is None else c.sigma_focal_px / c.params[0] for c in cameras]
     sigma_given = np.column_stack(
         [
             np.radians([camera.sigma_rotation_deg or config.sigma_rotation_deg for camera in cameras]),
@@ -196,7 +198,7 @@ def _calibration(
     if scene.certainty_of_cameras is not None:
         sigma[:, :6] = scene.certainty_of_cameras[0]
     observed = np.isfinite(scene.sigma_focal_px) & config.refine_focal
-    sigma[observed, 6] = (scene.sigma_focal_px / focal_px)[observed]
+    sigma[observed, 6] = (scene.sigma_focal_px / manifest_focal_px)[observed]
     says = sigma < NOTHING_OBSERVED * sigma_given
     information = np.where(says, sigma**-2.0 - sigma_given**-2.0, 0.0)
     without_prior = (found - given) / (sigma_given**2 * np.where(says, information, np.inf))

@@ -33,6 +33,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 UNIT_DOF = 6
 INTRINSICS = ADJUSTED  # phi, alpha, cx, cy, d0, d1, d2, d3
+DISTORTION = 4  # place of d0 among them
 CAMERA_DOF = 16
 # Places of a camera's step: phi, delta, rho, and from here on the rest of the intrinsics.
 FOCAL, TIME, READOUT, LENS = 6, 7, 8, 9

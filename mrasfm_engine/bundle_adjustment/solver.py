@@ -26,10 +26,11 @@ from mrasfm_engine.bundle_adjustment.kernels import (
 )
 from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, refine_points
 from mrasfm_engine.bundle_adjustment.priors import Term
-from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout, Observations, RowBandMotion, retract
+from mrasfm_engine.bundle_adjustment.problem import DISTORTION, UNIT_DOF, Layout, Observations, RowBandMotion, retract
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
 from mrasfm_engine.bundle_adjustment.schur_structure import SchurStructure
+from mrasfm_engine.geometry.camera_model import with_limit
 from mrasfm_engine.parallel import even_bounds, in_parts, in_ranges
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats, Ints
@@ -309,8 +310,16 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
     """
     if problem.layout.size < SMALL_SYSTEM:
         with _THREADS.limit(limits=1, user_api="blas"):
-            return _minimise(problem, cancel)
-    return _minimise(problem, cancel)
+            state, report = _minimise(problem, cancel)
+    else:
+        state, report = _minimise(problem, cancel)
+    if problem.layout.free_intrinsics[:, DISTORTION:].any():
+        # Not at every step: what a camera shows must not change while costs are compared.
+        limited = [
+            with_limit(int(kind), own) for kind, own in zip(problem.camera_kind, state.camera_params, strict=True)
+        ]
+        state = replace(state, camera_params=np.stack(limited))
+    return state, report
 
 
 def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:

@@ -78,7 +78,12 @@ def approximations(scene: Scene) -> list[Finding]:
         warning(
             "colmap-model-approximate",
             f"COLMAP has no model {camera.model}: `model/` and `features.db` have camera {camera.name} as "
-            f"{nearest.model}, which is off by up to {nearest.error_px:.2g} px in its image",
+            f"{nearest.model}, "
+            + (
+                f"which is off by up to {nearest.error_px:.2g} px in its image"
+                if np.isfinite(nearest.error_px)
+                else "without distortion, as its lens shows next to nothing"
+            ),
             "Take the camera's own model from calibration.json where that matters.",
         )
         for camera, nearest in zip(scene.drive.cameras, colmap_models(scene), strict=True)

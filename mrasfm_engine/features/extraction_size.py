@@ -8,16 +8,19 @@ time. Images that are dark or show little texture do not have enough, and are ex
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.features.extraction import Extractor, one_opencv_thread
+from mrasfm_engine.features.own_car import with_margin
+from mrasfm_engine.features.segmentation import Segmenter
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive
@@ -57,6 +60,19 @@ def largest_side_px(config: FeatureConfig) -> int:
     return config.max_side_px or LARGEST_SIDE_PX
 
 
+def reduced(image: Bytes, side_px: int) -> Bytes:
+    """An image (h, w) or (h, w, 3) whose longer side is `side_px` at most.
+
+    Its content fills the rounded size exactly: along each axis it shrinks by new size over old size.
+    """
+    height, width = image.shape[:2]
+    scale = side_px / max(height, width)
+    if scale >= 1.0:
+        return image
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
 @dataclass(frozen=True)
 class ExtractorBySize:
     """Extracts images at the size that was found for theirs, and others by `otherwise`."""
@@ -77,12 +93,24 @@ def at_sizes(extractor: Extractor, side_px: Mapping[Size, int]) -> Extractor:
 
 
 def find_sides(
-    drive: Drive, extractor: SizedExtractor, *, max_keypoints: int, threads: int, cancel: Cancel | None = None
+    drive: Drive,
+    extractor: SizedExtractor,
+    *,
+    max_keypoints: int,
+    threads: int,
+    segmenter: Segmenter | None = None,
+    own_cars: Sequence[Bools | None] = (),
+    cancel: Cancel | None = None,
 ) -> dict[Size, int]:
     """Longer side in pixels that images of each size are reduced to; a size that is extracted as it is has none.
 
     All cameras with images of one size have the same: keypoints of a stereo pair are then alike. Images that cannot be
     read say nothing: the extraction tells what is wrong with them.
+
+    Parameters
+    ----------
+    segmenter, own_cars
+        As the extraction has them: keypoints that it will not have do not count.
 
     Raises
     ------
@@ -90,13 +118,14 @@ def find_sides(
         Where `cancel` answers True.
     """
     result: dict[Size, int] = {}
+    usable = _Usable(drive, segmenter, [None if mask is None else ~with_margin(mask) for mask in own_cars])
     for size in sorted({(camera.width, camera.height) for camera in drive.cameras}):
         sampled, promising = _sample(drive, size), 0.0
         for reduction in REDUCTIONS:
             if reduction < promising:
                 continue
             side_px = round(reduction * min(max(size), LARGEST_SIDE_PX))
-            counts = _counts(drive, sampled, extractor.with_side(side_px), threads=threads, cancel=cancel)
+            counts = _counts(usable, sampled, extractor.with_side(side_px), threads=threads, cancel=cancel)
             share = float(np.quantile(counts, 0.25)) / (ENOUGH * max_keypoints) if counts else 0.0
             if share >= 1.0:
                 result[size] = side_px
@@ -119,24 +148,45 @@ def _sample(drive: Drive, size: Size) -> list[int]:
     return [of_size[k] for k in chosen]
 
 
+@dataclass(frozen=True)
+class _Usable:
+    """Images of a drive, and where they have keypoints."""
+
+    drive: Drive
+    segmenter: Segmenter | None
+    outside_own_car: Sequence[Bools | None]  # by camera; none where it was not sought
+
+    def read(self, index: int) -> tuple[Bytes, Bools | None] | None:
+        """An image (h, w, 3) and its usable pixels (h, w), None for all; None where it cannot be read."""
+        image, label_map = self.drive.images[index], self.drive.manifest.label_map or LabelMap.cityscapes()
+        try:
+            rgb = read_image_rgb(self.drive.root / image.file)
+            if image.mask is not None:
+                mask: Bytes | None = read_mask(self.drive.root / image.mask, self.drive.manifest.label_map)
+            else:
+                mask = None if self.segmenter is None else self.segmenter.segment(rgb)
+        except InputError:
+            return None
+        usable = None if mask is None else usable_pixels(class_codes(mask, label_map))
+        outside = self.outside_own_car[image.camera] if self.outside_own_car else None
+        for known in (usable, outside):
+            if known is not None and known.shape != rgb.shape[:2]:
+                return None
+        if usable is None or outside is None:
+            return rgb, outside if usable is None else usable
+        return rgb, usable & outside
+
+
 def _counts(
-    drive: Drive, images: list[int], extractor: SizedExtractor, *, threads: int, cancel: Cancel | None
+    usable: _Usable, images: list[int], extractor: SizedExtractor, *, threads: int, cancel: Cancel | None
 ) -> list[int]:
     """Keypoints of images at the extractor's size, of those that can be read."""
-    label_map = drive.manifest.label_map or LabelMap.cityscapes()
 
     def count(index: int) -> int | None:
         if cancel is not None and cancel():
             raise CancelledError
-        image = drive.images[index]
-        try:
-            rgb = read_image_rgb(drive.root / image.file)
-            mask = None
-            if image.mask is not None:
-                mask = usable_pixels(class_codes(read_mask(drive.root / image.mask, label_map), label_map))
-        except InputError:
-            return None
-        return None if mask is not None and mask.shape != rgb.shape[:2] else extractor.count(rgb, mask)
+        found = usable.read(index)
+        return None if found is None else extractor.count(*found)
 
     with one_opencv_thread(), closing(in_order(threads, count, images)) as counts:
         return [found for found in counts if found is not None]

@@ -16,7 +16,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import colors_at
-from mrasfm_engine.features.extraction_size import largest_side_px
+from mrasfm_engine.features.extraction_size import largest_side_px, reduced
 from mrasfm_engine.features.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.features.tiles import Tile, cut, duplicates, lay_tiles
 from mrasfm_engine.learned.network import STRIDE_PX, Network
@@ -64,7 +64,7 @@ class NetworkExtractor:
 
     def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
         """See `Extractor`."""
-        pixels = self._scaled(rgb)
+        pixels = reduced(rgb, largest_side_px(self._config))
         size = pixels.shape[0], pixels.shape[1]
         window = self._fixed_size or (_up(size[0]), _up(size[1]))
         stretch = np.array([rgb.shape[1] / size[1], rgb.shape[0] / size[0]])
@@ -97,12 +97,6 @@ class NetworkExtractor:
             colors=colors_at(rgb, xy),
             scores=np.ascontiguousarray(found.scores, dtype=np.float32),
         )
-
-    def _scaled(self, rgb: Bytes) -> Bytes:
-        scale = largest_side_px(self._config) / max(rgb.shape[:2])
-        if scale >= 1.0:
-            return rgb
-        return np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _detect(self, pixels: Bytes, tile: Tile, usable: Callable[[Floats32], Bools]) -> Detections:
         """Detections of a tile that lie in its core, are not masked and not too weak; in pixels of the scaled image."""

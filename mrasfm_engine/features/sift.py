@@ -8,7 +8,7 @@ import numpy as np
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE, NO_FEATURES, colors_at
-from mrasfm_engine.features.extraction_size import largest_side_px
+from mrasfm_engine.features.extraction_size import largest_side_px, reduced
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes
@@ -58,10 +58,7 @@ class SiftExtractor:
 
     def _prepared(self, rgb: Bytes, mask: Bools | None) -> tuple[Bytes, Bytes | None, cv2.SIFT]:
         """The image and the mask at the size of the extraction, and a detector."""
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        scale = min(1.0, largest_side_px(self._config) / max(gray.shape))
-        if scale < 1.0:
-            gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        gray = reduced(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), largest_side_px(self._config))
         small_mask, wanted = None, self._config.max_keypoints * (CANDIDATES if self._config.spread else 1)
         if mask is not None:
             small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -74,7 +71,7 @@ class SiftExtractor:
             contrastThreshold=self._config.contrast_threshold,
             enable_precise_upscale=True,
         )
-        return np.asarray(gray, dtype=np.uint8), small_mask, sift
+        return gray, small_mask, sift
 
 
 METHOD = Method[FeatureConfig, SiftExtractor](build=SiftExtractor)

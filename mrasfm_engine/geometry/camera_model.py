@@ -114,6 +114,11 @@ def pack_cameras(cameras: list[Camera]) -> tuple[Ints, Floats]:
     return np.array([kind for kind, _ in both], dtype=np.int64), np.stack([params for _, params in both])
 
 
+def manifest_scales(kind: int, params: Floats) -> Floats:
+    """Factors (8,) from a vector's parameters that can be adjusted to those of the manifest."""
+    return _mei_scales(float(params[REST])) if kind == OMNIDIRECTIONAL else np.ones(ADJUSTED)
+
+
 def largest_angle_rad(params: Floats) -> float:
     """Largest angle from the axis that a camera with a vector (PARAMETERS,) can show."""
     return math.acos(float(params[LIMIT]))
@@ -221,7 +226,8 @@ def _largest_angle(kind: int, k: Any, widest: float) -> float:
                 (out[5] * z * c + out[6] * z * s - out[7] * r) / k[1],
             )
             across_u, across_v = (-out[2] * s + out[3] * c) / k[0], (-out[5] * s + out[6] * c) / k[1]
-            outwards = ((out[0] - k[2]) / k[0] * u + (out[1] - k[3]) / k[1] * v) > 0.0
+            du, dv = (out[0] - k[2]) / k[0], (out[1] - k[3]) / k[1]
+            outwards = du * c + dv * s > 0.0 and du * u + dv * v > 0.0
             if not (outwards and u * across_v - v * across_u > 0.0):
                 return widest * (i - 1) / ANGLES
     return widest
@@ -251,7 +257,7 @@ def _unproject_pixels(kind: int, k: Any, pixels: Any, rays: Any) -> None:
             rays[i, 0], rays[i, 1], rays[i, 2] = u * n, v * n, n
             continue
         c, s = (u / wanted, v / wanted) if wanted > 1e-12 else (1.0, 0.0)
-        low, high = 0.0, widest
+        low, high, converged = 0.0, widest, False
         theta = min(math.atan(wanted), 0.5 * widest)
         for _ in range(60):
             z, r = math.cos(theta), math.sin(theta)
@@ -268,14 +274,18 @@ def _unproject_pixels(kind: int, k: Any, pixels: Any, rays: Any) -> None:
             else:
                 low = theta
             step = (reached - wanted) / slope if slope > 0.0 else 4.0
+            converged = abs(reached - wanted) < 1e-9 * (1.0 + wanted)
             if abs(step) < 1e-14 or high - low < 1e-15:
                 break
             theta = theta - step if low < theta - step < high else 0.5 * (low + high)
         x, y, z = math.sin(theta) * c, math.sin(theta) * s, math.cos(theta)
-        if kind != 2 and (k[6] != 0.0 or k[7] != 0.0):
+        if converged and kind != 2 and (k[6] != 0.0 or k[7] != 0.0):  # else it is beyond the limit, and stays there
+            kept_x, kept_y, kept_z = x, y, z
             for _ in range(10):
                 if not project(kind, k, x, y, z, work, out):
+                    x, y, z = kept_x, kept_y, kept_z
                     break
+                kept_x, kept_y, kept_z = x, y, z
                 eu, ev = pixels[i, 0] - out[0], pixels[i, 1] - out[1]
                 # Steps of two angles: away from the axis, and around it.
                 r = math.sqrt(x * x + y * y)
@@ -286,6 +296,8 @@ def _unproject_pixels(kind: int, k: Any, pixels: Any, rays: Any) -> None:
                 if not abs(det) > 1e-9 * k[0] * k[1]:
                     break
                 away, around = (b1 * eu - a1 * ev) / det, (a0 * ev - b0 * eu) / det
+                if abs(away) + abs(around) > 0.2:
+                    break
                 x, y, z = x + z * c * away - s * around, y + z * s * away + c * around, z - r * away
                 n = 1.0 / math.sqrt(x * x + y * y + z * z)
                 x, y, z = x * n, y * n, z * n

@@ -24,6 +24,7 @@ from schemas import Camera
 # explode.
 MIN_FORWARD = 0.15
 GRID = 33  # pixels across and down an image that a model is fitted to
+MIN_SHOWN = 0.02  # of them, that have a ray: fewer determine no model
 ITERATIONS = 20
 
 
@@ -93,12 +94,15 @@ def nearest_model(camera: Camera, params: Floats) -> NearestModel:
     rays = unproject_pixels(kind, own, pixels)
     # Corners of an image circle show nothing: their rays are those of the limit, and come back elsewhere.
     shown = rays[:, 2] > np.cos(largest_angle_rad(own)) + 1e-6
+    equidistant = np.array([*own[:4], 0.0, 0.0, 0.0, 0.0])
+    if shown.mean() < MIN_SHOWN:
+        return NearestModel(model="OPENCV_FISHEYE", params=equidistant, error_px=float("inf"))
     pixels, rays = pixels[shown], rays[shown]
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    fitted = np.array([*own[:4], 0.0, 0.0, 0.0, 0.0])
+    fitted = equidistant
     for _ in range(ITERATIONS):
         step, *_ = np.linalg.lstsq(_derivatives(fitted, rays, theta), (pixels - _fisheye(fitted, rays, theta)).ravel())
-        fitted += step
+        fitted = fitted + step
     off = np.linalg.norm(_fisheye(fitted, rays, theta) - pixels, axis=1)
     return NearestModel(model="OPENCV_FISHEYE", params=fitted, error_px=float(off.max()))
 

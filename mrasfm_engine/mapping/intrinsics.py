@@ -17,7 +17,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
-from mrasfm_engine.geometry.camera_model import FISHEYE, pack_cameras
+from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
 from schemas.drive import CAMERA_MODELS
@@ -116,10 +116,13 @@ def intrinsics_prior(mapper: Mapper) -> IntrinsicsPrior:
     sigma = np.empty((len(params), INTRINSICS))
     for c, camera in enumerate(mapper.drive.cameras):
         focal_px = params[c, 0]
-        sigma[c, 0] = settings.sigma_focal if camera.sigma_focal_px is None else camera.sigma_focal_px / focal_px
+        # Of a MEI camera the manifest's focal length is another one than that at the axis.
+        given = camera.sigma_focal_px
+        sigma[c, 0] = settings.sigma_focal if given is None else given / camera.params[0]
         sigma[c, 1] = SIGMA_ASPECT
         sigma[c, 2:4] = camera.sigma_principal_point_px or settings.sigma_principal_point * focal_px
         sigma[c, 4:] = camera.sigma_distortion or settings.sigma_distortion
+        sigma[c, 4:] /= manifest_scales(int(mapper.camera_kind[c]), params[c])[4:]
         if mapper.camera_kind[c] != FISHEYE:
             sigma[c, 6:] *= TANGENTIAL_SHARE
     return IntrinsicsPrior(params=params, sigma=sigma)

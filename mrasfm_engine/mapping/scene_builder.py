@@ -111,7 +111,11 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
         # A camera that is held is as good as what was given, whatever the drive would know of it.
         sigma = np.where(refinement.recalibrated[:, None], refinement.certainty.sigma_camera[:, :6], sigma)
         if asked:
-            focal = refinement.certainty.sigma_camera[:, 6] * mapper.state.camera_params[:, 0]
+            focal_px = [
+                unpack_camera(c.model, p)[0]
+                for c, p in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
+            ]
+            focal = refinement.certainty.sigma_camera[:, 6] * np.array(focal_px)
     if refinement.directions is not None:
         observed = refinement.directions.observed & refinement.recalibrated[:, None]
     wrong = {w.camera for w in refinement.miscalibrations}

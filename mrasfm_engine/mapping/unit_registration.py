@@ -25,6 +25,7 @@ from mrasfm_engine.matching.simultaneous import INDEPENDENT_MATCHES, MIN_SIGMA_P
 from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_CORRESPONDENCES = 1500  # more do not make a pose better, only slower
+MIN_PNP_POINTS = 3  # that determine a pose; COLMAP's solver does not survive none
 MIN_CAMERA_MATCHES = 30  # of a camera before its disagreement, or its vote, counts
 MIN_CAMERA_INLIER_RATIO = 0.25
 PREDICTION_RAD = 0.05  # by which images turn from where constant velocity predicts them, on bends and bumps
@@ -250,6 +251,8 @@ def _joint_pose(mapper: Mapper, matched: Correspondences2D3D) -> Floats | None:
     """world_from_rig by one generalised PnP over all cameras."""
     views, cameras = CameraViews.from_keypoints(mapper, matched.camera, matched.band), cameras_of(mapper)
     xy_px, usable = cameras.pixels(matched.camera, matched.xy_px)
+    if usable.sum() < MIN_PNP_POINTS:
+        return None
     result = pycolmap.estimate_and_refine_generalized_absolute_pose(
         xy_px[usable],
         matched.points_m[usable],

@@ -15,6 +15,7 @@ from mrasfm_engine.geometry.colmap_cameras import MIN_FORWARD
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.verification import (
+    MIN_RANSAC_MATCHES,
     epipolar_errors,
     essential_inliers,
     in_front_of_both,
@@ -132,6 +133,8 @@ def _explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: F
 def _direction(rays_a: Floats, rays_b: Floats) -> Floats | None:
     """Direction from camera a to camera b: a unit vector."""
     ok = (rays_a[:, 2] > MIN_FORWARD) & (rays_b[:, 2] > MIN_FORWARD)
+    if ok.sum() < MIN_RANSAC_MATCHES:
+        return None
     a, b = rays_a[ok, :2] / rays_a[ok, 2:], rays_b[ok, :2] / rays_b[ok, 2:]
     essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, 0.999, 2e-3)
     if essential is None or essential.shape != (3, 3):

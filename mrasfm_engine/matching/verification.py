@@ -9,7 +9,8 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.colmap_cameras import MIN_FORWARD
 from mrasfm_engine.types import Bools, Floats
 
-WIDE = 0.5  # z of a unit ray 60 degrees off axis: beyond it, an error counts over four times in the plane z = 1
+# z of unit rays 60 and 75 degrees off the axis: beyond, an error counts over 4 and 15 times in the plane z = 1.
+WIDE, VERY_WIDE = 0.5, 0.26
 REFINEMENTS = 3
 CONFIDENCE = 0.9999
 MIN_RANSAC_MATCHES = 8
@@ -18,7 +19,7 @@ MIN_RANSAC_MATCHES = 8
 def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bools:
     """Return which matches (n,) agree with one essential matrix found by RANSAC.
 
-    Views of less than 120 degrees are judged in the plane z = 1. There an error at the rim of a wider view is tens of
+    Views of less than 150 degrees are judged in the plane z = 1. There an error at the rim of a wider view is tens of
     times what it is at its centre: RANSAC works in planes turned towards the matches, and then all rays are judged by
     their angles.
 
@@ -29,7 +30,7 @@ def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bo
     max_error
         Distance from the epipolar line in the plane z = 1 (pixels over focal length), of wide views in radians.
     """
-    if len(rays_a) and min(rays_a[:, 2].min(), rays_b[:, 2].min()) < WIDE:
+    if len(rays_a) and min(rays_a[:, 2].min(), rays_b[:, 2].min()) < VERY_WIDE:
         return _wide_inliers(rays_a, rays_b, max_error)
     return _plane_inliers(rays_a, rays_b, max_error)[0]
 
@@ -54,7 +55,8 @@ def _wide_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> Bools:
     turned_a, turned_b = rays_a @ turn_a.T, rays_b @ turn_b.T
     best = np.zeros(len(rays_a), dtype=np.bool_)
     central = (turned_a[:, 2] > WIDE) & (turned_b[:, 2] > WIDE)
-    for rows in (np.flatnonzero(central), np.arange(len(rays_a))):
+    everything = np.arange(len(rays_a))
+    for rows in (everything,) if central.all() else (np.flatnonzero(central), everything):
         _, essential = _plane_inliers(turned_a[rows], turned_b[rows], max_error)
         if essential is None:
             continue

@@ -6,10 +6,11 @@ import numpy as np
 
 from mrasfm_engine.geometry.camera_model import largest_angle_rad, pack_camera, project_points, unproject_pixels
 from schemas import Camera, DriveManifest
-from schemas.findings import Finding, warning
+from schemas.findings import Finding, error, warning
 
 GRID = 65  # pixels across and down an image that are looked at
 COMES_BACK_PX = 0.01
+USELESS_SHARE = 0.9  # of an image without rays: what is left is the calibration of another camera, or none
 FULL_CIRCLE_RAD = np.radians(90.0)  # lenses that reach farther show an image circle: its corners are dark
 
 
@@ -20,7 +21,7 @@ def lens_findings(manifest: DriveManifest) -> list[Finding]:
         share, angle_rad = share_without_ray(camera)
         if share > 0.0 and angle_rad < FULL_CIRCLE_RAD:
             found.append(
-                warning(
+                (error if share > USELESS_SHARE else warning)(
                     "lens-folds",
                     f"rig.cameras: the distortion of camera {camera.name} folds back {np.degrees(angle_rad):.0f} deg "
                     f"off its axis, and its image reaches farther: {share:.0%} of the pixels have no ray, and what is "

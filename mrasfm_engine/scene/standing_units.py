@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, Scene
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -106,7 +107,7 @@ def _metres_per_px(scene: Scene, drive: Drive) -> float:
         return float("nan")
     unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)[scene.observation_image]
     away_m = np.linalg.norm(scene.points_m[scene.observation_point] - scene.world_from_rig[unit, :3, 3], axis=1)
-    focal_px = float(np.median([camera.params[0] for camera in drive.cameras]))
+    focal_px = float(np.median(pack_cameras(drive.cameras)[1][:, 0]))
     return float(np.median(away_m)) / focal_px
 
 

@@ -15,7 +15,10 @@ EXTRACTION_SIZE = "extraction-size"
 
 
 def extraction_sizes(run: Run) -> None:
-    """Find the size for the images of the drive, or take it from the store: `run.side_px` has it from here on."""
+    """Find the size for the images of the drive, or take it from the store: `run.side_px` has it from here on.
+
+    The own car is known by then.
+    """
     extractor = run.components.extractor
     if run.config.features.max_side_px is not None or not isinstance(extractor, SizedExtractor):
         return
@@ -30,6 +33,8 @@ def extraction_sizes(run: Run) -> None:
             extractor,
             max_keypoints=run.config.features.max_keypoints,
             threads=run.config.threads,
+            segmenter=run.components.segmenter,
+            own_cars=run.own_cars,
             cancel=run.cancel,
         )
         sizes = np.array([(*size, side) for size, side in sorted(found.items())], dtype=np.int64).reshape(-1, 3)

@@ -251,16 +251,20 @@ def test_a_time_offset_moves_its_camera_along_the_trajectory() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
 
 
-def test_a_readout_moves_rows_by_where_they_are_from_the_middle() -> None:
+@pytest.mark.parametrize(("axis", "side_px"), [(1, 720.0), (0, 1280.0)])
+def test_a_readout_moves_rows_by_where_they_are_from_the_middle(axis: int, side_px: float) -> None:
+    """And columns, where these are read one after the other."""
     free = {"free_units": [False] * 5, "free_cameras": [True] * 3}
     problem, state = following(make_case(units=5, cameras=3, points=120, **free))
     every = np.ones(3, dtype=np.bool_)
     layout = replace(problem.layout, free_times=every, free_readouts=every)
-    # Where all keypoints are at 3/4 of the height, a readout of 4 ms is an offset of 1 ms.
+    # Where all keypoints are at 3/4 of the side, a readout of 4 ms is an offset of 1 ms.
     at = 0.75
-    xy_px = np.column_stack([problem.observations.xy_px[:, 0], np.full(len(problem.observations.unit), at * 720.0)])
-    rows = replace(problem.observations, xy_px=xy_px)
-    cameras = replace(problem, layout=layout, observations=rows).normal_equations(state, 0.0).cameras
+    xy_px, readout = problem.observations.xy_px.copy(), np.zeros((3, 3))
+    xy_px[:, axis], readout[:, axis] = at * side_px, 1.0 / side_px
+    rows, motion = replace(problem.observations, xy_px=xy_px), replace(problem.motion, readout=readout)
+    problem = replace(problem, layout=layout, observations=rows, motion=motion)
+    cameras = problem.normal_equations(state, 0.0).cameras
     for c in range(3):
         square = cameras[c * LENS : (c + 1) * LENS, c * LENS : (c + 1) * LENS]
         assert square[TIME, TIME] > 0.0

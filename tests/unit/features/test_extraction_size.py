@@ -107,6 +107,41 @@ def test_keypoints_of_reduced_images_lie_where_those_of_full_ones_do(tmp_path: P
     assert drive.images
 
 
+@pytest.mark.parametrize(("size", "side_px"), [((1242, 375), 621), ((1920, 1208), 800), ((1920, 1208), 1131)])
+def test_reducing_moves_nothing_up_or_down(size: tuple[int, int], side_px: int) -> None:
+    """Sides that do not come out whole are rounded, and content must follow the rounded side to the last row."""
+    image, (width, height) = np.full((size[1], size[0], 3), 60, np.uint8), size
+    yy, xx = np.mgrid[: size[1], : size[0]] + 0.5
+    centres = [(x, y) for y in (40.3, height / 2, height - 40.7) for x in np.arange(60.0, width - 60.0, 97.3)]
+    sigmas_px = np.linspace(4.0, 8.0, 7)
+    gray = sum(
+        150 * np.exp(-((xx - x) ** 2 + (yy - y) ** 2) / (2 * sigmas_px[k % 7] ** 2)) for k, (x, y) in enumerate(centres)
+    )
+    image += gray.astype(np.uint8)[..., None]
+    found = SiftExtractor(FeatureConfig(max_side_px=side_px)).extract(image, None).xy_px
+    for row in (40.3, height / 2, height - 40.7):
+        near = [found[np.linalg.norm(found - c, axis=1).argmin()] - c for c in centres if c[1] == row]
+        near = [d for d in near if np.linalg.norm(d) < 2.0]
+        assert len(near) > len(centres) / 6
+        off = np.median(near, axis=0)
+        assert (np.abs(off) < 0.08).all(), (row, off)
+
+
+def test_what_will_be_masked_does_not_count_either(tmp_path: Path) -> None:
+    """The own car, and what a segmenter takes for something that moves."""
+    drive = write_drive(tmp_path, {"rich": 1.0})
+    extractor, bonnet = SiftExtractor(FeatureConfig(max_keypoints=700)), np.ones((480, 640), np.bool_)
+    bonnet[:16] = False
+    assert find_sides(drive, extractor, max_keypoints=700, threads=1) == {SIZES["rich"]: 320}
+    assert find_sides(drive, extractor, max_keypoints=700, threads=1, own_cars=[bonnet]) == {}
+
+    class Cars:
+        def segment(self, rgb: np.ndarray) -> np.ndarray:
+            return np.where(np.arange(rgb.shape[0])[:, None] < 16, 2, 13).repeat(rgb.shape[1], 1).astype(np.uint8)
+
+    assert find_sides(drive, extractor, max_keypoints=700, threads=1, segmenter=Cars()) == {}
+
+
 def test_images_that_cannot_be_read_say_nothing(tmp_path: Path) -> None:
     drive = write_drive(tmp_path, {"rich": 1.0})
     (tmp_path / "rich0.png").write_bytes(b"no image")

@@ -133,7 +133,7 @@ def test_wide_cameras_see_beyond_90_degrees(model: str) -> None:
 
 FOLDED = {
     # Half of the image is 25 deg; what lies 50 deg off the axis would come back into it.
-    "OPENCV": [1000.0, 1000.0, 466.0, 350.0, -0.32, 0.0, 0.0, 0.0],
+    "OPENCV": [1000.0, 1000.0, 466.0, 350.0, -0.32, 0.0, 5e-4, -3e-4],
     "RADIAL": [500.0, 480.0, 300.0, -0.35, 0.02],
     "FULL_OPENCV": [600.0, 600.0, 480.0, 300.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5, 0.3, 0.0],
     "OPENCV_FISHEYE": [330.0, 330.0, 480.0, 300.0, -0.2, 0.0, 0.0, 0.0],
@@ -159,11 +159,30 @@ def test_folded_distortion_shows_nothing_far_off(model: str) -> None:
     assert np.linspace(0.0, 1.15, 400)[int(np.argmax(reach))] == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("model", sorted(FOLDED))
-def test_pixels_beyond_the_limit_have_rays_at_the_limit(model: str) -> None:
-    kind, packed = pack_camera(model, FOLDED[model])
-    ray = unproject_pixels(kind, packed, [[1e5, 300.0], [480.0, -1e5]])
-    np.testing.assert_allclose(np.arccos(ray[:, 2]), largest_angle_rad(packed), atol=1e-6)
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        *FOLDED.items(),
+        ("OPENCV", [960.0, 960.0, 480.0, 300.0, -0.30, -0.02, 5e-4, -3e-4]),
+        ("OPENCV", [500.0, 500.0, 480.0, 300.0, -0.35, 0.05, 5e-4, -3e-4]),
+        ("MEI", PARAMS["MEI"]),
+    ],
+)
+def test_pixels_beyond_the_limit_have_rays_at_the_limit(model: str, params: list[float]) -> None:
+    """In their direction from the axis, whatever the lens is decentred by."""
+    kind, packed = pack_camera(model, params)
+    pixels = np.array([[1e5, 300.0], [480.0, -1e5], [-2000.0, -1500.0], [2500.0, 1400.0]])
+    rays = unproject_pixels(kind, packed, pixels)
+    np.testing.assert_allclose(np.arccos(rays[:, 2]), largest_angle_rad(packed), atol=1e-6)
+    towards = (pixels - packed[2:4]) / packed[:2]
+    np.testing.assert_allclose(np.arctan2(rays[:, 1], rays[:, 0]), np.arctan2(towards[:, 1], towards[:, 0]), atol=1e-3)
+
+
+@pytest.mark.parametrize(("model", "at"), [("OPENCV", 4), ("MEI", 4), ("FULL_OPENCV", 5)])
+def test_an_image_that_is_inverted_twice_is_none(model: str, at: int) -> None:
+    params = list(PARAMS[model])
+    params[at] = -1e9
+    assert largest_angle_rad(pack_camera(model, params)[1]) < np.radians(2.0)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -47,6 +47,14 @@ def test_the_nearest_fisheye_is_as_near_as_it_says() -> None:
     assert nearest.error_px < 1.0  # mostly the tangential terms, which no fisheye of COLMAP's has
 
 
+def test_a_lens_that_shows_nothing_has_no_nearest_model_but_breaks_nothing() -> None:
+    broken = [*MEI[:4], 0.0, 0.0, 1e3, 0.0, 2.2]
+    nearest = nearest_model(camera("MEI").model_copy(update={"params": broken}), np.array(broken))
+    assert nearest.model == "OPENCV_FISHEYE"
+    assert nearest.error_px == np.inf
+    assert np.isfinite(nearest.params).all()
+
+
 def test_generalised_pnp_finds_a_pose_whatever_the_models_are() -> None:
     """Points around the vehicle, of which many lie where COLMAP's plane z = 1 does not reach."""
     cameras = [camera(model) for model in PARAMS]

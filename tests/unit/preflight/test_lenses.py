@@ -6,6 +6,7 @@ import pytest
 
 from mrasfm_engine.preflight.lenses import lens_findings, share_without_ray
 from schemas import Camera, DriveManifest, Frame, FrameImage, Pose, Rig
+from schemas.findings import Severity
 
 
 def camera(model: str, params: list[float]) -> Camera:
@@ -50,6 +51,13 @@ def test_a_fold_inside_the_image_is_named_with_its_angle_and_share() -> None:
     (found,) = findings("OPENCV", params)
     assert found.startswith("lens-folds: rig.cameras: the distortion of camera cam folds back 31 deg off its axis")
     assert f"{share:.0%} of the pixels" in found
+
+
+def test_a_lens_that_shows_next_to_nothing_is_an_error() -> None:
+    frame = Frame(timestamp_us=0, source_frame=0, images={"cam": FrameImage(file="0.png")})
+    lens = camera("OPENCV", [500.0, 500.0, 480.0, 300.0, -40.0, 0.0, 0.0, 0.0])
+    (found,) = lens_findings(DriveManifest(name="lens", rig=Rig(cameras=[lens]), frames=[frame]))
+    assert (found.code, found.severity) == ("lens-folds", Severity.ERROR)
 
 
 def test_distortion_with_a_wrong_sign_is_seen() -> None:

@@ -224,7 +224,12 @@ def test_a_version_that_only_equals_one(example: dict[str, Any], version: object
 
 
 def test_version_2_says_how_well_more_of_a_camera_is_known(example: dict[str, Any]) -> None:
-    new = {"sigma_principal_point_px": 1.5, "sigma_distortion": 0.01, "sigma_time_offset_us": 500.0}
+    new = {
+        "sigma_principal_point_px": 1.5,
+        "sigma_distortion": 0.01,
+        "sigma_time_offset_us": 500.0,
+        "readout_direction": "left_to_right",
+    }
     example["rig"]["cameras"][0] |= new
     example["version"] = 2
     camera = parse_manifest(json.dumps(example).encode()).rig.cameras[0].model_dump()
