@@ -262,6 +262,7 @@ def test_a_readout_moves_rows_by_where_they_are_from_the_middle(axis: int, side_
     at = 0.75
     xy_px, readout = problem.observations.xy_px.copy(), np.zeros((3, 3))
     xy_px[:, axis], readout[:, axis] = at * side_px, 1.0 / side_px
+    assert problem.motion is not None
     rows, motion = replace(problem.observations, xy_px=xy_px), replace(problem.motion, readout=readout)
     problem = replace(problem, layout=layout, observations=rows, motion=motion)
     cameras = problem.normal_equations(state, 0.0).cameras
