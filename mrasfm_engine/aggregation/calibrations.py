@@ -38,8 +38,8 @@ def calibration_priors(
 
     They are the drives that have units that vary and whose scenes refined it, or of whose vehicle others did. A scene's
     certainty rests on all its units; observations of those that vary count in the adjustment anyway, so only the
-    others' share is kept. In a map of very many drives calibrations stay as their scenes found them, as they do where
-    the settings hold them.
+    others' share is kept. That of a smaller component rests on the largest one's units, and all of it is kept. In a map
+    of very many drives calibrations stay as their scenes found them, as they do where the settings hold them.
 
     Parameters
     ----------
@@ -54,8 +54,10 @@ def calibration_priors(
         return []
     priors = []
     for k, scene in enumerate(assembly.scenes):
-        vary, told = _share_that_varies(assembly, free_units, k), expected.get(k)
-        if not vary or (scene.certainty_of_cameras is None and told is None):
+        told = expected.get(k)
+        if not (free_units & (assembly.scene_of_unit == k)).any() or (
+            scene.certainty_of_cameras is None and told is None
+        ):
             continue
         cameras = scene.drive.cameras
         given = np.column_stack(
@@ -65,7 +67,7 @@ def calibration_priors(
             ]
         ).repeat(3, axis=1)
         sigma, observed = scene.certainty_of_cameras or (given, np.zeros(given.shape, dtype=np.bool_))
-        left = max(1.0 - vary, 1e-12)
+        left = _share_left(assembly, free_units, k)
         known = np.where(observed, np.minimum(sigma / np.sqrt(left), given), given)
         number = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
         poses, held = scene.drive.rig_from_cam, ~observed
@@ -109,17 +111,21 @@ def _combined(told: Expected, left: float) -> tuple[Floats, Floats]:
 
 
 def _focal_prior(
-    assembly: Assembly, state: State, free_units: Bools, expected: Mapping[int, Expected]
+    assembly: Assembly, state: State, free_units: Bools, cameras: Bools, expected: Mapping[int, Expected]
 ) -> tuple[IntrinsicsPrior, Bools]:
-    """Prior of the focal lengths that other drives of a vehicle observed, and the cameras (c,) of which they did."""
+    """Prior of the focal lengths that other drives of a vehicle observed, and which (c,) of the `cameras` (c,) they did.
+
+    The others keep what their scenes found.
+    """
     params, sigma = state.camera_params.copy(), np.ones((len(state.camera_params), INTRINSICS))
     observed = np.zeros(len(params), dtype=np.bool_)
     for k, told in expected.items():
-        mean, own_sigma = _combined(told, 1.0 - _share_that_varies(assembly, free_units, k))
+        mean, own_sigma = _combined(told, _share_left(assembly, free_units, k))
         rows = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
-        observed[rows] = np.isfinite(own_sigma[:, 6])
-        params[rows, :2] *= np.exp(mean[:, 6:])
-        sigma[rows, 0] = np.where(observed[rows], own_sigma[:, 6], 1.0)
+        says = np.isfinite(own_sigma[:, 6]) & cameras[rows]
+        params[rows[says], :2] *= np.exp(mean[says, 6:])
+        sigma[rows[says], 0] = own_sigma[says, 6]
+        observed[rows] = says
     return IntrinsicsPrior(params=params, sigma=sigma), observed
 
 
@@ -174,13 +180,17 @@ def map_calibrations(
         expected, learning = {}, ()
     for prior in priors:
         cameras[prior.camera] = True
-    focal, observed = _focal_prior(assembly, state, more, expected)
-    intrinsics[:, 0] = observed & cameras
+    focal, intrinsics[:, 0] = _focal_prior(assembly, state, more, cameras, expected)
     terms: list[CameraPosePrior | IntrinsicsPrior] = [*priors, *([focal] if intrinsics.any() else [])]
     return MapCalibrations(free_units=more, cameras=cameras, free_intrinsics=intrinsics, terms=terms, learning=learning)
 
 
-def _share_that_varies(assembly: Assembly, free_units: Bools, k: int) -> float:
-    """Share of a scene's registered units that are among the free ones (u,)."""
+def _share_left(assembly: Assembly, free_units: Bools, k: int) -> float:
+    """Share, above zero, of the units that a scene's calibration rests on that are not among the free ones (u,).
+
+    The calibration of a smaller component is the largest one's and rests on none of the component's own units.
+    """
+    if assembly.scenes[k].calibration.get("from_component") is not None:
+        return 1.0
     units = assembly.scene_of_unit == k
-    return float((free_units & units).sum() / max((assembly.registered & units).sum(), 1))
+    return max(1.0 - float((free_units & units).sum() / max((assembly.registered & units).sum(), 1)), 1e-12)
