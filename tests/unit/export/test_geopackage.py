@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.errors import StorageError
 from mrasfm_engine.export import geopackage, geopackage_readback
 from mrasfm_engine.export.geopackage import write_geopackage
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import TRAJECTORY_FILE
-from tests.helpers.export_example import MISSING_IMAGE, MISSING_UNIT, UNITS, assert_nothing_published, make_scene
+from tests.helpers.export_example import MISSING_IMAGE, MISSING_UNIT, UNITS, assert_withheld, make_scene, withheld_files
 
 NAMES = ["example"] * UNITS
 
@@ -188,11 +188,31 @@ def dumped(path: Path) -> list[str]:
         lambda s: with_times(s, (s.drive.timestamps_us + 1).tolist()),
     ],
 )
-def test_a_file_of_another_scene_is_refused_by_name(
+def test_a_file_of_another_scene_is_withheld_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Scene], Scene]
 ) -> None:
     original = geopackage.write_geopackage
     monkeypatch.setattr(geopackage, "write_geopackage", lambda scene, *args: original(change(scene), *args))
-    with pytest.raises(MrasfmError, match=r"trajectory\.gpkg was written but does not read back"):
-        write_scene(make_scene(), tmp_path / "scene", {})
-    assert_nothing_published(tmp_path / "scene")
+    write_scene(make_scene(), tmp_path / "scene", {})
+    assert_withheld(tmp_path / "scene", "trajectory.gpkg")
+
+
+@pytest.mark.parametrize("error", [ValueError("no"), OSError(28, "No space left on device")])
+def test_a_writer_that_fails_takes_its_file_alone_and_a_full_disk_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(scene: Scene, names: object, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise error
+
+    out = tmp_path / "scene"
+    write_scene(make_scene(), out, {})
+    monkeypatch.setattr(geopackage, "write_geopackage", fail)
+    if isinstance(error, OSError):
+        with pytest.raises(StorageError, match="No space left"):
+            write_scene(make_scene(), out, {})
+        assert (out / "trajectory.gpkg").exists()  # the older one, with its own report
+        return
+    write_scene(make_scene(), out, {})
+    assert not (out / "trajectory.gpkg").exists()  # not even the older one
+    assert withheld_files(out) == ["trajectory.gpkg is withheld: it cannot be written: ValueError: no"]
