@@ -74,6 +74,21 @@ def test_every_flipped_bit_is_found(tmp_path: Path, file: str) -> None:
         assert not agrees(scene, path.parent), at
 
 
+def test_parts_of_it_are_written_and_read_at_one_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_scene()
+    write_autoware(scene, tmp_path / "whole")
+    monkeypatch.setattr(autoware, "BLOCK", 7)
+    monkeypatch.setattr(autoware_readback, "BATCH", 11)
+    write_autoware(scene, tmp_path / "parts")
+    written, whole = (tmp_path / folder / autoware.POINTS for folder in ("parts", "whole"))
+    assert written.read_bytes() == whole.read_bytes()
+    sizes = [len(rows) for rows in autoware_readback.read_pcd(written).points()]
+    assert (max(sizes), sum(sizes)) == (11, len(scene.points_m))
+    assert agrees(scene, tmp_path / "parts")
+    written.write_bytes(whole.read_bytes()[:-16])
+    assert not agrees(scene, tmp_path / "parts")
+
+
 def agrees(scene: Scene, folder: Path) -> bool:
     try:
         rows = [
