@@ -50,6 +50,20 @@ def calibration_priors(
     expected
         What other drives of its vehicle let a scene's cameras expect, by scene.
     """
+    priors = _all_priors(assembly, free_units, config, expected)
+    return [] if _too_many(priors, free_units) else priors
+
+
+def _too_many(priors: Sequence[CameraPosePrior], free_units: Bools) -> bool:
+    """Return whether the cameras of these priors and the free units (u,) are more than the solver can hold."""
+    refined = sum(len(prior.camera) for prior in priors)
+    return refined * (int(free_units.sum()) + refined) > MAX_COUPLINGS
+
+
+def _all_priors(
+    assembly: Assembly, free_units: Bools, config: BundleAdjustmentConfig, expected: Mapping[int, Expected]
+) -> list[CameraPosePrior]:
+    """Priors as `calibration_priors` makes them, however many they are."""
     if not config.refine_calibration:
         return []
     priors = []
@@ -78,8 +92,7 @@ def calibration_priors(
                 camera=number, rotation=poses[:, :3, :3], position_m=poses[:, :3, 3], sigma=known, held=held
             )
         )
-    refined = sum(len(prior.camera) for prior in priors)
-    return priors if refined * (int(free_units.sum()) + refined) <= MAX_COUPLINGS else []
+    return priors
 
 
 def _with_expected(
@@ -145,6 +158,8 @@ class MapCalibrations:
         Their priors.
     learning
         Indices of the scenes whose calibration learns from other drives.
+    too_many
+        The cameras and units are too many for the solver: no drive learns from others.
     """
 
     free_units: Bools
@@ -152,6 +167,7 @@ class MapCalibrations:
     free_intrinsics: Bools
     terms: Sequence[CameraPosePrior | IntrinsicsPrior]
     learning: tuple[int, ...] = ()
+    too_many: bool = False
 
     def at_priors(self, state: State) -> State:
         """The state with cameras where their priors have them: from far off a prior hardly counts."""
@@ -172,17 +188,25 @@ def map_calibrations(
     expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
     learning = tuple(k for k, told in expected.items() if told.learns)
     more = free_units | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
-    priors = calibration_priors(assembly, state, more, config, expected)
+    priors = _all_priors(assembly, more, config, expected)
+    too_many = _too_many(priors, more)
     cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     intrinsics = np.zeros((len(cameras), INTRINSICS), dtype=np.bool_)
-    if not priors:  # too many for the solver, or none is to vary
+    if too_many or not priors:
         more, priors = free_units, calibration_priors(assembly, state, free_units, config)
         expected, learning = {}, ()
     for prior in priors:
         cameras[prior.camera] = True
     focal, intrinsics[:, 0] = _focal_prior(assembly, state, more, cameras, expected)
     terms: list[CameraPosePrior | IntrinsicsPrior] = [*priors, *([focal] if intrinsics.any() else [])]
-    return MapCalibrations(free_units=more, cameras=cameras, free_intrinsics=intrinsics, terms=terms, learning=learning)
+    return MapCalibrations(
+        free_units=more,
+        cameras=cameras,
+        free_intrinsics=intrinsics,
+        terms=terms,
+        learning=learning,
+        too_many=too_many,
+    )
 
 
 def _share_left(assembly: Assembly, free_units: Bools, k: int) -> float:

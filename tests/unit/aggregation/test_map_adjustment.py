@@ -334,7 +334,9 @@ def test_focal_lengths_that_another_drive_observed(street: Street, folder: Path)
     assert np.median(asked.model.errors_px) < np.median(not_asked.model.errors_px)
 
 
-def test_focal_lengths_of_scenes_that_take_no_part_stay(street: Street, folder: Path) -> None:
+def test_focal_lengths_of_scenes_that_take_no_part_stay(
+    street: Street, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """None of the second drive's units vary, and it knows its cameras as well as the first one does."""
     drives = [
         with_focal(
@@ -354,6 +356,10 @@ def test_focal_lengths_of_scenes_that_take_no_part_stay(street: Street, folder: 
     moved = np.abs(found.at_priors(state).camera_params - state.camera_params).max(1)
     assert (moved[:4] > 1e-5).all()
     assert (moved[4:] == 0.0).all()
+    assert not found.too_many
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 10)
+    found = map_calibrations(assembly, state, free, vehicles, config)
+    assert (found.too_many, found.learning, found.cameras.any()) == (True, (), False)
 
 
 @pytest.mark.parametrize("names", [("van-7", "van-8"), ("van-7", None), (None, None)])

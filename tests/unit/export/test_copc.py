@@ -20,7 +20,7 @@ from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import COPC_FILE
-from tests.helpers.export_example import assert_withheld, make_scene, scene_with_road, street_of_points
+from tests.helpers.export_example import assert_withheld, make_scene, withheld_files, scene_with_road, street_of_points
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +226,9 @@ def test_a_point_too_far_away_withholds_the_file(tmp_path: Path) -> None:
     assert not (out / COPC_FILE).exists()
     note = json.loads((out / "report.json").read_text())["summary"]["notes"][-1]
     assert note == "points.copc.laz is withheld: it holds points up to 200 km from the origin"
+    none = {name: getattr(scene, name)[:0] for name in vars(scene) if name.startswith(("point", "observation_"))}
+    write_scene(replace(scene, **none), out, {})
+    assert withheld_files(out) == []
     far[3:5] = [140_000.0, -140_000.0, 0.0], [-140_000.0, 140_000.0, 0.0]
     write_scene(replace(scene, points_m=far), out, {})
     assert np.ptp(laspy.read(out / COPC_FILE).x) == pytest.approx(280_000, rel=0.05)
