@@ -380,8 +380,8 @@ class DriveManifest(_Model):
     name: Annotated[str, Field(min_length=1, max_length=200)] = Field(description="what results are called")
     vehicle: Vehicle | None = Field(
         None,
-        description="since version 2: which vehicle drove, by its fleet number or another name without spaces; drives of one "
-        "vehicle share what they tell of its calibration",
+        description="since version 2: which vehicle drove, by its fleet number or another name without spaces; drives "
+        "of one vehicle share what they tell of its calibration",
     )
     rig: Rig = Field(description="the vehicle's cameras")
     frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()] = Field(

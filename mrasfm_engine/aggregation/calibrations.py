@@ -126,7 +126,7 @@ def _combined(told: Expected, left: float) -> tuple[Floats, Floats]:
 def _focal_prior(
     assembly: Assembly, state: State, free_units: Bools, cameras: Bools, expected: Mapping[int, Expected]
 ) -> tuple[IntrinsicsPrior, Bools]:
-    """Prior of the focal lengths that other drives of a vehicle observed, and which (c,) of the `cameras` (c,) they did.
+    """Prior of the focal lengths that other drives of a vehicle observed, and of which of the `cameras` (c,).
 
     The others keep what their scenes found.
     """

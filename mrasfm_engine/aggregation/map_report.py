@@ -102,10 +102,8 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
         run.found(
             warning(
                 "calibrations-not-shared",
-                "the cameras and units of the map are too many to refine its calibrations together: they keep what their "
-                "scenes found"
-                + ("" if result.adjusted.free_cameras else " and stay there")
-                + ", and no drive learns from others of its vehicle",
+                "the cameras and units of the map are too many: no drive learns from others of its vehicle"
+                + ("" if result.adjusted.free_cameras else ", and calibrations stay as their scenes found them"),
                 "Make several maps of fewer drives if their scenes' calibrations are uncertain.",
             )
         )

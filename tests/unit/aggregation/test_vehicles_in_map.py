@@ -66,7 +66,7 @@ def test_a_map_too_large_to_share_calibrations_says_so(
     assert document["vehicles"][0]["learning"] == []
     (finding,) = report["findings"]
     assert finding["code"] == "calibrations-not-shared"
-    assert "stay there, and no drive learns" in finding["what"]
+    assert "no drive learns from others of its vehicle, and calibrations stay" in finding["what"]
 
 
 def test_of_two_drives_either_may_be_the_odd_one(folders: dict[str, Path], tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import COPC_FILE
-from tests.helpers.export_example import assert_withheld, make_scene, withheld_files, scene_with_road, street_of_points
+from tests.helpers.export_example import assert_withheld, make_scene, scene_with_road, street_of_points, withheld_files
 
 
 @pytest.fixture(scope="module")
