@@ -96,7 +96,7 @@ class ReadBack:
                 _refuse(path, fault)
 
     def fault(self, check: Check) -> str | None:
-        """What is wrong with a file; None where it says what it must say.
+        """The fault of a file in words; None where it says what it must say.
 
         Raises
         ------

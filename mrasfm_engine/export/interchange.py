@@ -80,7 +80,7 @@ class Interchange:
         return notes
 
     def _parts(self) -> Iterator[_Part]:
-        """What is to be written of this scene."""
+        """Files and folders that this scene has."""
         scene = self.scene
         yield _Part(path=TRAJECTORY_FILE, write=self._write_trajectory, checks=self._trajectory_checks)
         for rig, prefix in self.rigs.items():
