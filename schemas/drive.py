@@ -61,7 +61,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=1e6)]
 TimestampUs = Annotated[int, Field(ge=0, le=2**62, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-VEHICLE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$"
+MAX_VEHICLE_CHARACTERS = 64
+VEHICLE_PATTERN = rf"^[A-Za-z0-9][A-Za-z0-9_.:-]{{0,{MAX_VEHICLE_CHARACTERS - 1}}}$"
 Vehicle = Annotated[str, Field(pattern=VEHICLE_PATTERN)]
 
 
@@ -379,8 +380,8 @@ class DriveManifest(_Model):
     name: Annotated[str, Field(min_length=1, max_length=200)] = Field(description="what results are called")
     vehicle: Vehicle | None = Field(
         None,
-        description="since version 2: which vehicle drove, as its number plate or fleet number; drives of one vehicle "
-        "share what they tell of its calibration",
+        description="since version 2: which vehicle drove, by its fleet number or another name without spaces; drives "
+        "of one vehicle share what they tell of its calibration",
     )
     rig: Rig = Field(description="the vehicle's cameras")
     frames: Annotated[list[Frame], Field(min_length=1, max_length=MAX_FRAMES), FailFast()] = Field(

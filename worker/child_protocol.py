@@ -41,7 +41,7 @@ class Attempt:
     failed, members
         Of an aggregation: drives that have no scene, for its report, and what that calls those that have one, by name.
     leave_out
-        Of an aggregation: whether a scene that fits into no map does not take the others with it.
+        Of an aggregation: whether a scene that fits into no map, or a component, does not take the others with it.
     submap_workers
         Of a reconstruction: number of workers that a long drive is cut for. With less than 2 it is not cut: the child
         does all of it.

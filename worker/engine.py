@@ -132,6 +132,7 @@ def _aggregate(
         into=request.into,
         remove=request.remove,
         leave_out=request.leave_out,
+        require_components=not request.leave_out,
         progress=progress,
         cancel=cancelled,
         complete_report=complete,

@@ -38,8 +38,8 @@ def calibration_priors(
 
     They are the drives that have units that vary and whose scenes refined it, or of whose vehicle others did. A scene's
     certainty rests on all its units; observations of those that vary count in the adjustment anyway, so only the
-    others' share is kept. In a map of very many drives calibrations stay as their scenes found them, as they do where
-    the settings hold them.
+    others' share is kept. That of a smaller component rests on the largest one's units, and all of it is kept. In a map
+    of very many drives calibrations stay as their scenes found them, as they do where the settings hold them.
 
     Parameters
     ----------
@@ -50,12 +50,28 @@ def calibration_priors(
     expected
         What other drives of its vehicle let a scene's cameras expect, by scene.
     """
+    priors = _all_priors(assembly, free_units, config, expected)
+    return [] if _too_many(priors, free_units) else priors
+
+
+def _too_many(priors: Sequence[CameraPosePrior], free_units: Bools) -> bool:
+    """Return whether the cameras of these priors and the free units (u,) are more than the solver can hold."""
+    refined = sum(len(prior.camera) for prior in priors)
+    return refined * (int(free_units.sum()) + refined) > MAX_COUPLINGS
+
+
+def _all_priors(
+    assembly: Assembly, free_units: Bools, config: BundleAdjustmentConfig, expected: Mapping[int, Expected]
+) -> list[CameraPosePrior]:
+    """Priors as `calibration_priors` makes them, however many they are."""
     if not config.refine_calibration:
         return []
     priors = []
     for k, scene in enumerate(assembly.scenes):
-        vary, told = _share_that_varies(assembly, free_units, k), expected.get(k)
-        if not vary or (scene.certainty_of_cameras is None and told is None):
+        told = expected.get(k)
+        if not (free_units & (assembly.scene_of_unit == k)).any() or (
+            scene.certainty_of_cameras is None and told is None
+        ):
             continue
         cameras = scene.drive.cameras
         given = np.column_stack(
@@ -65,7 +81,7 @@ def calibration_priors(
             ]
         ).repeat(3, axis=1)
         sigma, observed = scene.certainty_of_cameras or (given, np.zeros(given.shape, dtype=np.bool_))
-        left = max(1.0 - vary, 1e-12)
+        left = _share_left(assembly, free_units, k)
         known = np.where(observed, np.minimum(sigma / np.sqrt(left), given), given)
         number = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
         poses, held = scene.drive.rig_from_cam, ~observed
@@ -76,8 +92,7 @@ def calibration_priors(
                 camera=number, rotation=poses[:, :3, :3], position_m=poses[:, :3, 3], sigma=known, held=held
             )
         )
-    refined = sum(len(prior.camera) for prior in priors)
-    return priors if refined * (int(free_units.sum()) + refined) <= MAX_COUPLINGS else []
+    return priors
 
 
 def _with_expected(
@@ -109,17 +124,21 @@ def _combined(told: Expected, left: float) -> tuple[Floats, Floats]:
 
 
 def _focal_prior(
-    assembly: Assembly, state: State, free_units: Bools, expected: Mapping[int, Expected]
+    assembly: Assembly, state: State, free_units: Bools, cameras: Bools, expected: Mapping[int, Expected]
 ) -> tuple[IntrinsicsPrior, Bools]:
-    """Prior of the focal lengths that other drives of a vehicle observed, and the cameras (c,) of which they did."""
+    """Prior of the focal lengths that other drives of a vehicle observed, and of which of the `cameras` (c,).
+
+    The others keep what their scenes found.
+    """
     params, sigma = state.camera_params.copy(), np.ones((len(state.camera_params), INTRINSICS))
     observed = np.zeros(len(params), dtype=np.bool_)
     for k, told in expected.items():
-        mean, own_sigma = _combined(told, 1.0 - _share_that_varies(assembly, free_units, k))
+        mean, own_sigma = _combined(told, _share_left(assembly, free_units, k))
         rows = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
-        observed[rows] = np.isfinite(own_sigma[:, 6])
-        params[rows, :2] *= np.exp(mean[:, 6:])
-        sigma[rows, 0] = np.where(observed[rows], own_sigma[:, 6], 1.0)
+        says = np.isfinite(own_sigma[:, 6]) & cameras[rows]
+        params[rows[says], :2] *= np.exp(mean[says, 6:])
+        sigma[rows[says], 0] = own_sigma[says, 6]
+        observed[rows] = says
     return IntrinsicsPrior(params=params, sigma=sigma), observed
 
 
@@ -139,6 +158,8 @@ class MapCalibrations:
         Their priors.
     learning
         Indices of the scenes whose calibration learns from other drives.
+    too_many
+        The cameras and units are too many for the solver: no drive learns from others.
     """
 
     free_units: Bools
@@ -146,6 +167,7 @@ class MapCalibrations:
     free_intrinsics: Bools
     terms: Sequence[CameraPosePrior | IntrinsicsPrior]
     learning: tuple[int, ...] = ()
+    too_many: bool = False
 
     def at_priors(self, state: State) -> State:
         """The state with cameras where their priors have them: from far off a prior hardly counts."""
@@ -166,21 +188,33 @@ def map_calibrations(
     expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
     learning = tuple(k for k, told in expected.items() if told.learns)
     more = free_units | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
-    priors = calibration_priors(assembly, state, more, config, expected)
+    priors = _all_priors(assembly, more, config, expected)
+    too_many = _too_many(priors, more)
     cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     intrinsics = np.zeros((len(cameras), INTRINSICS), dtype=np.bool_)
-    if not priors:  # too many for the solver, or none is to vary
+    if too_many or not priors:
         more, priors = free_units, calibration_priors(assembly, state, free_units, config)
         expected, learning = {}, ()
     for prior in priors:
         cameras[prior.camera] = True
-    focal, observed = _focal_prior(assembly, state, more, expected)
-    intrinsics[:, 0] = observed & cameras
+    focal, intrinsics[:, 0] = _focal_prior(assembly, state, more, cameras, expected)
     terms: list[CameraPosePrior | IntrinsicsPrior] = [*priors, *([focal] if intrinsics.any() else [])]
-    return MapCalibrations(free_units=more, cameras=cameras, free_intrinsics=intrinsics, terms=terms, learning=learning)
+    return MapCalibrations(
+        free_units=more,
+        cameras=cameras,
+        free_intrinsics=intrinsics,
+        terms=terms,
+        learning=learning,
+        too_many=too_many,
+    )
 
 
-def _share_that_varies(assembly: Assembly, free_units: Bools, k: int) -> float:
-    """Share of a scene's registered units that are among the free ones (u,)."""
+def _share_left(assembly: Assembly, free_units: Bools, k: int) -> float:
+    """Share, above zero, of the units that a scene's calibration rests on that are not among the free ones (u,).
+
+    The calibration of a smaller component is the largest one's and rests on none of the component's own units.
+    """
+    if assembly.scenes[k].calibration.get("from_component") is not None:
+        return 1.0
     units = assembly.scene_of_unit == k
-    return float((free_units & units).sum() / max((assembly.registered & units).sum(), 1))
+    return max(1.0 - float((free_units & units).sum() / max((assembly.registered & units).sum(), 1)), 1e-12)

@@ -306,12 +306,17 @@ def _point_classes(path: Path, count: int) -> Bytes:
     return np.ascontiguousarray(rows["class"])
 
 
+def _uri(database: Path) -> str:
+    """SQLite's URI of a database that nobody writes; its folder may have any name."""
+    return f"{database.resolve().as_uri()}?mode=ro&immutable=1"
+
+
 def _keypoints(
     folder: Path, model: Mapping[int, ModelImage], images: int, points: int
 ) -> tuple[Ints, Floats32, Ints, Bytes]:
     """First keypoint of every image, positions, points, and the descriptors of keypoints with a point, as bytes."""
     counts, xy, point, descriptors = np.zeros(images, dtype=np.int64), [], [], []
-    with closing(sqlite3.connect(f"file:{folder / 'features.db'}?mode=ro&immutable=1", uri=True)) as db:
+    with closing(sqlite3.connect(_uri(folder / "features.db"), uri=True)) as db:
         for i in range(images):
             found = model.get(i)
             if found is None:

@@ -53,6 +53,7 @@ class AdjustedMap:
     free_units: int
     free_cameras: int
     learning: tuple[int, ...]  # scenes whose calibration took what other drives of their vehicle observed
+    too_many_cameras: bool  # for the solver: no scene learns, or even varies its calibration
     dropped_observations: int
     dropped_points: int
 
@@ -133,6 +134,7 @@ def adjust_map(
         free_units=int(free.sum()),
         free_cameras=int(cameras.sum()),
         learning=calibrations.learning,
+        too_many_cameras=calibrations.too_many,
         dropped_observations=observations,
         dropped_points=points_dropped,
     )

@@ -98,6 +98,15 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
     for vehicle in result.vehicles:
         for one in vehicle.knocked:
             run.found(_knocked(vehicle, one, [scene.name for scene in result.scenes]))
+    if result.adjusted.too_many_cameras:
+        run.found(
+            warning(
+                "calibrations-not-shared",
+                "the cameras and units of the map are too many: no drive learns from others of its vehicle"
+                + ("" if result.adjusted.free_cameras else ", and calibrations stay as their scenes found them"),
+                "Make several maps of fewer drives if their scenes' calibrations are uncertain.",
+            )
+        )
     names = result.unconnected
     if len(names) == len(result.scenes):
         refused = any(seam.accepted for seam in result.found_seams)

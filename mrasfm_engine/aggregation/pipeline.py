@@ -40,6 +40,7 @@ def aggregate(
     into: Path | None = None,
     remove: Sequence[str] = (),
     leave_out: bool = False,
+    require_components: bool = False,
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
     complete_report: Callable[[dict[str, Any]], None] = lambda report: None,
@@ -60,6 +61,9 @@ def aggregate(
     leave_out
         Make the map without scenes that can be in none, for being damaged, or placed nowhere on the earth; the report
         says which and why under `left_out`. Else they are errors, as they are where nothing new is left.
+    require_components
+        A smaller component of a drive that nothing places is an error, too. Else the report names it. One that is too
+        small to be a scene is only named.
     progress
         Called as progress(stage, done, total).
     cancel
@@ -92,7 +96,14 @@ def aggregate(
     known = stages.association(run, found)
     seams = stages.seams(run, found, known)
     graph, loops, chains = _graph(found, known, seams, config)
-    kept = stages.without_unplaced(run, found, seams, [chain.scenes for chain in chains], leave_out=leave_out)
+    kept = stages.without_unplaced(
+        run,
+        found,
+        seams,
+        [chain.scenes for chain in chains],
+        leave_out=leave_out,
+        require_components=require_components,
+    )
     if len(kept) < len(found):
         found, known = [found[k] for k in kept], known.of_scenes(kept)
         names = {scene.name for scene in found}

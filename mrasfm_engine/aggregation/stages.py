@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from schemas.artifacts import (
 from schemas.findings import Finding, as_json, listed, warning
 
 FAR_APART_M = 50_000.0
-MIN_SCENES = 2
+MIN_DRIVES = 2
 SEAM_VERSION = 1  # see `mrasfm_engine.stages.VERSIONS`
 
 
@@ -110,7 +110,7 @@ def scenes(
                 raise
             unfit[name] = error
         run.progress(Stage.SCENES, done, len(coming))
-    if unfit and (len(unfit) == len(coming) or len(result) < MIN_SCENES):
+    if unfit and (len(unfit) == len(coming) or _drives(result) < MIN_DRIVES):
         raise next(iter(unfit.values()))
     for name, unfit_because in unfit.items():
         _leave_out(run, name, unfit_because)
@@ -136,6 +136,11 @@ def _is_small_component(name: str, error: InputError) -> bool:
     return name != drive_of_scene(name) and error.code == "empty-scene"
 
 
+def _drives(scenes: Iterable[SourceScene]) -> int:
+    """Count the drives that scenes are of: components of one drive count once."""
+    return len({drive_of_scene(scene.name) for scene in scenes})
+
+
 def _leave_out(run: Run, name: str, because: InputError) -> None:
     """Note that a scene is not in the map."""
     run.report["left_out"].append({"scene": name, "code": because.code, "what": because.what, "remedy": because.remedy})
@@ -149,6 +154,7 @@ def without_unplaced(
     chains: Iterable[Sequence[int]],
     *,
     leave_out: bool,
+    require_components: bool,
 ) -> list[int]:
     """Indices of the scenes that the map can place: by positions, or by seams with scenes that have some.
 
@@ -158,20 +164,23 @@ def without_unplaced(
     ----------
     chains
         Indices of scenes that seams connect.
+    leave_out, require_components
+        See `pipeline.aggregate`.
 
     Raises
     ------
     InputError
-        Where nothing places a drive that must not be left out, or fewer scenes are left than a map needs.
+        Where nothing places a scene that must not be left out, or fewer drives are left than a map needs.
     """
     lost = sorted(k for chain in chains if not any(found[i].is_placed for i in chain) for k in chain)
     errors = {k: not_georeferenced(found[k].name, f", and no seam places it: {_tried(found[k], seams)}") for k in lost}
     for k, error in errors.items():
-        if not leave_out and found[k].name == drive_of_scene(found[k].name):
+        is_component = found[k].name != drive_of_scene(found[k].name)
+        if require_components if is_component else not leave_out:
             raise error
         _leave_out(run, found[k].name, error)
     kept = [k for k in range(len(found)) if k not in errors]
-    if errors and len(kept) < MIN_SCENES:
+    if errors and _drives(found[k] for k in kept) < MIN_DRIVES:
         raise next(iter(errors.values()))
     return kept
 
@@ -240,10 +249,10 @@ def map_document(folder: Path) -> dict[str, Any]:
 
 def _check_together(run: Run, found: Sequence[SourceScene]) -> None:
     """Refuse scenes that cannot be in one map; say what is unusual."""
-    if len(found) < MIN_SCENES:
+    if _drives(found) < MIN_DRIVES:
         raise InputError(
-            f"a map needs {MIN_SCENES} scenes, this would have {len(found)}",
-            remedy="Give more scenes; a scene by itself needs no map.",
+            f"a map needs {MIN_DRIVES} drives, this would have {_drives(found)}",
+            remedy="Give scenes of more drives; a drive by itself needs no map, whatever components it has.",
             code="one-scene",
         )
     for k, scene in enumerate(found):
@@ -317,6 +326,7 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
     started = time.perf_counter()
     run.begin(Stage.ASSOCIATION)
     result = associate(found, run.config.aggregation)
+    result = replace(result, pairs=tuple(sorted({*result.pairs, *_pairs_with_seams(run.into, found)})))
     middle = np.array([m[:3, 3] for m in result.map_from_scene])
     if np.nanmax(np.abs(middle - middle[result.reference])) > FAR_APART_M:
         run.found(
@@ -328,6 +338,20 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
         )
     run.ended(Stage.ASSOCIATION, started, reference=found[result.reference].name, pairs=len(result.pairs))
     return result
+
+
+def _pairs_with_seams(into: Path | None, found: Sequence[SourceScene]) -> list[tuple[int, int]]:
+    """Pairs of scenes that seams of the map join already.
+
+    Scenes that are added fill the lists of candidates: what rests on a seam would lose its place to them.
+    """
+    document = None if into is None else map_document(into)
+    if document is None:
+        return []
+    of_map = {entry["name"]: entry["fingerprint"] for entry in document["scenes"]}
+    row = {scene.name: k for k, scene in enumerate(found) if of_map.get(scene.name) == scene.fingerprint}
+    ends = [(seam["a"], seam["b"]) for seam in document["seams"] if seam["accepted"]]
+    return [(min(row[a], row[b]), max(row[a], row[b])) for a, b in ends if a in row and b in row]
 
 
 def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Seam]:

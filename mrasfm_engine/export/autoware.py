@@ -14,6 +14,7 @@ import numpy as np
 from mrasfm_engine.scene.scene import Scene
 
 POINTS, PROJECTOR = "pointcloud_map.pcd", "map_projector_info.yaml"
+BLOCK = 500_000  # points that are in memory at one time
 
 
 def fits(scene: Scene) -> bool:
@@ -27,17 +28,20 @@ def write_autoware(scene: Scene, folder: Path) -> None:
     (folder / PROJECTOR).write_text(projector_text(scene), encoding="ascii")
     place = scene.georeference
     assert place is not None
-    # PCL's points with colours: 32 bits each, the colours' bits as those of a float
-    rows = np.zeros(len(scene.points_m), dtype=[("xyz", "<f4", 3), ("bgr", "u1", 3), ("zero", "u1")])
-    rows["xyz"] = scene.points_m + np.array([0.0, 0.0, place.origin_ellipsoidal_height_m])
-    rows["bgr"] = scene.point_colors[:, ::-1]
+    count = len(scene.points_m)
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\n"
-        f"COUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+        f"COUNT 1 1 1 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
     )
     with (folder / POINTS).open("wb") as file:
         file.write(header.encode("ascii"))
-        file.write(rows.tobytes())
+        for first in range(0, count, BLOCK):
+            block = slice(first, first + BLOCK)
+            # PCL's points with colours: 32 bits each, the colours' bits as those of a float
+            rows = np.zeros(len(scene.points_m[block]), dtype=[("xyz", "<f4", 3), ("bgr", "u1", 3), ("zero", "u1")])
+            rows["xyz"] = scene.points_m[block] + np.array([0.0, 0.0, place.origin_ellipsoidal_height_m])
+            rows["bgr"] = scene.point_colors[block, ::-1]
+            file.write(rows.tobytes())
 
 
 def projector_text(scene: Scene) -> str:

@@ -88,15 +88,33 @@ class ReadBack:
         """
         for check in checks:
             path = self._folder / check.file
-            self._covered.add(check.file)
             try:
-                for row in check.compare(check.read(path)):
-                    if not row.agrees:
-                        _refuse(path, row.difference)
-            except MrasfmError:
-                raise
-            except Exception as error:
-                _refuse(path, f"{type(error).__name__}: {error}")
+                fault = self.fault(check)
+            except OSError as error:
+                fault = f"{type(error).__name__}: {error}"
+            if fault is not None:
+                _refuse(path, fault)
+
+    def fault(self, check: Check) -> str | None:
+        """The fault of a file in words; None where it says what it must say.
+
+        Raises
+        ------
+        OSError
+            Where a file that is there cannot be read.
+        """
+        self._covered.add(check.file)
+        try:
+            for row in check.compare(check.read(self._folder / check.file)):
+                if not row.agrees:
+                    return row.difference
+        except FileNotFoundError:
+            return "it is missing"
+        except (MrasfmError, OSError):
+            raise
+        except Exception as error:
+            return f"{type(error).__name__}: {error}"
+        return None
 
     def require_all(self) -> None:
         """Refuse a folder that holds a file which no check has read.

@@ -75,9 +75,17 @@ def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path) -> 
 
 
 def _positions(scene: Scene, poses: Floats) -> Floats:
-    """Origins (n, 3) of poses (n, 4, 4) in the file's system: longitude, latitude and height, or local coordinates."""
-    geodetic = geodetic_positions(scene, poses)
-    return poses[:, :3, 3] if geodetic is None else geodetic[:, [1, 0, 2]]
+    """Origins (n, 3) of poses (n, 4, 4) in the file's system: longitude, latitude and height, or local coordinates.
+
+    Across the antimeridian longitudes go on beyond 180 deg, on the side of the scene's origin: lines and extents would
+    reach around the earth.
+    """
+    geodetic, place = geodetic_positions(scene, poses), scene.georeference
+    if geodetic is None or place is None:
+        return poses[:, :3, 3]
+    places: Floats = geodetic[:, [1, 0, 2]]
+    places[:, 0] -= 360.0 * np.rint((places[:, 0] - place.origin_longitude_deg) / 360.0)
+    return places
 
 
 def _date(timestamp_us: int) -> str | None:

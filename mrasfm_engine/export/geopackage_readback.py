@@ -35,7 +35,7 @@ def read_geopackage(path: Path) -> Select:
     """A function from SQL to all rows."""
 
     def select(sql: str) -> list[tuple[Any, ...]]:
-        with closing(sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)) as db:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as db:
             return db.execute(sql).fetchall()
 
     return select
@@ -140,9 +140,18 @@ def _path(scene: Scene, of_scene: NDArray[np.bool_]) -> Ints:
 
 
 def _places(scene: Scene, poses: Floats) -> Floats:
-    """Origins of poses as `poses.json` has them, as x, y, z; its own check compares them with the poses."""
+    """Origins of poses as `poses.json` has them, as x, y, z; its own check compares them with the poses.
+
+    Longitudes are those within 180 deg of the origin's.
+    """
     geodetic = geodetic_positions(scene, poses)
-    return poses[:, :3, 3] if geodetic is None else geodetic[:, [1, 0, 2]]
+    if geodetic is None:
+        return poses[:, :3, 3]
+    assert scene.georeference is not None
+    latitude, longitude, height = geodetic.T
+    east = longitude - scene.georeference.origin_longitude_deg
+    longitude = np.where(east > 180.0, longitude - 360.0, np.where(east < -180.0, longitude + 360.0, longitude))
+    return np.stack([longitude, latitude, height], -1)
 
 
 def _srs(scene: Scene) -> int:

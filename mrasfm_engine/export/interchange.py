@@ -1,12 +1,17 @@
-"""The files of a scene or map in formats of other programs: what is written, and how it is read back."""
+"""The files of a scene or map in formats of other programs: what is written, and how it is read back.
+
+Nothing of the scene rests on them. One that cannot be written, or does not read back, is withheld and named.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from mrasfm_engine.errors import StorageError
 from mrasfm_engine.export import (
     autoware,
     autoware_readback,
@@ -17,11 +22,31 @@ from mrasfm_engine.export import (
     rig_files,
     rig_files_readback,
 )
-from mrasfm_engine.export.check import Check
+from mrasfm_engine.export.check import Check, ReadBack
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, TRAJECTORY_FILE
+from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE
 
-OPTIONAL = (COPC_FILE, AUTOWARE_FOLDER)  # not of every scene
+OPTIONAL = (COPC_FILE, AUTOWARE_FOLDER, TRAJECTORY_FILE, RIG_FOLDER, RIGS_FOLDER)  # not of every scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """A file or folder below the result's folder.
+
+    Attributes
+    ----------
+    write
+        Writes it; what it lacks, and why.
+    checks
+        Checks of what was written.
+    is_whole
+        The files of a folder belong together: none is kept without the others.
+    """
+
+    path: str
+    write: Callable[[Path], Sequence[str]]
+    checks: Callable[[], Iterable[Check]]
+    is_whole: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,32 +57,93 @@ class Interchange:
     scene_of_unit: Sequence[str]  # name of the scene that each unit is of
     rigs: Mapping[str, str]  # folders, and what the names of their cameras begin with
 
-    def write(self, folder: Path) -> list[str]:
-        """Write the files into a scene's or map's folder; which are withheld, and why."""
-        geopackage.write_geopackage(self.scene, self.scene_of_unit, folder / TRAJECTORY_FILE)
-        notes = []
-        for rig, prefix in self.rigs.items():
-            lacking = rig_files.write_rig(rig_files.rig_cameras(self.scene, prefix), folder / rig)
-            notes += [f"{rig}/{what}" for what in lacking]
-        if autoware.fits(self.scene):
-            autoware.write_autoware(self.scene, folder / AUTOWARE_FOLDER)
-        if copc.fits(self.scene):
-            copc.write_copc(self.scene, folder / COPC_FILE)
-        else:
+    def write(self, folder: Path, read_back: ReadBack) -> list[str]:
+        """Write the files into a scene's or map's folder and read them back; which are withheld, and why.
+
+        Raises
+        ------
+        OSError, StorageError
+            Where the disk is full or cannot be written or read.
+        """
+        notes: list[str] = []
+        for part in self._parts():
+            try:
+                notes += [f"{part.path}/{what}" for what in part.write(folder / part.path)]
+                notes += _withheld(part, folder, read_back)
+            except (OSError, StorageError):
+                raise
+            except Exception as error:
+                _remove(folder / part.path, folder)
+                notes.append(f"{part.path} is withheld: it cannot be written: {type(error).__name__}: {error}")
+        if len(self.scene.points_m) and not copc.fits(self.scene):
             notes += [f"{COPC_FILE} is withheld: it holds points up to {copc.REACH_M / 1000:.0f} km from the origin"]
         return notes
 
-    def checks(self) -> list[Check]:
-        """Checks of what `write` writes."""
+    def _parts(self) -> Iterator[_Part]:
+        """Files and folders that this scene has."""
         scene = self.scene
-        points = Check(COPC_FILE, copc_readback.read_copc, partial(copc_readback.copc, scene))
-        trajectory = partial(geopackage_readback.geopackage, scene, self.scene_of_unit)
-        return [
-            *([points] if copc.fits(scene) else []),
-            Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, trajectory),
-            *(check for rig, prefix in self.rigs.items() for check in _rig_checks(scene, rig, prefix)),
-            *(_autoware_checks(scene) if autoware.fits(scene) else []),
-        ]
+        yield _Part(path=TRAJECTORY_FILE, write=self._write_trajectory, checks=self._trajectory_checks)
+        for rig, prefix in self.rigs.items():
+            write = partial(_write_rig, scene, prefix)
+            yield _Part(path=rig, write=write, checks=partial(_rig_checks, scene, rig, prefix), is_whole=False)
+        if autoware.fits(scene):
+            yield _Part(
+                path=AUTOWARE_FOLDER, write=partial(_write_autoware, scene), checks=partial(_autoware_checks, scene)
+            )
+        if copc.fits(scene):
+            yield _Part(path=COPC_FILE, write=partial(_write_copc, scene), checks=partial(_copc_checks, scene))
+
+    def _write_trajectory(self, path: Path) -> Sequence[str]:
+        geopackage.write_geopackage(self.scene, self.scene_of_unit, path)
+        return ()
+
+    def _trajectory_checks(self) -> Iterator[Check]:
+        compare = partial(geopackage_readback.geopackage, self.scene, self.scene_of_unit)
+        yield Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, compare)
+
+
+def _withheld(part: _Part, folder: Path, read_back: ReadBack) -> Iterator[str]:
+    """Remove what does not read back of a part; its names, and why."""
+    for check in part.checks():
+        fault = read_back.fault(check)
+        if fault is None:
+            continue
+        path = part.path if part.is_whole else check.file
+        _remove(folder / path, folder)
+        which = "it" if path == check.file else Path(check.file).name
+        yield f"{path} is withheld: {which} was written but does not read back: {fault}"
+        if part.is_whole:
+            return
+
+
+def _remove(path: Path, folder: Path) -> None:
+    """Remove a file or folder, and the folders below `folder` that are empty then."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    for parent in path.parents:
+        if parent == folder or (parent.is_dir() and any(parent.iterdir())):
+            return
+        if parent.is_dir():
+            parent.rmdir()
+
+
+def _write_rig(scene: Scene, prefix: str, folder: Path) -> Sequence[str]:
+    return rig_files.write_rig(rig_files.rig_cameras(scene, prefix), folder)
+
+
+def _write_autoware(scene: Scene, folder: Path) -> Sequence[str]:
+    autoware.write_autoware(scene, folder)
+    return ()
+
+
+def _write_copc(scene: Scene, path: Path) -> Sequence[str]:
+    copc.write_copc(scene, path)
+    return ()
+
+
+def _copc_checks(scene: Scene) -> Iterator[Check]:
+    yield Check(COPC_FILE, copc_readback.read_copc, partial(copc_readback.copc, scene))
 
 
 def _rig_checks(scene: Scene, folder: str, prefix: str) -> Iterator[Check]:

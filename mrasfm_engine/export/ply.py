@@ -47,7 +47,7 @@ def write_ply(scene: Scene, path: Path) -> None:
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment metres in the local frame of frame.json\n"
         f"comment class: {classes}\ncomment road_patch: index into road.json's patches, -1 off the road\n"
-        "comment component: as report.json numbers them, 0 the largest\n"
+        "comment component: as report.json numbers a scene's and map.json a map's, 0 the largest\n"
         f"element vertex {n}\n{properties}end_header\n"
     )
     with path.open("wb") as file:

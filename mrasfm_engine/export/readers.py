@@ -102,7 +102,7 @@ def database(path: Path) -> Callable[[str], Iterator[Any]]:
 
 
 def _selected(path: Path, sql: str) -> Iterator[Any]:
-    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
         yield from db.execute(sql)
 
 

@@ -143,7 +143,7 @@ def _write(
     figures = write_common(scene, work, pictures, read_back)
     names = [scene.drive.manifest.name] * len(scene.unit_registered)
     others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
-    figures["notes"] += others.write(work)
+    figures["notes"] += others.write(work, read_back)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
     feature_database.write_features(scene, work / "features.db")
     if scene.road is not None:
@@ -155,7 +155,7 @@ def _write(
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
     write_json(work / COMPLETE_MARK, {**report, "summary": figures})
-    read_back.check([*_checks(scene, pictures), *others.checks()])
+    read_back.check(_checks(scene, pictures))
     read_back.require_all()
 
 

@@ -6,6 +6,7 @@ development kit. The rig frame is the dataset's ego frame: x forward, y left, z 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -20,12 +21,13 @@ from mrasfm_engine.importers.rig_folder import checked_camera
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.types import Floats
 from schemas import Camera
-from schemas.drive import Finite, RelativePath, Vector3, Vehicle
+from schemas.drive import MAX_VEHICLE_CHARACTERS, Finite, RelativePath, Vector3
 
 DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
 HAS_SCENES = True
 LIDAR = "LIDAR_TOP"
 FLAT_NOTE = "The truth is nuScenes' ego poses: they are plane (z = 0) and good to about 0.1 m; compare x and y apart."
+_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]+")
 MAX_TABLE_BYTES = 4_000_000_000  # sample_data.json of the full set has over 1 GB
 
 
@@ -42,7 +44,7 @@ class _Scene(_Row):
 
 
 class _Log(_Row):
-    vehicle: Vehicle | None = None
+    vehicle: Any = None
 
 
 class _Sample(_Row):
@@ -145,11 +147,13 @@ def read(folder: Path, scene: str | None = None) -> Recording:
 
 
 def _vehicle(scene: _Scene, tables: Path) -> str | None:
-    """The vehicle that the scene's log names, where the tables have one."""
+    """The vehicle that the scene's log names, where the tables have one, by a name that a manifest may have."""
     if scene.log_token is None or not (tables / "log.json").is_file():
         return None
     logs = _by_token(_table(tables, "log", _Log))
-    return logs[scene.log_token].vehicle if scene.log_token in logs else None
+    given = logs[scene.log_token].vehicle if scene.log_token in logs else None
+    found = _NOT_IN_A_NAME.sub("-", given if isinstance(given, str) else "").lstrip("_.:-")[:MAX_VEHICLE_CHARACTERS]
+    return found or None
 
 
 def scene_names(folder: Path) -> list[str]:

@@ -55,5 +55,7 @@ class AggregationRequest(RequestBody):
     )
     require_all: bool = Field(
         False,
-        description="fail where a drive cannot be reconstructed; by default the map is made of the others and says so",
+        description="fail where a drive cannot be reconstructed, or its scene or one of its smaller components cannot "
+        "be placed in the map (components too small to be a scene are only named); by default the map is made of the "
+        "others and says so",
     )

@@ -14,6 +14,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from schemas.artifacts import drive_of_scene
+
 if TYPE_CHECKING:
     from service.client import Client
     from service.client.display import Display
@@ -200,7 +202,7 @@ class _Demo:
             raise DemoError(f"job {job.id} {job.state}{why}. {self._log()}")
         version = client.map_version(job.map_id, job.map_version)
         scene_of = {scene.drive_id: scene.scene_id for scene in version.scenes}
-        self._name_of = {scene.drive_id: scene.name for scene in version.scenes}
+        self._name_of = {s.drive_id: s.name for s in version.scenes if s.name == drive_of_scene(s.name)}
         self._drive_ids = drive_ids
         with self._timed("download"):
             for number, drive_id in zip(self._numbers, drive_ids, strict=True):

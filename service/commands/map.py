@@ -40,7 +40,9 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--remove", action="append", default=[], metavar="ID", help="drive or scene that the new version leaves out"
     )
     parser.add_argument("--name", help="name of a new map")
-    parser.add_argument("--require-all", action="store_true", help="fail where a drive cannot be reconstructed")
+    parser.add_argument(
+        "--require-all", action="store_true", help="fail where a drive cannot be reconstructed, or placed in the map"
+    )
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS in the reconstructions")
     parser.set_defaults(run=run)
 

@@ -16,7 +16,7 @@ from schemas.api.drives import DriveState, PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
 from schemas.api.resource import Finding
-from schemas.artifacts import Stage
+from schemas.artifacts import Stage, drive_of_scene
 from service.database.tables import TERMINAL, Drive, Job, JobMember, JobState, Map, MapScene, Project, Scene, new_id
 from service.domain import drives, jobs, maps
 from service.domain.access import require
@@ -238,7 +238,8 @@ def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
 
 def _members(session: Session, job: Job, plan: _Plan) -> Iterator[Job | None]:
     """Record what the aggregation brings; for each the job that makes its scene, None where that is there."""
-    taken = {scene.name for scene in (*plan.remaining, *plan.removed)}
+    # A component's name stands for its drive, also where the largest one is not in the version.
+    taken = {drive_of_scene(scene.name) for scene in (*plan.remaining, *plan.removed)}
     for drive_id, scene in plan.scenes.items():
         name = _name(scene.name, taken)
         session.add(JobMember(job_id=job.id, drive_id=drive_id, name=name, scene_id=scene.id))

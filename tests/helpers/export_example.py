@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -155,6 +156,21 @@ def make_scene(
 def assert_nothing_published(out: Path) -> None:
     assert not out.exists()
     assert not [p for p in out.parent.iterdir() if "partial" in p.name]
+
+
+def withheld_files(out: Path) -> list[str]:
+    """Notes of a scene's report on files that are withheld."""
+    notes = json.loads((out / "report.json").read_text())["summary"]["notes"]
+    return [note for note in notes if " is withheld: " in note]
+
+
+def assert_withheld(out: Path, *files: str) -> None:
+    """The scene in `out` is complete but for these files, and its report names each."""
+    withheld = withheld_files(out)
+    assert [note.split(" is withheld: ")[0] for note in withheld] == list(files), withheld
+    assert all("does not read back" in note for note in withheld)
+    assert not any((out / file).exists() for file in files)
+    assert (out / "model" / "points3D.bin").is_file()
 
 
 def scene_with_road(*, far: bool = False) -> Scene:

@@ -6,9 +6,9 @@ import hashlib
 from typing import Any
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import delete, select, update
 
-from service.database.tables import Blob, Map, MapFile, Scene, now_us
+from service.database.tables import Blob, Map, MapFile, MapScene, Scene, now_us
 from service.domain import jobs, maps
 from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, forget_all, problem_of
 from tests.helpers.tiny_drive import tiny_drive
@@ -94,6 +94,19 @@ def test_components_of_a_drive_are_scenes_of_the_version(client: Client, drives:
     assert names(client, map_id) == ["drive-1", "drive-2"]
     left = client.post("/v1/aggregations", json={"map_id": map_id, "remove": [drives[1]]})
     problem_of(left, 422, "too-few-scenes")
+
+
+def test_a_drive_is_not_named_as_one_whose_component_alone_is_in_the_map(client: Client, drives: list[str]) -> None:
+    job = client.aggregate(drives=drives[:2])
+    for member in job["members"]:
+        finish(client, member["job_id"])
+    client.publish_map(client.claim(job["id"]), FILES, components=("drive-0#1",))
+    map_id = job_of(client, job["id"])["map_id"]
+    with client.api.database.write() as session:
+        session.execute(delete(MapScene).where(MapScene.map_id == map_id, MapScene.name == "drive-0"))
+    namesake = client.frozen(tiny_drive("drive-0", seed=f"{client.project_id} another"))
+    added = client.aggregate(map_id=map_id, drives=[namesake])
+    assert [member["name"] for member in added["members"]] == ["drive-0-2"]
 
 
 def test_what_cannot_be_added_or_removed(client: Client, drives: list[str], map_id: str) -> None:

@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mrasfm_engine.aggregation import stages
+from mrasfm_engine.aggregation.association import associate
 from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export import readers
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.read_map import read_map
+from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.synthetic.simulate import poses_along
 from tests.helpers.small_scenes import Street, configured, drive_along, make_street
 
@@ -141,6 +144,47 @@ def test_a_component_that_nothing_places_is_left_out_with_the_reason(
     assert "no seam places it: with one: " in left_out["reason"]
     assert [finding["code"] for finding in report["findings"]] == ["scene-left-out"]
     assert report["left_out"][0]["code"] == "not-georeferenced"
+
+
+def test_a_component_that_nothing_places_is_an_error_where_all_are_required(
+    street: Street, elsewhere: Street, tmp_path: Path
+) -> None:
+    in_components(street, elsewhere, tmp_path / "tunnel")
+    lit = drive_along(street, tmp_path / "lit", WAY[:5], lateral_m=0.6, seed=4).folder
+    with pytest.raises(InputError, match="scene tunnel#1 is not georeferenced, and no seam places it") as raised:
+        made({"tunnel": tmp_path / "tunnel", "lit": lit}, tmp_path / "map", require_components=True)
+    assert raised.value.code == "not-georeferenced"
+    assert not (tmp_path / "map" / "map.json").exists()
+
+
+def test_a_component_keeps_its_place_whatever_is_added(
+    result: tuple[dict[str, Any], Path], street: Street, folders: dict[str, Path], tmp_path: Path
+) -> None:
+    """With one candidate, a drive that looks more like it than the one whose seam places it takes that one's turn."""
+    config = configured()
+    changes = {
+        "output": config.output.model_copy(update={"pictures": False}),
+        "aggregation": config.aggregation.model_copy(update={"candidates": 1}),
+    }
+    run = stages.Run(config.model_copy(update=changes), StageStore(tmp_path), result[1], lambda *_: None, lambda: False)
+    more = {f"more{k}": drive_along(street, tmp_path / f"more{k}", WAY, lateral_m=0.1 * k, seed=1).folder
+            for k in range(2)}  # fmt: skip
+    found = stages.scenes(run, more, [])
+    names = [scene.name for scene in found]
+    known = stages.association(run, found)
+    assert {(names[i], names[j]) for i, j in known.pairs} >= {("lit", "tunnel"), ("lit", "tunnel#1")}
+    before = associate(found, run.config.aggregation)
+    assert not {(names[i], names[j]) for i, j in before.pairs} & {("lit", "tunnel"), ("lit", "tunnel#1")}
+    made = {seam.a + seam.b for seam in stages.seams(run, found, known.of_scenes(range(len(found)))) if seam.accepted}
+    assert "littunnel#1" in made
+
+
+def test_components_of_one_drive_are_no_map(street: Street, tmp_path: Path) -> None:
+    folder = drive_along(street, tmp_path / "lit", WAY[:4], seed=4).folder
+    drive_along(street, folder / "components" / "1", WAY[:4], lateral_m=0.5, component=1, seed=5)
+    with pytest.raises(InputError, match="a map needs 2 drives, this would have 1") as raised:
+        made({"lit": folder}, tmp_path / "map")
+    assert raised.value.code == "one-scene"
 
 
 def test_a_drive_that_nothing_places_is_an_error_unless_it_may_be_left_out(

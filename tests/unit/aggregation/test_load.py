@@ -12,7 +12,7 @@ from mrasfm_engine.aggregation.load import name_scenes, read_scene
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.scene import write_scene
-from tests.helpers.export_example import make_scene
+from tests.helpers.export_example import make_scene, withheld_files
 
 
 @pytest.fixture
@@ -37,6 +37,15 @@ def test_everything_comes_back(folder: Path) -> None:
     for row, image, keypoint in zip(rows, written.observation_image, written.observation_keypoint, strict=True):
         descriptor = read.descriptors[read.descriptor_row[row]]
         assert np.array_equal(descriptor, written.features[image].descriptors[keypoint])
+
+
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    """With what SQLite takes for parts of a URI."""
+    folder = tmp_path / "a#1 b%25?"
+    write_scene(make_scene(), folder, {"settings": {"features": {"extractor": "sift"}}})
+    assert (folder / "trajectory.gpkg").is_file()
+    assert withheld_files(folder) == []
+    assert len(read_scene(folder, "one").keypoint_point) > 0
 
 
 def test_packing_changes_nothing(folder: Path) -> None:

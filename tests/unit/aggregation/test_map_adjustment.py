@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mrasfm_engine.aggregation import calibrations
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
-from mrasfm_engine.aggregation.calibrations import calibration_priors
+from mrasfm_engine.aggregation.calibrations import calibration_priors, map_calibrations
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, MapModel, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.vehicles import vehicles_of
@@ -334,6 +334,36 @@ def test_focal_lengths_that_another_drive_observed(street: Street, folder: Path)
     assert np.median(asked.model.errors_px) < np.median(not_asked.model.errors_px)
 
 
+def test_focal_lengths_of_scenes_that_take_no_part_stay(
+    street: Street, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None of the second drive's units vary, and it knows its cameras as well as the first one does."""
+    drives = [
+        with_focal(
+            drive_along(street, folder / f"no part {k}", WAYS[k], cameras_off_deg=0.02, vehicle="van-7", rig_seed=50,
+                        seed=52 + k),
+            0.001 * k,
+            observed=True,
+        )
+        for k in range(2)
+    ]  # fmt: skip
+    assembly = Assembly(scenes=[d.source for d in drives])
+    state = assembly.state(np.stack([d.street_from_scene for d in drives]))
+    config = CONFIG.bundle_adjustment.model_copy(update={"refine_focal": True})
+    vehicles, free = vehicles_of(assembly.scenes, config), assembly.registered & (assembly.scene_of_unit == 0)
+    found = map_calibrations(assembly, state, free, vehicles, config)
+    assert found.cameras.tolist() == found.free_intrinsics[:, 0].tolist() == [True] * 4 + [False] * 4
+    moved = np.abs(found.at_priors(state).camera_params - state.camera_params).max(1)
+    assert (moved[:4] > 1e-5).all()
+    assert (moved[4:] == 0.0).all()
+    assert not found.too_many
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 10)
+    found = map_calibrations(assembly, state, free, vehicles, config)
+    assert found.too_many
+    assert found.learning == ()
+    assert not found.cameras.any()
+
+
 @pytest.mark.parametrize("names", [("van-7", "van-8"), ("van-7", None), (None, None)])
 def test_drives_of_unlike_vehicles_are_untouched(
     street: Street, folder: Path, names: tuple[str | None, str | None]
@@ -395,6 +425,10 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
         np.testing.assert_allclose(sigma[:, :3], np.radians(CONFIG.bundle_adjustment.sigma_rotation_deg))
         np.testing.assert_allclose(sigma[:, 3:], CONFIG.bundle_adjustment.sigma_translation_m)
     assert len(every) == 2
+    component = replace(drives[0].source, calibration=drives[0].source.calibration | {"from_component": 0})
+    of_component = Assembly(scenes=[component, drives[1].source])
+    prior = calibration_priors(of_component, state, assembly.registered, CONFIG.bundle_adjustment)[0]
+    np.testing.assert_allclose(prior.sigma[:, :3], np.radians(0.1), rtol=1e-6)  # of the largest one's units, not of its
     assert sigmas(~assembly.registered) == []
     monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 8 * (14 + 8))
     assert len(sigmas(assembly.registered)) == 2

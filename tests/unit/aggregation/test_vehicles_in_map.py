@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mrasfm_engine.aggregation import calibrations
 from mrasfm_engine.aggregation.pipeline import aggregate
 from tests.helpers.small_scenes import configured, drive_along, make_street
 
@@ -55,6 +56,17 @@ def test_the_drive_is_named_whose_camera_was_knocked(folders: dict[str, Path], t
     assert (finding["code"], finding["severity"]) == ("camera-contradicts-vehicle", "warning")
     assert f"camera {camera} of vehicle van-7 was knocked or exchanged, in c, the other drives agree" in finding["what"]
     assert json.loads((tmp_path / "map" / "calibration" / "c.json").read_text())["vehicle"] == "van-7"
+
+
+def test_a_map_too_large_to_share_calibrations_says_so(
+    folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibrations, "MAX_COUPLINGS", 10)
+    document, report = made({name: folders[name] for name in ("a", "b")}, tmp_path / "map")
+    assert document["vehicles"][0]["learning"] == []
+    (finding,) = report["findings"]
+    assert finding["code"] == "calibrations-not-shared"
+    assert "no drive learns from others of its vehicle, and calibrations stay" in finding["what"]
 
 
 def test_of_two_drives_either_may_be_the_odd_one(folders: dict[str, Path], tmp_path: Path) -> None:

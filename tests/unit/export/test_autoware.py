@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import autoware, autoware_readback
 from mrasfm_engine.export.autoware import write_autoware
 from mrasfm_engine.export.rig_files_readback import parsed_yaml
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.scene.scene import Scene
-from tests.helpers.export_example import assert_nothing_published, make_scene
+from tests.helpers.export_example import assert_withheld, make_scene, withheld_files
 
 
 def points_of(path: Path) -> np.ndarray:
@@ -75,6 +74,21 @@ def test_every_flipped_bit_is_found(tmp_path: Path, file: str) -> None:
         assert not agrees(scene, path.parent), at
 
 
+def test_parts_of_it_are_written_and_read_at_one_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_scene()
+    write_autoware(scene, tmp_path / "whole")
+    monkeypatch.setattr(autoware, "BLOCK", 7)
+    monkeypatch.setattr(autoware_readback, "BATCH", 11)
+    write_autoware(scene, tmp_path / "parts")
+    written, whole = (tmp_path / folder / autoware.POINTS for folder in ("parts", "whole"))
+    assert written.read_bytes() == whole.read_bytes()
+    sizes = [len(rows) for rows in autoware_readback.read_pcd(written).points()]
+    assert (max(sizes), sum(sizes)) == (11, len(scene.points_m))
+    assert agrees(scene, tmp_path / "parts")
+    written.write_bytes(whole.read_bytes()[:-16])
+    assert not agrees(scene, tmp_path / "parts")
+
+
 def agrees(scene: Scene, folder: Path) -> bool:
     try:
         rows = [
@@ -97,14 +111,15 @@ def agrees(scene: Scene, folder: Path) -> bool:
         ),
     ],
 )
-def test_a_map_of_another_scene_is_refused_by_name(
+def test_a_map_of_another_scene_is_withheld_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Scene], Scene], file: str
 ) -> None:
     original: Any = autoware.write_autoware
     monkeypatch.setattr(autoware, "write_autoware", lambda scene, folder: original(change(scene), folder))
-    with pytest.raises(MrasfmError, match=f"{file} was written but does not read back"):
-        write_scene(make_scene(), tmp_path / "scene", {})
-    assert_nothing_published(tmp_path / "scene")
+    write_scene(make_scene(), tmp_path / "scene", {})
+    assert_withheld(tmp_path / "scene", "autoware")
+    (note,) = withheld_files(tmp_path / "scene")
+    assert f": {file} was written" in note
 
 
 def test_a_projection_of_another_place_is_refused_by_the_points(tmp_path: Path) -> None:

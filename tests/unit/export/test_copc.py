@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import copc, copc_readback, octree, ply
 from mrasfm_engine.export.copc import write_copc
 from mrasfm_engine.export.scene import write_scene
@@ -21,7 +20,7 @@ from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import COPC_FILE
-from tests.helpers.export_example import assert_nothing_published, make_scene, scene_with_road, street_of_points
+from tests.helpers.export_example import assert_withheld, make_scene, scene_with_road, street_of_points, withheld_files
 
 
 @pytest.fixture(scope="module")
@@ -185,14 +184,13 @@ def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
         lambda s: replace(s, georeference=replace(s.georeference, origin_longitude_deg=12.5)),
     ],
 )
-def test_a_file_of_other_points_is_refused_by_name(
+def test_a_file_of_other_points_is_withheld_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Scene], Scene]
 ) -> None:
     scene, original = scene_with_road(), copc.write_copc
     monkeypatch.setattr(copc, "write_copc", lambda _, path: original(change(scene), path))
-    with pytest.raises(MrasfmError, match=r"points\.copc\.laz was written but does not read back"):
-        write_scene(scene, tmp_path / "scene", {})
-    assert_nothing_published(tmp_path / "scene")
+    write_scene(scene, tmp_path / "scene", {})
+    assert_withheld(tmp_path / "scene", COPC_FILE)
 
 
 def test_a_file_that_cannot_grow_is_an_os_error(scene: Scene, tmp_path: Path) -> None:
@@ -228,6 +226,9 @@ def test_a_point_too_far_away_withholds_the_file(tmp_path: Path) -> None:
     assert not (out / COPC_FILE).exists()
     note = json.loads((out / "report.json").read_text())["summary"]["notes"][-1]
     assert note == "points.copc.laz is withheld: it holds points up to 200 km from the origin"
+    none = {name: getattr(scene, name)[:0] for name in vars(scene) if name.startswith(("point", "observation_"))}
+    write_scene(replace(scene, **none), out, {})
+    assert withheld_files(out) == []
     far[3:5] = [140_000.0, -140_000.0, 0.0], [-140_000.0, 140_000.0, 0.0]
     write_scene(replace(scene, points_m=far), out, {})
     assert np.ptp(laspy.read(out / COPC_FILE).x) == pytest.approx(280_000, rel=0.05)

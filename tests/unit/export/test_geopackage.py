@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.errors import StorageError
 from mrasfm_engine.export import geopackage, geopackage_readback
 from mrasfm_engine.export.geopackage import write_geopackage
+from mrasfm_engine.export.pose_files import geodetic_positions
 from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import TRAJECTORY_FILE
-from tests.helpers.export_example import MISSING_IMAGE, MISSING_UNIT, UNITS, assert_nothing_published, make_scene
+from tests.helpers.export_example import MISSING_IMAGE, MISSING_UNIT, UNITS, assert_withheld, make_scene, withheld_files
 
 NAMES = ["example"] * UNITS
 
@@ -188,11 +190,49 @@ def dumped(path: Path) -> list[str]:
         lambda s: with_times(s, (s.drive.timestamps_us + 1).tolist()),
     ],
 )
-def test_a_file_of_another_scene_is_refused_by_name(
+def test_a_file_of_another_scene_is_withheld_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Scene], Scene]
 ) -> None:
     original = geopackage.write_geopackage
     monkeypatch.setattr(geopackage, "write_geopackage", lambda scene, *args: original(change(scene), *args))
-    with pytest.raises(MrasfmError, match=r"trajectory\.gpkg was written but does not read back"):
-        write_scene(make_scene(), tmp_path / "scene", {})
-    assert_nothing_published(tmp_path / "scene")
+    write_scene(make_scene(), tmp_path / "scene", {})
+    assert_withheld(tmp_path / "scene", "trajectory.gpkg")
+
+
+@pytest.mark.parametrize(("longitude_deg", "east_m", "low"), [(180.0 - 1e-6, 0.0, 179.9), (1e-6 - 180.0, -3.0, -180.1)])
+def test_the_antimeridian_divides_no_line(tmp_path: Path, longitude_deg: float, east_m: float, low: float) -> None:
+    scene, path = make_scene(), tmp_path / TRAJECTORY_FILE
+    assert scene.georeference is not None
+    matrix = geodesy.ecef_from_local([0.1, longitude_deg, 10.0])
+    place = replace(scene.georeference, origin_longitude_deg=longitude_deg, ecef_from_local=matrix)
+    poses = scene.world_from_rig.copy()
+    poses[:, 0, 3] += east_m
+    scene = replace(scene, georeference=place, world_from_rig=poses)
+    geodetic = geodetic_positions(scene, scene.world_from_rig)
+    assert geodetic is not None
+    assert np.nanmax(geodetic[:, 1]) - np.nanmin(geodetic[:, 1]) > 359  # the way crosses it
+    write_geopackage(scene, NAMES, path)
+    assert disagreement(scene, path) is None
+    ((least, greatest),) = select(path, "SELECT min_x, max_x FROM gpkg_contents WHERE table_name = 'trajectory'")
+    assert low < least < greatest < low + 0.2
+
+
+@pytest.mark.parametrize("error", [ValueError("no"), OSError(28, "No space left on device")])
+def test_a_writer_that_fails_takes_its_file_alone_and_a_full_disk_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(scene: Scene, names: object, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise error
+
+    out = tmp_path / "scene"
+    write_scene(make_scene(), out, {})
+    monkeypatch.setattr(geopackage, "write_geopackage", fail)
+    if isinstance(error, OSError):
+        with pytest.raises(StorageError, match="No space left"):
+            write_scene(make_scene(), out, {})
+        assert (out / "trajectory.gpkg").exists()  # the older one, with its own report
+        return
+    write_scene(make_scene(), out, {})
+    assert not (out / "trajectory.gpkg").exists()  # not even the older one
+    assert withheld_files(out) == ["trajectory.gpkg is withheld: it cannot be written: ValueError: no"]

@@ -133,6 +133,12 @@ def test_the_vehicle_is_that_of_the_scenes_log(dataset: Path, tmp_path: Path) ->
     import_recording(dataset, tmp_path / "known", scene="scene-0103")
     manifest = read_drive(tmp_path / "known").manifest
     assert (manifest.version, manifest.vehicle) == (2, "n015")
+    for number, (name, expected) in enumerate(
+        {" M-AB 123": "M-AB-123", "Zoë/2": "Zo-2", "n" * 70: "n" * 64, "—": None, 8: None}.items()
+    ):
+        (tables / "log.json").write_text(json.dumps([{"token": "log-scene-0103", "vehicle": name}]))
+        import_recording(dataset, tmp_path / f"named {number}", scene="scene-0103")
+        assert read_drive(tmp_path / f"named {number}").manifest.vehicle == expected
     import_recording(dataset, tmp_path / "given", scene="scene-0103", vehicle="van-7")
     assert read_drive(tmp_path / "given").manifest.vehicle == "van-7"
 
