@@ -60,7 +60,7 @@ def largest_side_px(config: FeatureConfig) -> int:
     return config.max_side_px or LARGEST_SIDE_PX
 
 
-def reduced(image: Bytes, side_px: int) -> Bytes:
+def shrunk(image: Bytes, side_px: int) -> Bytes:
     """An image (h, w) or (h, w, 3) whose longer side is `side_px` at most.
 
     Its content fills the rounded size exactly: along each axis it shrinks by new size over old size.

@@ -16,7 +16,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import colors_at
-from mrasfm_engine.features.extraction_size import largest_side_px, reduced
+from mrasfm_engine.features.extraction_size import largest_side_px, shrunk
 from mrasfm_engine.features.keypoint_refinement import snap_to_extrema
 from mrasfm_engine.features.tiles import Tile, cut, duplicates, lay_tiles
 from mrasfm_engine.learned.network import STRIDE_PX, Network
@@ -64,7 +64,7 @@ class NetworkExtractor:
 
     def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
         """See `Extractor`."""
-        pixels = reduced(rgb, largest_side_px(self._config))
+        pixels = shrunk(rgb, largest_side_px(self._config))
         size = pixels.shape[0], pixels.shape[1]
         window = self._fixed_size or (_up(size[0]), _up(size[1]))
         stretch = np.array([rgb.shape[1] / size[1], rgb.shape[0] / size[0]])

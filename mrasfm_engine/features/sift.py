@@ -8,7 +8,7 @@ import numpy as np
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE, NO_FEATURES, colors_at
-from mrasfm_engine.features.extraction_size import largest_side_px, reduced
+from mrasfm_engine.features.extraction_size import largest_side_px, shrunk
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes
@@ -58,7 +58,7 @@ class SiftExtractor:
 
     def _prepared(self, rgb: Bytes, mask: Bools | None) -> tuple[Bytes, Bytes | None, cv2.SIFT]:
         """The image and the mask at the size of the extraction, and a detector."""
-        gray = reduced(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), largest_side_px(self._config))
+        gray = shrunk(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), largest_side_px(self._config))
         small_mask, wanted = None, self._config.max_keypoints * (CANDIDATES if self._config.spread else 1)
         if mask is not None:
             small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
