@@ -47,7 +47,7 @@ import numpy as np
 from numba import njit
 
 from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS, Groups
-from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.geometry.camera_model import inverse_depth, project
 from mrasfm_engine.types import Bools, Floats, Ints
 
 BEHIND_PX = 1000.0  # what an observation costs whose point is where its camera shows nothing
@@ -235,9 +235,7 @@ def intrinsics_derivatives(kind: int, k: Any, cam: Any, proj: Any, s: float, jc:
     A perspective camera's distortion is the radial one's, of which it has none: how far it may be off is asked all the
     same.
     """
-    iz = 1.0 / cam[2]
-    if kind == 4:
-        iz = (1.0 + k[9]) / (cam[2] + k[9] * math.sqrt(cam[0] * cam[0] + cam[1] * cam[1] + cam[2] * cam[2]))
+    iz = inverse_depth(kind, k, cam[2], cam[0] * cam[0] + cam[1] * cam[1] + cam[2] * cam[2])
     a, b = cam[0] * iz, cam[1] * iz
     r2 = a * a + b * b
     jc[0, 9], jc[1, 9] = 0.0, (proj[1] - k[3]) * s

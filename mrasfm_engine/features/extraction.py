@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import cv2
@@ -53,6 +53,75 @@ def one_opencv_thread() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskedImage:
+    """Verdict of masks on the pixels of an image.
+
+    Attributes
+    ----------
+    usable
+        (h, w) where keypoints may be; None: everywhere.
+    codes
+        (h, w) classes as `semantics.class_codes` has them, None where no mask says.
+    made_mask
+        (h, w) the mask, where the segmenter made it.
+    """
+
+    usable: Bools | None
+    codes: Bytes | None = None
+    made_mask: Bytes | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageMasks:
+    """The masks of a drive's images: given, made or of the own car."""
+
+    drive: Drive
+    segmenter: Segmenter | None
+    outside_own_car: Sequence[Bools | None]  # by camera; none where it was not sought
+
+    @staticmethod
+    def of_drive(drive: Drive, segmenter: Segmenter | None, own_cars: Sequence[Bools | None]) -> ImageMasks:
+        """Masks with a margin around the own car, whose masks (h, w) by camera are True where pixels show it."""
+        outside = [None if mask is None else ~with_margin(mask) for mask in own_cars]
+        return ImageMasks(drive=drive, segmenter=segmenter, outside_own_car=outside)
+
+    def of_image(self, index: int, rgb: Bytes) -> MaskedImage:
+        """Masks of an image (h, w, 3).
+
+        Raises
+        ------
+        InputError
+            Where the image has another size than its camera, or its mask another than the image or cannot be read.
+        """
+        image, given = self.drive.images[index], self.drive.manifest.label_map
+        camera = self.drive.cameras[image.camera]
+        if rgb.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"{image.file} has {rgb.shape[1]}x{rgb.shape[0]} pixels, its camera {camera.name} "
+                f"{camera.width}x{camera.height}",
+                remedy="Give the calibration of images of this size, or images of the calibration's size.",
+            )
+        outside = self.outside_own_car[image.camera] if self.outside_own_car else None
+        made_mask = None
+        if image.mask is not None:
+            mask = read_mask(self.drive.root / image.mask, given)
+            if mask.shape != rgb.shape[:2]:
+                raise InputError(
+                    f"mask {image.mask} has {mask.shape[1]}x{mask.shape[0]} pixels, its image has "
+                    f"{rgb.shape[1]}x{rgb.shape[0]}",
+                    remedy="Give masks of their images' size, without interpolating between ids.",
+                    code="mask-size",
+                )
+        elif self.segmenter is not None:
+            mask = made_mask = self.segmenter.segment(rgb)
+        else:
+            return MaskedImage(usable=outside)
+        codes = class_codes(mask, given or LabelMap.cityscapes())
+        usable = usable_pixels(codes)
+        return MaskedImage(usable=usable if outside is None else usable & outside, codes=codes, made_mask=made_mask)
 
 
 def extract_features(
@@ -113,45 +182,23 @@ def features_by_image(
         Where `cancel` answers True.
     """
 
+    masks = ImageMasks.of_drive(drive, segmenter, own_cars)
+
     def one(index: int) -> ImageFeatures | Incomplete:
         if cancel is not None and cancel():
             raise CancelledError
-        image = drive.images[index]
-        camera = drive.cameras[image.camera]
         try:
-            rgb = read_image_rgb(drive.root / image.file)
+            rgb = read_image_rgb(drive.root / drive.images[index].file)
         except IncompleteImageError as problem:
             return problem.reason
-        if rgb.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"{image.file} has {rgb.shape[1]}x{rgb.shape[0]} pixels, its camera {camera.name} "
-                f"{camera.width}x{camera.height}",
-                remedy="Give the calibration of images of this size, or images of the calibration's size.",
-            )
-        outside = outside_own_car[image.camera] if outside_own_car else None
-        made_mask = None
-        if image.mask is not None:
-            mask = read_mask(drive.root / image.mask, drive.manifest.label_map)
-            if mask.shape != rgb.shape[:2]:
-                raise InputError(
-                    f"mask {image.mask} has {mask.shape[1]}x{mask.shape[0]} pixels, its image has "
-                    f"{rgb.shape[1]}x{rgb.shape[0]}",
-                    remedy="Give masks of their images' size, without interpolating between ids.",
-                    code="mask-size",
-                )
-        elif segmenter is not None:
-            mask = segmenter.segment(rgb)
-            made_mask = mask_png(mask)
-        else:
-            return extractor.extract(rgb, outside)
-        codes = class_codes(mask, label_map)
-        usable = usable_pixels(codes)
-        found = extractor.extract(rgb, usable if outside is None else usable & outside)
-        classes = classes_at(confident_classes(codes, class_margin_px), found.xy_px)
+        masked = masks.of_image(index, rgb)
+        found = extractor.extract(rgb, masked.usable)
+        if masked.codes is None:
+            return found
+        made_mask = None if masked.made_mask is None else mask_png(masked.made_mask)
+        classes = classes_at(confident_classes(masked.codes, class_margin_px), found.xy_px)
         return replace(found, classes=classes, made_mask=made_mask)
 
-    label_map = drive.manifest.label_map or LabelMap.cityscapes()
-    outside_own_car = [None if mask is None else ~with_margin(mask) for mask in own_cars]
     count = len(drive.images)
     with one_opencv_thread():
         for done, found in enumerate(in_order(threads, one, range(count)), 1):

@@ -18,16 +18,13 @@ import numpy as np
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.features.extraction import Extractor, one_opencv_thread
-from mrasfm_engine.features.own_car import with_margin
+from mrasfm_engine.features.extraction import Extractor, ImageMasks, one_opencv_thread
 from mrasfm_engine.features.segmentation import Segmenter
-from mrasfm_engine.io.images import read_image_rgb, read_mask
+from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.scene.semantics import class_codes, usable_pixels
 from mrasfm_engine.types import Bools, Bytes, Cancel
-from schemas import LabelMap
 
 LARGEST_SIDE_PX = 1600
 # Sizes that are tried, the smallest first, relative to the largest: half is the smallest that was measured.
@@ -118,14 +115,14 @@ def find_sides(
         Where `cancel` answers True.
     """
     result: dict[Size, int] = {}
-    usable = _Usable(drive, segmenter, [None if mask is None else ~with_margin(mask) for mask in own_cars])
+    masks = ImageMasks.of_drive(drive, segmenter, own_cars)
     for size in sorted({(camera.width, camera.height) for camera in drive.cameras}):
         sampled, promising = _sample(drive, size), 0.0
         for reduction in REDUCTIONS:
             if reduction < promising:
                 continue
             side_px = round(reduction * min(max(size), LARGEST_SIDE_PX))
-            counts = _counts(usable, sampled, extractor.with_side(side_px), threads=threads, cancel=cancel)
+            counts = _counts(masks, sampled, extractor.with_side(side_px), threads=threads, cancel=cancel)
             share = float(np.quantile(counts, 0.25)) / (ENOUGH * max_keypoints) if counts else 0.0
             if share >= 1.0:
                 result[size] = side_px
@@ -148,45 +145,19 @@ def _sample(drive: Drive, size: Size) -> list[int]:
     return [of_size[k] for k in chosen]
 
 
-@dataclass(frozen=True)
-class _Usable:
-    """Images of a drive, and where they have keypoints."""
-
-    drive: Drive
-    segmenter: Segmenter | None
-    outside_own_car: Sequence[Bools | None]  # by camera; none where it was not sought
-
-    def read(self, index: int) -> tuple[Bytes, Bools | None] | None:
-        """An image (h, w, 3) and its usable pixels (h, w), None for all; None where it cannot be read."""
-        image, label_map = self.drive.images[index], self.drive.manifest.label_map or LabelMap.cityscapes()
-        try:
-            rgb = read_image_rgb(self.drive.root / image.file)
-            if image.mask is not None:
-                mask: Bytes | None = read_mask(self.drive.root / image.mask, self.drive.manifest.label_map)
-            else:
-                mask = None if self.segmenter is None else self.segmenter.segment(rgb)
-        except InputError:
-            return None
-        usable = None if mask is None else usable_pixels(class_codes(mask, label_map))
-        outside = self.outside_own_car[image.camera] if self.outside_own_car else None
-        for known in (usable, outside):
-            if known is not None and known.shape != rgb.shape[:2]:
-                return None
-        if usable is None or outside is None:
-            return rgb, outside if usable is None else usable
-        return rgb, usable & outside
-
-
 def _counts(
-    usable: _Usable, images: list[int], extractor: SizedExtractor, *, threads: int, cancel: Cancel | None
+    masks: ImageMasks, images: list[int], extractor: SizedExtractor, *, threads: int, cancel: Cancel | None
 ) -> list[int]:
     """Keypoints of images at the extractor's size, of those that can be read."""
 
     def count(index: int) -> int | None:
         if cancel is not None and cancel():
             raise CancelledError
-        found = usable.read(index)
-        return None if found is None else extractor.count(*found)
+        try:
+            rgb = read_image_rgb(masks.drive.root / masks.drive.images[index].file)
+            return extractor.count(rgb, masks.of_image(index, rgb).usable)
+        except InputError:
+            return None
 
     with one_opencv_thread(), closing(in_order(threads, count, images)) as counts:
         return [found for found in counts if found is not None]

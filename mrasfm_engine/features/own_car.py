@@ -183,7 +183,11 @@ def _judge(drive: Drive, camera: int, statistics: _Statistics) -> OwnCar:
 
 def with_margin(mask: Bools) -> Bools:
     """The mask (h, w) and the pixels around it whose keypoints would depend on its outline."""
-    side = 2 * max(1, round(MARGIN_SHARE * mask.shape[1])) + 1
+    return _near(mask, max(1, round(MARGIN_SHARE * mask.shape[1])))
+
+
+def _near(mask: Bools, margin_px: int) -> Bools:
+    side = 2 * margin_px + 1
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
@@ -293,11 +297,6 @@ def _static_region(drive: Drive, camera: int, statistics: _Statistics) -> Bools:
     is_car = found.evidence_px >= MIN_EVIDENCE_PX and found.evidence_share >= MIN_EVIDENCE_SHARE
     mask = np.rot90(found.mask, -side) if is_car else np.zeros(fall.shape, np.bool_)
     return np.ascontiguousarray(mask | surround | other)
-
-
-def _near(mask: Bools, margin_px: int) -> Bools:
-    side = 2 * margin_px + 1
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def _world_motion(drive: Drive, camera: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, int]:

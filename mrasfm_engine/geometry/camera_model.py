@@ -149,6 +149,14 @@ def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
 
 
 @njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def inverse_depth(kind: int, k: Any, z: float, d2: float) -> float:
+    """Factor from x and y to (a, b) of a point at a squared distance d2; of no fisheye."""
+    if kind == 4:
+        return float((1.0 + k[9]) / (z + k[9] * math.sqrt(d2)))
+    return 1.0 / z
+
+
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any) -> bool:
     """Pixel of a point in camera axes into out[0:2] and d(pixel)/d(x, y, z), row by row, into out[2:8].
 
@@ -182,9 +190,7 @@ def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any
         out[6] = fy * (scale + y * y * slope)
         out[7] = fy * y * sink
         return True
-    iz = 1.0 / z
-    if kind == 4:
-        iz = (1.0 + k[9]) / (z + k[9] * math.sqrt(d2))
+    iz = inverse_depth(kind, k, z, d2)
     a, b = x * iz, y * iz
     distort(kind, k, a, b, work)
     out[0] = k[2] + fx * work[0]

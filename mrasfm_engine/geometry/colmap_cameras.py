@@ -52,7 +52,7 @@ class SolverCameras:
         for camera, own in zip(given, params, strict=True):
             model, values = camera.model, unpack_camera(camera.model, own)
             if not is_colmaps(model):
-                model, values = "OPENCV_FISHEYE", np.array([*own[:4], 0.0, 0.0, 0.0, 0.0])
+                model, values = "OPENCV_FISHEYE", _equidistant(own)
             cameras.append(pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=values))
         return SolverCameras(cameras=cameras, kind=kind, params=params)
 
@@ -67,8 +67,7 @@ class SolverCameras:
             usable[rows] = rays[:, 2] > MIN_FORWARD
             if self.kind[c] == OMNIDIRECTIONAL:
                 result = result.copy() if result is xy_px else result
-                equidistant = pack_camera("OPENCV_FISHEYE", [*self.params[c, :4], 0.0, 0.0, 0.0, 0.0])
-                result[rows] = project_points(*equidistant, rays)
+                result[rows] = project_points(*pack_camera("OPENCV_FISHEYE", _equidistant(self.params[c])), rays)
         return result, usable
 
 
@@ -94,17 +93,21 @@ def nearest_model(camera: Camera, params: Floats) -> NearestModel:
     rays = unproject_pixels(kind, own, pixels)
     # Corners of an image circle show nothing: their rays are those of the limit, and come back elsewhere.
     shown = rays[:, 2] > np.cos(largest_angle_rad(own)) + 1e-6
-    equidistant = np.array([*own[:4], 0.0, 0.0, 0.0, 0.0])
+    fitted = _equidistant(own)
     if shown.mean() < MIN_SHOWN:
-        return NearestModel(model="OPENCV_FISHEYE", params=equidistant, error_px=float("inf"))
+        return NearestModel(model="OPENCV_FISHEYE", params=fitted, error_px=float("inf"))
     pixels, rays = pixels[shown], rays[shown]
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    fitted = equidistant
     for _ in range(ITERATIONS):
         step, *_ = np.linalg.lstsq(_derivatives(fitted, rays, theta), (pixels - _fisheye(fitted, rays, theta)).ravel())
         fitted = fitted + step
     off = np.linalg.norm(_fisheye(fitted, rays, theta) - pixels, axis=1)
     return NearestModel(model="OPENCV_FISHEYE", params=fitted, error_px=float(off.max()))
+
+
+def _equidistant(params: Floats) -> Floats:
+    """Parameters (8,) of the fisheye without distortion that has a camera's focal lengths and principal point."""
+    return np.array([*params[:4], 0.0, 0.0, 0.0, 0.0])
 
 
 def _directions(rays: Floats) -> Floats:
@@ -114,15 +117,18 @@ def _directions(rays: Floats) -> Floats:
 
 def _fisheye(params: Floats, rays: Floats, theta: Floats) -> Floats:
     """Pixels (n, 2) of rays with angles (n,) from the axis."""
-    reach = theta * (1.0 + sum(params[4 + i] * theta ** (2 * i + 2) for i in range(4)))
-    result: Floats = params[2:4] + params[:2] * _directions(rays) * reach[:, None]
+    result: Floats = params[2:4] + params[:2] * _directions(rays) * _reach(params, theta)[:, None]
+    return result
+
+
+def _reach(params: Floats, theta: Floats) -> Floats:
+    result: Floats = theta * (1.0 + sum(params[4 + i] * theta ** (2 * i + 2) for i in range(4)))
     return result
 
 
 def _derivatives(params: Floats, rays: Floats, theta: Floats) -> Floats:
     """Derivatives (2 n, 8) of `_fisheye` in its parameters."""
-    direction = _directions(rays)
-    reach = theta * (1.0 + sum(params[4 + i] * theta ** (2 * i + 2) for i in range(4)))
+    direction, reach = _directions(rays), _reach(params, theta)
     result = np.zeros((len(rays), 2, 8))
     for k in range(2):
         result[:, k, k] = direction[:, k] * reach

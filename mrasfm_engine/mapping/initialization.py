@@ -11,6 +11,7 @@ import pycolmap
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.unit_registration import CameraViews, cameras_of, matrix_of, register_unit, rigid3d
@@ -180,10 +181,11 @@ def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: 
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
     options.min_num_trials, options.max_num_trials = 100, 2000
-    a, b, xy_a, xy_b = _for_solver(mapper, a, b)
+    cameras = cameras_of(mapper)
+    a, b, xy_a, xy_b = _for_solver(mapper, cameras, a, b)
     if not len(a):
         return None
-    both, cameras = np.concatenate([a, b]), cameras_of(mapper).cameras
+    both = np.concatenate([a, b])
     views = CameraViews.from_keypoints(mapper, mapper.keypoints.camera[both], mapper.keypoints.band[both])
     result = pycolmap.estimate_generalized_relative_pose(
         xy_a,
@@ -191,7 +193,7 @@ def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: 
         [int(i) for i in views.index[: len(a)]],
         [int(i) for i in views.index[len(a) :]],
         [rigid3d(m) for m in se3.inverse(views.rig_from_view)],
-        [cameras[c] for c in views.camera],
+        [cameras.cameras[c] for c in views.camera],
         estimation_options=options,
     )
     if result is None or "rig2_from_rig1" not in result:
@@ -206,9 +208,9 @@ def _single_camera_relative_pose(
     a, b = _matches_between(mapper, pairs, u, v)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
-    index = int(mapper.image_camera[0])
-    camera = cameras_of(mapper).cameras[index]
-    a, b, xy_a, xy_b = _for_solver(mapper, a, b)
+    index, cameras = int(mapper.image_camera[0]), cameras_of(mapper)
+    camera = cameras.cameras[index]
+    a, b, xy_a, xy_b = _for_solver(mapper, cameras, a, b)
     if not len(a):
         return None
     result = pycolmap.estimate_essential_matrix(xy_a, xy_b, camera, camera, estimation_options=options)
@@ -227,9 +229,9 @@ def _single_camera_relative_pose(
     return result_pose
 
 
-def _for_solver(mapper: Mapper, a: Ints, b: Ints) -> tuple[Ints, Ints, Floats, Floats]:
+def _for_solver(mapper: Mapper, cameras: SolverCameras, a: Ints, b: Ints) -> tuple[Ints, Ints, Floats, Floats]:
     """Matching keypoints (n,) that COLMAP's solvers can use, and their pixels (n, 2) as these take them."""
-    cameras, keypoints = cameras_of(mapper), mapper.keypoints
+    keypoints = mapper.keypoints
     (xy_a, usable_a), (xy_b, usable_b) = (cameras.pixels(keypoints.camera[k], keypoints.xy_px[k]) for k in (a, b))
     both = usable_a & usable_b
     return a[both], b[both], xy_a[both], xy_b[both]

@@ -10,10 +10,9 @@ import numpy as np
 from mrasfm_engine.features.own_car import OwnCar, find_own_cars, large_share_finding
 from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.io.images import mask_of_png, mask_png
-from mrasfm_engine.io.stage_store import Arrays, fingerprint
+from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.stages._run import OWN_CAR_VERSION, Run
 from mrasfm_engine.types import Bools
-from schemas.artifacts import Stage
 from schemas.findings import as_json
 
 OWN_CAR = "own-car"
@@ -33,17 +32,15 @@ def own_cars(run: Run) -> None:
 def _found(run: Run) -> tuple[list[Bools | None], dict[str, Any]]:
     if not run.config.features.own_car:
         return [None for _ in run.drive.cameras], {}
-    key = fingerprint(run.key or run.drive_key, OWN_CAR, OWN_CAR_VERSION)
-    stored = run.store.load(OWN_CAR, key)
-    if stored is not None:
-        return _unpacked(stored[0]), stored[1]
-    run.require_unplanned()
-    run.begin(Stage.FEATURES)  # which are extracted next, without what is found here
-    found = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
-    return_freed_memory()
-    report = {camera.name: car.report() for camera, car in zip(run.drive.cameras, found, strict=True)}
-    run.store.save(OWN_CAR, key, _packed(found), report)
-    return [car.mask for car in found], report
+
+    def find() -> tuple[Arrays, dict[str, Any]]:
+        found = find_own_cars(run.drive, threads=run.config.threads, cancel=run.cancel)
+        return_freed_memory()
+        report = {camera.name: car.report() for camera, car in zip(run.drive.cameras, found, strict=True)}
+        return _packed(found), report
+
+    masks, report = run.once(OWN_CAR, OWN_CAR_VERSION, find=find)
+    return _unpacked(masks), report
 
 
 def _packed(own_cars: Sequence[OwnCar]) -> Arrays:

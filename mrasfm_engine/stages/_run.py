@@ -90,6 +90,25 @@ class Run:
                 "the plan of the drive's sub-maps is not there any more", remedy="Ask for the reconstruction again."
             )
 
+    def once(
+        self, name: str, *settings: object, find: Callable[[], tuple[Arrays, dict[str, Any]]]
+    ) -> tuple[Arrays, dict[str, Any]]:
+        """Find what all sub-maps of a drive share before the extraction, or take it from the store.
+
+        Raises
+        ------
+        StorageError
+            Where the plan must have it, and has not.
+        """
+        key = fingerprint(self.key or self.drive_key, name, *settings)
+        stored = self.store.load(name, key)
+        if stored is None:
+            self.require_unplanned()
+            self.begin(Stage.FEATURES)  # which are extracted next
+            stored = find()
+            self.store.save(name, key, *stored)
+        return stored
+
     def step(self, stage: Stage) -> CountProgress:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
