@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mrasfm_engine import stages
 from mrasfm_engine.ablation import warm_up
 from mrasfm_engine.benchmark import simulated_drive
+from mrasfm_engine.benchmark.simulated_descriptors import store_descriptors
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import storage_error
 from mrasfm_engine.export.feature_database import write_matches
 from mrasfm_engine.io.stage_store import Arrays, StageStore, fingerprint
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.preflight.drive_reader import read_drive, write_manifest
 from mrasfm_engine.scene.drive import Drive
-from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
+from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.subprocess_run import memory_bytes
+from mrasfm_engine.synthetic.long_route import simulate_long_route
 from mrasfm_engine.types import Floats, StageProgress
+from schemas.artifacts import Stage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +59,9 @@ class Mapped:
     observations: int
     revisits_tried: int
     revisits_believed: int
+    matching_s: float | None = None  # where descriptors were matched
+    verified_matches: int | None = None  # the same
+    submaps: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +70,7 @@ class Simulated:
 
     images: int
     keypoints: int
-    verified_matches: int
+    verified_matches: int | None  # None where descriptors are still to be matched
     world_from_rig: Floats
 
 
@@ -98,8 +104,7 @@ def map_drive(progress: StageProgress, drive_folder: Path, config: EngineConfig,
 def map_simulated(progress: StageProgress, folder: Path, config: EngineConfig) -> Mapped:
     """Map from simulated features and matches, and refine."""
     simulated = simulated_drive.load(folder)
-    key = fingerprint(simulated.drive.manifest.name)  # there are no files whose fingerprint it could be
-    run = stages.Run(simulated.drive, config, _MappedAnew(folder), progress, lambda: False, key=key)
+    run = _simulated_run(progress, simulated.drive, config, _MappedAnew(folder))
     return _map(run, simulated.features, simulated.pairs, stages.prior(run))
 
 
@@ -129,6 +134,49 @@ def simulate(progress: StageProgress, rig: str, units: int, seed: int, config: E
     )
 
 
+def simulate_descriptors(
+    progress: StageProgress, rig: str, units: int, seed: int, config: EngineConfig, folder: Path
+) -> Simulated:
+    """Simulate a drive into a folder, up to the descriptors of its images."""
+    route = simulate_long_route(rig, units, seed=seed, progress=lambda done, total: progress("route", done, total))
+    drive = simulated_drive.drive_of_route(rig, route, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_manifest(drive.manifest, folder)
+    run = _simulated_run(progress, drive, config, StageStore(folder))
+    return Simulated(
+        images=len(drive.images),
+        keypoints=store_descriptors(run, route, seed=seed),
+        verified_matches=None,
+        world_from_rig=route.world_from_rig,
+    )
+
+
+def map_descriptors(progress: StageProgress, folder: Path, config: EngineConfig) -> Mapped:
+    """Match the descriptors that `simulate_descriptors` left and map, in sub-maps where the drive is cut, and
+    refine."""
+    run = _simulated_run(progress, read_drive(folder), config, StageStore(folder))
+    run.report["findings"] = []
+    start_memory_bytes = memory_bytes()
+    prior, spans = stages.prior(run), stages.cut_drive(run)
+    features: Sequence[ImageFeatures]
+    if spans:
+        features, matches, (model, *_) = stages.join_submaps(run, stages.run_submaps(run, spans), prior)
+    else:
+        features, _ = stages.extract(run)
+        matches = stages.matches(run, features, prior)
+        model, *_ = stages.mapping(run, features, matches, prior)
+    scene = stages.scene(run, model, features, matches, prior)
+    every = [*run.report["stages"], *(stage for part in run.report.get("submaps", []) for stage in part["stages"])]
+    matched = next(stage for stage in run.report["stages"] if stage["stage"] == Stage.MATCHES)
+    return replace(
+        _mapped(run, scene, start_memory_bytes),
+        mapping_s=sum(stage["seconds"] for stage in every if stage["stage"] == Stage.MAPPING),
+        matching_s=sum(stage["seconds"] for stage in every if stage["stage"] == Stage.MATCHES),
+        verified_matches=matched["verified_matches"],
+        submaps=max(len(spans), 1),
+    )
+
+
 class _MappedAnew(StageStore):
     """Finished stages, of which mapping is always done again: it is what is timed."""
 
@@ -141,6 +189,11 @@ def _run(progress: StageProgress, drive_folder: Path, config: EngineConfig, stor
     return stages.Run(read_drive(drive_folder), config, store, progress, lambda: False)
 
 
+def _simulated_run(progress: StageProgress, drive: Drive, config: EngineConfig, store: StageStore) -> stages.Run:
+    key = fingerprint(drive.manifest.name)  # there are no files whose fingerprint it could be
+    return stages.Run(drive, config, store, progress, lambda: False, key=key)
+
+
 def _map(
     run: stages.Run, features: Sequence[ImageFeatures], matches: Sequence[PairMatches], prior: PriorTrajectory
 ) -> Mapped:
@@ -148,7 +201,10 @@ def _map(
     warm_up(run, features, matches, prior)
     start_memory_bytes = memory_bytes()
     model = stages.mapping(run, features, matches, prior)[0]
-    scene = stages.scene(run, model, features, matches, prior)
+    return _mapped(run, stages.scene(run, model, features, matches, prior), start_memory_bytes)
+
+
+def _mapped(run: stages.Run, scene: Scene, start_memory_bytes: int | None) -> Mapped:
     done = {stage["stage"]: stage for stage in run.report["stages"]}
     revisits = done["mapping"]["revisits"]
     return Mapped(

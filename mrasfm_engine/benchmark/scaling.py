@@ -46,23 +46,45 @@ class Growth:
     route_m: float
     images: int
     keypoints: int
-    verified_matches: int
+    verified_matches: int | None  # None where descriptors were matched: see the row
     rows: list[GrowthRow]
 
 
-def measure_growth(rig: str, units: Sequence[int], seed: int, work: Path, settings: Settings) -> list[Growth]:
+def measure_growth(
+    rig: str, units: Sequence[int], seed: int, work: Path, settings: Settings, *, descriptors: bool = False
+) -> list[Growth]:
     """Simulate a route of every length, and map it.
+
+    Parameters
+    ----------
+    descriptors
+        Leave the descriptors of all images on disk, and match them as those of a drive, in sub-maps where it is cut.
 
     Raises
     ------
     InputError
-        For a rig that is not known, or a length that makes no sense.
+        For a rig that is not known, a length that makes no sense, or baselines where there are descriptors.
     """
     require_rig(rig)
+    if descriptors and settings.baselines:
+        raise InputError(
+            "--descriptors does not go with --baselines: baselines map matches", remedy="Leave one of them out."
+        )
+    if descriptors and settings.repeat > 1:
+        raise InputError(
+            "--descriptors does not go with --repeat: what is matched once stays on disk", remedy="Leave one out."
+        )
     for count in units:
         if count < MIN_POSES:
             raise InputError(f"--units {count} is too short a route", remedy=f"Ask for at least {MIN_POSES} units.")
-    return [_measure(rig, count, seed, work / f"{rig}-{count}", settings) for count in units]
+    measure = _measure_from_descriptors if descriptors else _measure
+    return [measure(rig, count, seed, work / f"{rig}-{count}", settings) for count in units]
+
+
+def _measure_from_descriptors(rig: str, units: int, seed: int, folder: Path, settings: Settings) -> Growth:
+    label = f"{rig}, {units} units"
+    simulated, _ = settings.require(label, mapping.simulate_descriptors, rig, units, seed, settings.config, folder)
+    return _growth(rig, units, seed, simulated, [our_row(settings, mapping.map_descriptors, folder, settings.config)])
 
 
 def _measure(rig: str, units: int, seed: int, folder: Path, settings: Settings) -> Growth:
@@ -71,6 +93,10 @@ def _measure(rig: str, units: int, seed: int, folder: Path, settings: Settings) 
     if settings.baselines:
         settings.require(label, mapping.write_simulated_database, folder, folder / DATABASE)
     rows = [our_row(settings, mapping.map_simulated, folder, settings.config), *peer_rows(settings, folder / DATABASE)]
+    return _growth(rig, units, seed, simulated, rows)
+
+
+def _growth(rig: str, units: int, seed: int, simulated: mapping.Simulated, rows: Sequence[Row]) -> Growth:
     truth = simulated.world_from_rig
     route_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     return Growth(

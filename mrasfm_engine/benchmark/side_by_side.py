@@ -128,6 +128,9 @@ class Row:
     observations: int | None = None
     revisits_tried: int | None = None
     revisits_believed: int | None = None
+    matching_s: float | None = None  # where every mapping matches anew
+    verified_matches: int | None = None  # the same
+    submaps: int = 1
     errors: TrajectoryErrors | None = None
     failure: str = ""
     world_from_rig: Floats = field(repr=False, default_factory=lambda: np.zeros((0, 4, 4)))
@@ -239,6 +242,9 @@ def _ours(settings: Settings, work: Callable[..., Mapped], *arguments: object) -
         observations=mapped.observations,
         revisits_tried=mapped.revisits_tried,
         revisits_believed=mapped.revisits_believed,
+        matching_s=mapped.matching_s,
+        verified_matches=mapped.verified_matches,
+        submaps=mapped.submaps,
         world_from_rig=mapped.world_from_rig,
     )
 

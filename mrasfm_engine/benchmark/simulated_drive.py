@@ -44,7 +44,7 @@ def simulate_drive(
         Where the drive will be kept.
     """
     route = simulate_long_route(rig, units, seed=seed, progress=lambda done, total: progress("route", done, total))
-    drive = Drive(folder, _manifest(rig, route))
+    drive = drive_of_route(rig, route, folder)
     pairs = simulate_matches(
         drive,
         route,
@@ -58,6 +58,11 @@ def simulate_drive(
         pairs=pairs,
         world_from_rig=route.world_from_rig,
     )
+
+
+def drive_of_route(rig: str, route: LongRoute, folder: Path) -> Drive:
+    """The drive that a route's cameras would have recorded into a folder."""
+    return Drive(folder, _manifest(rig, route))
 
 
 def _manifest(rig: str, route: LongRoute) -> DriveManifest:

@@ -17,7 +17,7 @@ RESULT = "bench.json"
 DEFAULT_UNITS = "100"
 
 # Which options go with which of the things to measure on.
-OF_DRIVE, OF_SIMULATION = {"truth"}, {"units", "seed"}
+OF_DRIVE, OF_SIMULATION = {"truth"}, {"units", "seed", "descriptors"}
 OF_KITTI, OF_NUSCENES = {"sequences", "frames"}, {"scenes", "frames"}
 
 
@@ -36,6 +36,12 @@ def register(subparsers: Any) -> None:
         "--units", metavar="N[,N]", help=f"number of units of each path, one per metre (default: {DEFAULT_UNITS})"
     )
     parser.add_argument("--seed", type=int, help="everything random about the paths follows from it (default: 0)")
+    parser.add_argument(
+        "--descriptors",
+        action="store_const",
+        const=True,
+        help="begin each path with descriptors on disk, and match them; else with matches",
+    )
     parser.add_argument("--kitti", type=Path, metavar="FOLDER", help="KITTI odometry: sequences/ and poses/")
     parser.add_argument("--sequences", metavar="LIST", help="as 00-10 or 00,05 (default: all that have true poses)")
     parser.add_argument("--nuscenes", type=Path, metavar="FOLDER", help="nuScenes: v1.0-*/ and samples/")
@@ -113,7 +119,14 @@ def _measure(arguments: argparse.Namespace, work: Path, settings: Any) -> Any:
     if arguments.simulate is not None:
         lengths = _lengths(arguments.units or DEFAULT_UNITS)
         return bench_output.GrowthOutput(
-            scaling.measure_growth(arguments.simulate, lengths, arguments.seed or 0, work, settings)
+            scaling.measure_growth(
+                arguments.simulate,
+                lengths,
+                arguments.seed or 0,
+                work,
+                settings,
+                descriptors=bool(arguments.descriptors),
+            )
         )
     if arguments.kitti is not None:
         sequences = datasets.kitti_sequences(arguments.kitti, arguments.sequences)

@@ -173,13 +173,15 @@ GROWTH_MEASURES: Mapping[str, Callable[[Growth, GrowthRow], str]] = {
     "route, m": lambda route, row: number(route.route_m, 0),
     "images": lambda route, row: str(route.images),
     "keypoints": lambda route, row: str(route.keypoints),
-    "verified matches": lambda route, row: str(route.verified_matches),
+    "verified matches": lambda route, row: _count(route.verified_matches or row.row.verified_matches),
     "units registered": lambda route, row: str(row.row.registered_units),
     "points": lambda route, row: _count(row.row.points),
     "observations": lambda route, row: _count(row.row.observations),
     "revisits believed, of tried": lambda route, row: (
         "-" if row.row.revisits_tried is None else f"{row.row.revisits_believed} of {row.row.revisits_tried}"
     ),
+    "sub-maps": lambda route, row: str(row.row.submaps),
+    "matching, s": lambda route, row: number(row.row.matching_s, 1),
     "mapping, s": lambda route, row: number(row.row.mapping_s, 1),
     "refinement, s": lambda route, row: number(row.row.refinement_s, 1),
     "both a unit, s": lambda route, row: number(row.per_unit_s, 3),

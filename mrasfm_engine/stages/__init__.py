@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
 from mrasfm_engine.stages._extraction_size import extraction_sizes
-from mrasfm_engine.stages._features import features
+from mrasfm_engine.stages._features import extract, features, store_features
 from mrasfm_engine.stages._mapping import mapping
 from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
 from mrasfm_engine.stages._own_car import own_cars
@@ -24,6 +24,7 @@ __all__ = [
     "components",
     "count_of_submaps",
     "cut_drive",
+    "extract",
     "extraction_sizes",
     "features",
     "in_units",
@@ -42,6 +43,7 @@ __all__ = [
     "probe",
     "run_submaps",
     "scene",
+    "store_features",
     "store_of",
     "unpack_pairs",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -40,12 +40,9 @@ def features(run: Run) -> Sequence[ImageFeatures]:
 
 def extract(run: Run) -> tuple[StoredFeatures, dict[str, Any]]:
     """The stage of the features and its report, whatever the images show."""
-
-    def work(stage: StageWriter) -> dict[str, Any]:
-        writer = FeatureWriter(stage)
-        by_class: Counter[str] = Counter()
-        left_out: dict[str, Incomplete] = {}
-        extracted = features_by_image(
+    return store_features(
+        run,
+        lambda: features_by_image(
             run.drive,
             run.extractor,
             threads=run.config.threads,
@@ -54,9 +51,22 @@ def extract(run: Run) -> tuple[StoredFeatures, dict[str, Any]]:
             own_cars=run.own_cars,
             progress=run.step(Stage.FEATURES),
             cancel=run.cancel,
-        )
-        with closing(extracted):
-            for image, found in zip(run.drive.images, extracted, strict=True):
+        ),
+    )
+
+
+def store_features(
+    run: Run, extracted: Callable[[], Generator[ImageFeatures | Incomplete, None, None]]
+) -> tuple[StoredFeatures, dict[str, Any]]:
+    """The stage and its report, of features in the order of the run's images, which are asked for where it is not done
+    already."""
+
+    def work(stage: StageWriter) -> dict[str, Any]:
+        writer = FeatureWriter(stage)
+        by_class: Counter[str] = Counter()
+        left_out: dict[str, Incomplete] = {}
+        with closing(extracted()) as every:
+            for image, found in zip(run.drive.images, every, strict=True):
                 writer.add(found)
                 if isinstance(found, Incomplete):
                     left_out[image.file] = found

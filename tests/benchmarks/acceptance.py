@@ -34,6 +34,8 @@
 | 30 | drives cut into sub-maps, beside the same in one piece |
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
+| 35 | the whole command on real drives beside COLMAP's extraction, matching and global mapper |
+| 36 | simulated routes whose descriptors lie on disk: memory and time of matching and mapping |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -83,12 +85,13 @@ from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.sigmas import halves, simulated
 from tests.benchmarks.simulated_routes import simulated_routes
-from tests.benchmarks.speed import long_routes, speed, surround_speed
+from tests.benchmarks.speed import from_descriptors, long_routes, speed, surround_speed
 from tests.benchmarks.stops import stops
 from tests.benchmarks.submaps import submaps
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
 from tests.benchmarks.vehicles import vehicles
+from tests.benchmarks.whole_command import whole_command
 from tests.benchmarks.wrong_manifests import wrong_manifests
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -138,6 +141,8 @@ LINES = {
     "30": Line(untimed=(submaps,)),
     "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
+    "35": Line(timed=(whole_command,)),
+    "36": Line(timed=(from_descriptors,)),
 }
 
 

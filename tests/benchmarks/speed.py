@@ -1,8 +1,9 @@
-"""Lines 2, 14 and 15: how fast mapping is, beside COLMAP on the same matches, and how it grows with the route."""
+"""Lines 2, 14, 15 and 36: how fast mapping is, beside COLMAP on the same matches, and how it grows with the route."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import statistics
 import subprocess
 import sys
@@ -27,6 +28,7 @@ ALONE = 2  # runs of ours without baselines
 PATIENCE = 1.25  # a baseline is given so many times what would do: it need not come to its end to be slower
 ROUTES = (500, 1000, 2000, 4541)
 MAX_GROWTH, MAX_MEMORY_GB, MAX_ERROR_PERCENT = 1.5, 8.0, 0.1
+FROM_DESCRIPTORS, MAX_FROM_DESCRIPTORS_GB = (500, 2000), 4.0
 
 
 def speed(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
@@ -69,6 +71,28 @@ def long_routes(data: Path, work: Path) -> Iterator[Figure]:
         value=per_unit_s[ROUTES[-1]] / per_unit_s[ROUTES[0]],
         most=MAX_GROWTH,
     )
+
+
+def from_descriptors(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 36: simulated routes of six cameras whose descriptors lie on disk, matched and mapped."""
+    figure = partial(Figure, line="36")
+    for units in FROM_DESCRIPTORS:
+        out = work / f"descriptors of {units}"
+        route = _bench("--simulate", "surround", "--units", units, "--descriptors", "--out", out)["routes"][0]
+        shutil.rmtree(out)
+        ours = route["mappers"][0]
+        title = f"{route['images']} images of {route['keypoints'] // route['images']} descriptors on disk"
+        if ours["failure"]:
+            raise AssertionError(f"{title}: {ours['failure']}")
+        yield figure(what=f"{title}: registered", value=ours["registered_units"], above=0.98 * units, most=units)
+        yield figure(what=f"{title}: sub-maps", value=ours["submaps"])
+        memory_gb = ours["peak_memory_bytes"] / 1e9
+        yield figure(what=f"{title}: peak memory", value=memory_gb, unit="GB", most=MAX_FROM_DESCRIPTORS_GB)
+        seconds = {"matching": ours["matching_s"], "mapping and refinement": ours["whole_s"]}
+        for name, value in seconds.items():
+            yield figure(what=f"{title}: {name}, a unit", value=1e3 * value / units, unit="ms")
+        error = ours["route_error_percent"]
+        yield figure(what=f"{title}: error of the route, of the length", value=error, unit="%", most=MAX_ERROR_PERCENT)
 
 
 def _beside_baselines(line: str, name: str, drive: Path, out: Path, repeat: int) -> Iterator[Figure]:
