@@ -30,16 +30,20 @@ class SimulatedImages:
     ----------
     keypoints
         Number of keypoints of every image; those that are no points of the route are its own.
+    seed
+        The same one gives the points the same descriptors, on all drives that see them.
+    number
+        Of the drive: each has images of its own.
     """
 
-    def __init__(self, route: LongRoute, *, keypoints: int, seed: int) -> None:
-        self._route, self._keypoints, self._seed = route, keypoints, seed
+    def __init__(self, route: LongRoute, *, keypoints: int, seed: int, number: int = 0) -> None:
+        self._route, self._keypoints, self._seed = route, keypoints, (seed, number)
         rng = np.random.default_rng([seed, len(route.points_m)])
         self._histograms = rng.standard_exponential((len(route.points_m), DESCRIPTOR_SIZE), dtype=np.float32)
 
     def __getitem__(self, image: int) -> ImageFeatures:
         """Features of an image, its keypoints in no order."""
-        route, rng = self._route, np.random.default_rng([self._seed, image])
+        route, rng = self._route, np.random.default_rng([*self._seed, image])
         camera = route.cameras[image % len(route.cameras)]
         own = max(self._keypoints - len(route.point[image]), 0)
         elsewhere = rng.uniform(0.0, [camera.width, camera.height], (own, 2)).astype(np.float32)
@@ -68,9 +72,9 @@ def _root_sift(histograms: Floats) -> Bytes:
     return result
 
 
-def store_descriptors(run: stages.Run, route: LongRoute, *, seed: int) -> int:
+def store_descriptors(run: stages.Run, route: LongRoute, *, seed: int, number: int = 0) -> int:
     """Leave the features of all images in the run's store, of each sub-map where the drive is cut; their number."""
-    images = SimulatedImages(route, keypoints=run.config.features.max_keypoints, seed=seed)
+    images = SimulatedImages(route, keypoints=run.config.features.max_keypoints, seed=seed, number=number)
     spans = stages.cut_drive(run)
     total, done = len(run.drive.images), 0
 

@@ -36,6 +36,7 @@
 | 32 | fisheyes of 190 deg beside pinholes |
 | 35 | the whole command on real drives beside COLMAP's extraction, matching and global mapper |
 | 36 | simulated routes whose descriptors lie on disk: memory and time of matching and mapping |
+| 37 | maps of 15 and of 60 simulated scenes: time and memory of a scene |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -70,6 +71,7 @@ from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.gaps import components_in_map, gaps
 from tests.benchmarks.learned import learned
+from tests.benchmarks.many_scenes import many_scenes
 from tests.benchmarks.motion import motion
 from tests.benchmarks.moving_objects import moving_objects
 from tests.benchmarks.occlusion import occlusion
@@ -143,6 +145,7 @@ LINES = {
     "32": Line(by_seed=(fisheyes,)),
     "35": Line(timed=(whole_command,)),
     "36": Line(timed=(from_descriptors,)),
+    "37": Line(timed=(many_scenes,)),
 }
 
 
