@@ -18,6 +18,16 @@ from numba import njit
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
+from mrasfm_engine.visualization.pixel_lattice import (
+    LINEAR,
+    SKIPPED,
+    all_shown,
+    between_nodes,
+    meets_car,
+    node_step,
+    place_nodes,
+    square_kind,
+)
 from mrasfm_engine.visualization.views import (
     MIN_RESOLUTION_PX,
     VIEW_M,
@@ -25,9 +35,11 @@ from mrasfm_engine.visualization.views import (
     View,
     find_pixel,
     height_at,
+    hidden_by_car,
     paint_views,
     place_view,
     sample,
+    shows,
 )
 
 RADIUS_M = 12.0  # beside the trajectory
@@ -139,6 +151,7 @@ class MosaicPainter:
                 placed.heights_m,
                 np.array([grid.left_m, grid.top_m, grid.cell_m, *placed.first_m]),
                 bounds,
+                node_step(grid.cell_m),
                 mosaic.owner,
                 mosaic.score,
                 mosaic.color,
@@ -186,50 +199,76 @@ def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: fl
     return 1 if s > score[1, row, column] else -1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
 def _paint(
     rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, centre: Any, rig_from_plan: Any, own_car: Any,
     kind: int, params: Any, gain: Any, camera: int, heights: Any, place: Any, bounds: Any,
-    owner: Any, score: Any, color: Any,
+    step: int, owner: Any, score: Any, color: Any,
 ) -> int:  # fmt: skip
     """Colour the cells that the image sees better than what is there; how many."""
-    left, top, cell, first_x, first_y = place[0], place[1], place[2], place[3], place[4]
+    cell, first = place[2], place[3:5]
+    x_first, y_first = place[0] + 0.5 * cell, place[1] - 0.5 * cell
     focal = math.sqrt(params[1, 0] * params[1, 1])
     work, pixel, cam = np.empty(6), np.empty(8), np.empty(3)
+    rows, columns, nodes = place_nodes(
+        x_first, y_first, cell, bounds, step, cam_from_plan[1], centre, kind, params[1], heights, first
+    )
+    given = place_nodes(
+        x_first, y_first, cell, bounds, step, cam_from_plan[0], centre, kind, params[0], heights, first
+    )[2]
     painted = 0
-    for row in range(bounds[0], bounds[1]):
-        y = top - (row + 0.5) * cell
-        for column in range(bounds[2], bounds[3]):
-            x = left + (column + 0.5) * cell
-            z = height_at(heights, x - first_x, y - first_y)
-            dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
-            d2 = dx * dx + dy * dy + above * above
-            if d2 > VIEW_M * VIEW_M:
-                continue
-            s = focal * above / d2  # foreshortening h / d times focal length over distance
-            if s < MIN_RESOLUTION_PX:
-                continue
-            layer = _layer_for(owner, score, row, column, camera, s)
-            if layer < 0:
-                continue
-            if not find_pixel(
-                rgb, usable, has_mask, cam_from_plan[1], rig_from_plan, own_car, kind, params[1], x, y, z, dx, dy,
-                above, work, pixel,
-            ):  # fmt: skip
-                continue
-            u, v = pixel[0], pixel[1]
-            if layer == 2:
-                owner[1, row, column], score[1, row, column] = owner[0, row, column], score[0, row, column]
-                for c in range(2):
+    for i, j in np.ndindex(len(rows) - 1, len(columns) - 1):
+        square = square_kind(nodes, i, j, rgb.shape[1], rgb.shape[0], focal, centre[2])
+        if square == SKIPPED:
+            continue
+        at_car = meets_car(rig_from_plan, own_car, x_first, y_first, cell, rows, columns, nodes, i, j, centre)
+        is_given_linear = all_shown(given, i, j)
+        for row in range(rows[i], rows[i + 1]):
+            y = y_first - row * cell
+            for column in range(columns[j], columns[j + 1]):
+                x = x_first + column * cell
+                if square == LINEAR:
+                    u, v, z = between_nodes(nodes, rows, columns, i, j, row, column)
+                else:
+                    z = height_at(heights, x - first[0], y - first[1])
+                dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
+                d2 = dx * dx + dy * dy + above * above
+                if d2 > VIEW_M * VIEW_M:
+                    continue
+                s = focal * above / d2  # foreshortening h / d times focal length over distance
+                if s < MIN_RESOLUTION_PX:
+                    continue
+                layer = _layer_for(owner, score, row, column, camera, s)
+                if layer < 0:
+                    continue
+                if square == LINEAR:
+                    if not shows(rgb, usable, has_mask, u, v):
+                        continue
+                    if at_car and hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above):
+                        continue
+                elif find_pixel(
+                    rgb, usable, has_mask, cam_from_plan[1], rig_from_plan, own_car, kind, params[1], x, y, z, dx,
+                    dy, above, work, pixel,
+                ):  # fmt: skip
+                    u, v = pixel[0], pixel[1]
+                else:
+                    continue
+                if layer == 2:
+                    owner[1, row, column], score[1, row, column] = owner[0, row, column], score[0, row, column]
+                    for c in range(2):
+                        for k in range(3):
+                            color[c, 1, row, column, k] = color[c, 0, row, column, k]
+                    layer = 0
+                owner[layer, row, column], score[layer, row, column] = camera, s
+                sample(rgb, u, v, gain, color[1, layer, row, column])
+                if is_given_linear:
+                    u, v, z = between_nodes(given, rows, columns, i, j, row, column)
+                    sample(rgb, u, v, gain, color[0, layer, row, column])
+                else:
+                    m = cam_from_plan[0]
                     for k in range(3):
-                        color[c, 1, row, column, k] = color[c, 0, row, column, k]
-                layer = 0
-            owner[layer, row, column], score[layer, row, column] = camera, s
-            sample(rgb, u, v, gain, color[1, layer, row, column])
-            m = cam_from_plan[0]
-            for i in range(3):
-                cam[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
-            if project(kind, params[0], cam[0], cam[1], cam[2], work, pixel):
-                sample(rgb, pixel[0], pixel[1], gain, color[0, layer, row, column])
-            painted += 1
+                        cam[k] = m[k, 0] * x + m[k, 1] * y + m[k, 2] * z + m[k, 3]
+                    if project(kind, params[0], cam[0], cam[1], cam[2], work, pixel):
+                        sample(rgb, pixel[0], pixel[1], gain, color[0, layer, row, column])
+                painted += 1
     return painted

@@ -15,6 +15,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mrasfm_engine.types import Bools, Bytes, Floats, Ints
+from mrasfm_engine.visualization.pixel_lattice import (
+    LINEAR,
+    SKIPPED,
+    between_nodes,
+    meets_car,
+    node_step,
+    place_nodes,
+    square_kind,
+)
 from mrasfm_engine.visualization.standing_points import STEP_M
 from mrasfm_engine.visualization.views import (
     MIN_RESOLUTION_PX,
@@ -24,7 +33,9 @@ from mrasfm_engine.visualization.views import (
     View,
     find_pixel,
     height_at,
+    hidden_by_car,
     sample,
+    shows,
 )
 
 CANDIDATES = 10  # of a cell: most of 15 m of path in steps of `PLACE_M`, for a camera that looks along it
@@ -129,6 +140,7 @@ def add_view(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float) ->
             candidates.row,
             candidates.column,
             bounds,
+            node_step(cell_m),
             candidates.count,
             candidates.color,
             candidates.quality,
@@ -165,11 +177,11 @@ def log_ratios(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float, 
     return found[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
 def _add(
     rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
     own_car: Any, kind: int, params: Any, heights: Any, first: Any, gain: Any, place: int, cell: float,
-    first_row: int, first_column: int, bounds: Any, count: Any, color: Any, quality: Any, places: Any,
+    first_row: int, first_column: int, bounds: Any, step: int, count: Any, color: Any, quality: Any, places: Any,
 ) -> int:  # fmt: skip
     """Offer the view to every cell; to how many it is added."""
     height, width = rgb.shape[0], rgb.shape[1]
@@ -178,59 +190,77 @@ def _add(
     rim = RIM_SHARE * min(width, height)
     work, pixel = np.empty(6), np.empty(8)
     seen = np.empty(3, np.uint8)
+    x_first, y_first = (first_column + 0.5) * cell, -(first_row + 0.5) * cell
+    rows, columns, nodes = place_nodes(
+        x_first, y_first, cell, bounds, step, cam_from_plan, centre, kind, params, heights, first
+    )
     added = 0
-    for row in range(bounds[0], bounds[1]):
-        y = -(first_row + row + 0.5) * cell
-        for column in range(bounds[2], bounds[3]):
-            x = (first_column + column + 0.5) * cell
-            z = height_at(heights, x - first[0], y - first[1])
-            dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
-            d2 = dx * dx + dy * dy + above * above
-            if d2 > VIEW_M * VIEW_M:
-                continue
-            s = focal * above / d2  # foreshortening h / d times focal length over distance
-            if s < MIN_RESOLUTION_PX:
-                continue
-            n: Any = np.int64(count[row, column])  # of unsigned numbers numba makes floats
-            at, worst = -1, 0
-            for k in range(n):
-                if places[row, column, k] == place:
-                    at = k
-                if quality[row, column, k] < quality[row, column, worst]:
-                    worst = k
-            if at < 0:
-                at = n if n < most else worst
-            beaten = 0.0 if at == n else quality[row, column, at] / QUALITY_UNIT
-            if s <= beaten:
-                continue
-            if not find_pixel(
-                rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, x, y, z, dx, dy,
-                above, work, pixel,
-            ):  # fmt: skip
-                continue
-            u, v = pixel[0], pixel[1]
-            inwards = min(min(u, width - u), min(v, height - v)) / rim
-            if inwards < 1.0:
-                s *= inwards * inwards * (3.0 - 2.0 * inwards)
-            if s <= beaten:
-                continue
-            if hidden[round(middle + dy / STEP_M), round(middle + dx / STEP_M)]:
-                seen[:] = HIDDEN
-            else:
-                sample(rgb, u, v, gain, seen)
-                raw = rgb[int(v), int(u)]
-                brightest = max(max(raw[0], raw[1]), raw[2])
-                if brightest > SATURATED or brightest < DARK:
-                    s *= LOST_SHARE
-                    if s <= beaten:
+    for i, j in np.ndindex(len(rows) - 1, len(columns) - 1):
+        square = square_kind(nodes, i, j, width, height, focal, centre[2])
+        if square == SKIPPED:
+            continue
+        at_car = meets_car(rig_from_plan, own_car, x_first, y_first, cell, rows, columns, nodes, i, j, centre)
+        for row in range(rows[i], rows[i + 1]):
+            y = y_first - row * cell
+            for column in range(columns[j], columns[j + 1]):
+                x = x_first + column * cell
+                if square == LINEAR:
+                    u, v, z = between_nodes(nodes, rows, columns, i, j, row, column)
+                else:
+                    z = height_at(heights, x - first[0], y - first[1])
+                dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
+                d2 = dx * dx + dy * dy + above * above
+                if d2 > VIEW_M * VIEW_M:
+                    continue
+                s = focal * above / d2  # foreshortening h / d times focal length over distance
+                if s < MIN_RESOLUTION_PX:
+                    continue
+                n: Any = np.int64(count[row, column])  # of unsigned numbers numba makes floats
+                at, worst = -1, 0
+                for k in range(n):
+                    if places[row, column, k] == place:
+                        at = k
+                    if quality[row, column, k] < quality[row, column, worst]:
+                        worst = k
+                if at < 0:
+                    at = n if n < most else worst
+                beaten = 0.0 if at == n else quality[row, column, at] / QUALITY_UNIT
+                if s <= beaten:
+                    continue
+                if square == LINEAR:
+                    if not shows(rgb, usable, has_mask, u, v):
                         continue
-            if at == n:
-                count[row, column] = n + 1
-            for k in range(3):
-                color[row, column, at, k] = seen[k]
-            quality[row, column, at] = int(min(max(s * QUALITY_UNIT, 1.0), 65535.0))
-            places[row, column, at] = place
-            added += 1
+                    if at_car and hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above):
+                        continue
+                elif find_pixel(
+                    rgb, usable, has_mask, cam_from_plan, rig_from_plan, own_car, kind, params, x, y, z, dx, dy,
+                    above, work, pixel,
+                ):  # fmt: skip
+                    u, v = pixel[0], pixel[1]
+                else:
+                    continue
+                inwards = min(min(u, width - u), min(v, height - v)) / rim
+                if inwards < 1.0:
+                    s *= inwards * inwards * (3.0 - 2.0 * inwards)
+                if s <= beaten:
+                    continue
+                if hidden[round(middle + dy / STEP_M), round(middle + dx / STEP_M)]:
+                    seen[:] = HIDDEN
+                else:
+                    sample(rgb, u, v, gain, seen)
+                    raw = rgb[int(v), int(u)]
+                    brightest = max(max(raw[0], raw[1]), raw[2])
+                    if brightest > SATURATED or brightest < DARK:
+                        s *= LOST_SHARE
+                        if s <= beaten:
+                            continue
+                if at == n:
+                    count[row, column] = n + 1
+                for k in range(3):
+                    color[row, column, at, k] = seen[k]
+                quality[row, column, at] = int(min(max(s * QUALITY_UNIT, 1.0), 65535.0))
+                places[row, column, at] = place
+                added += 1
     return added
 
 

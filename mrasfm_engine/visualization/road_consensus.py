@@ -78,7 +78,7 @@ def _mean(share: Floats32, seen: Bools) -> Floats32:
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
 def _decide(
     count: Any, color: Any, quality: Any, place: Any, cameras: int, result: Any, share: Any, places: Any
 ) -> None:

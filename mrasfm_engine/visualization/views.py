@@ -184,13 +184,26 @@ def find_pixel(
     c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
     if not project(kind, params, a, b, c, work, pixel):
         return False
-    if not (0.0 <= pixel[0] < rgb.shape[1] and 0.0 <= pixel[1] < rgb.shape[0]):
+    if not shows(rgb, usable, has_mask, pixel[0], pixel[1]):
         return False
-    if has_mask and not usable[int(pixel[1]), int(pixel[0])]:
+    return not hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above)
+
+
+@njit(cache=True, inline="always")
+def shows(rgb: Any, usable: Any, has_mask: bool, u: float, v: float) -> bool:
+    """Return whether a pixel is in the image, and usable."""
+    if not (0.0 <= u < rgb.shape[1] and 0.0 <= v < rgb.shape[0]):
         return False
-    return not (
-        inside_car(rig_from_plan, own_car, x, y, z)
-        or inside_car(rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above)
+    return bool(not has_mask or usable[int(v), int(u)])
+
+
+@njit(cache=True, inline="always")
+def hidden_by_car(
+    rig_from_plan: Any, own_car: Any, x: float, y: float, z: float, dx: float, dy: float, above: float
+) -> bool:
+    """Return whether a place, or what is over it on the line of sight, lies in the car's rectangle."""
+    return inside_car(rig_from_plan, own_car, x, y, z) or inside_car(
+        rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above
     )
 
 
