@@ -37,6 +37,16 @@ class ExportFormat:
 EXPORT_FORMATS = {
     known.name: known
     for known in (
+        ExportFormat(
+            name="colmap",
+            description="COLMAP workspace with undistorted pinhole images and masks, for 3DGS, nerfstudio and MVS",
+            needs_images=True,
+        ),
+        ExportFormat(
+            name="nerfstudio",
+            description="transforms.json with undistorted pinhole images, masks and points, for nerfstudio",
+            needs_images=True,
+        ),
         ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
         ExportFormat(
             name="geojson", description="path and positions of units and cameras as GeoJSON", needs_place=True

@@ -1,4 +1,4 @@
-"""What a writer of an export format is given, and what it must give back: the contract of `export.formats`."""
+"""Contract of the writers of `export.formats`: what they are given, and what they must give back."""
 
 from __future__ import annotations
 

@@ -7,11 +7,15 @@ writers, reads all files back by the checks that they return, withholds what fai
 
 from __future__ import annotations
 
+from mrasfm_engine.export.colmap_workspace import write_colmap
 from mrasfm_engine.export.contract import Writer
 from mrasfm_engine.export.geojson import write_geojson
 from mrasfm_engine.export.kitti_odometry import write_kitti
+from mrasfm_engine.export.nerfstudio import write_nerfstudio
 
 WRITERS: dict[str, Writer] = {
+    "colmap": write_colmap,
+    "nerfstudio": write_nerfstudio,
     "kitti": write_kitti,
     "geojson": write_geojson,
 }

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def scene_folder(tmp_path: Path) -> Path:
     return tmp_path / "scene"
 
 
-def _exported(folder: Path, *formats: str, **options: object) -> dict:
+def _exported(folder: Path, *formats: str, **options: object) -> dict[str, Any]:
     request = ExportRequest(
         folder=folder, out=folder.parent / "out", formats=formats, options=ExportOptions(**options), drives={}
     )
