@@ -379,6 +379,21 @@ class ExportActive(ServiceError, status=409):
     """The export is being made."""
 
 
+# Webhooks
+
+
+class AddressRefused(ServiceError, status=422):
+    """The address is not told anything."""
+
+
+class TooManyWebhooks(ServiceError, status=429):
+    """The project has as many webhooks as it may."""
+
+
+class DeliveryPending(ServiceError, status=409):
+    """The message is pending."""
+
+
 # Maps
 
 

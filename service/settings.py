@@ -103,6 +103,12 @@ class Settings(BaseSettings):
         1.0, description="an event stream checks for news, and whether its key is still valid, at this interval"
     )
 
+    # Webhooks
+    webhook_private_addresses: bool = Field(
+        False, description="webhooks may lead to addresses of private networks, and be unencrypted"
+    )
+    webhook_seconds: Seconds = Field(2.0, description="messages of webhooks that are due are looked for this often")
+
     # Quotas of a new project
     project_max_bytes: Bytes = Field(1_000_000_000_000, description="stored bytes of a new project")
     project_max_active_jobs: Count = Field(1_000, description="queued and running jobs of a new project")

@@ -23,13 +23,14 @@ from service.database.tables import (
     Scene,
     now_us,
 )
-from service.domain import exports, job_trees, jobs, maps, workers
+from service.domain import exports, job_trees, jobs, maps, webhooks, workers
 from service.job_queue import BrokerError, JobQueue, task_id
 from service.logs import log_fields
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
 from service.storage.garbage_collection import collect_orphans, collect_unused
 from worker.clock_guard import ClockGuard
+from worker.webhook_sender import WebhookSender
 
 log = logging.getLogger("mrasfm.reconciler")
 
@@ -51,6 +52,7 @@ class Reconciler:
         self._database = Database.from_settings(settings)
         self._artifacts = ArtifactStore(settings)
         self._job_queue = JobQueue(settings)
+        self._webhooks = WebhookSender(settings, self._database)
         self._broker_was_there = True
         self._clock_guard = ClockGuard(settings.lease_seconds)
         self._limits = jobs.RetryLimits.from_settings(settings)
@@ -68,6 +70,7 @@ class Reconciler:
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
                 ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
+                ("webhooks", self.send_webhooks, self._settings.webhook_seconds, 0.0),
                 ("orphans", self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
             )
         ]
@@ -131,6 +134,10 @@ class Reconciler:
         with self._database.write() as session:
             jobs.mark_enqueued(session, [job.id for job in missing])
 
+    def send_webhooks(self) -> None:
+        """Send the messages of webhooks that are due."""
+        self._webhooks.send_due()
+
     def sweep(self) -> None:
         """Delete what has passed its retention date, and bytes that nothing needs."""
         self._try("retention", self._expire)
@@ -152,6 +159,7 @@ class Reconciler:
         now = now_us()
         # Of their own: aggregations lock maps and scenes before drives.
         self._in_batches(lambda session: exports.forget_expired(session, now))
+        self._in_batches(lambda session: webhooks.forget_old(session, now))
         self._in_batches(lambda session: maps.forget_expired(session, now, unless=_is_exported))
         with self._database.read() as session:
             expired = session.scalars(select(Drive.id).where(Drive.expires_us < now)).all()

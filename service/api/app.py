@@ -38,6 +38,7 @@ from service.api.routes import (
     reconstructions,
     scenes,
     uploads,
+    webhooks,
 )
 from service.api.routes.documentation import add_documentation
 from service.database.tables import now_us
@@ -104,7 +105,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.state.readiness = Readiness(context)
-    modules = (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, exports, operations)
+    modules = (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, exports, webhooks, operations)
     routers = [*(module.router for module in modules), operations.metrics_route(metrics, settings.metrics_token)]
     for router in (*routers, heads_of(routers)):
         app.include_router(router)

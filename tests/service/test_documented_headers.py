@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.database.tables import WebhookDelivery
 from service.domain import exports
 from tests.helpers.live_api import Api, Client
 from tests.helpers.tiny_drive import tiny_drive
@@ -61,6 +62,7 @@ def heard(api: Api) -> dict[tuple[str, str], list[set[str]]]:
     said.ask("delete_export", "DELETE", f"/v1/exports/{export_id}", 204)
     _download(said, "map", f"/v1/maps/{map_id}/versions/current/files/points.ply")
     _delete(said, map_id, scene_id)
+    _webhook(said, drive_id)
     for name, url in (
         ("get_liveness", "/livez"),
         ("get_readiness", "/readyz"),
@@ -183,6 +185,23 @@ def _export(said: Conversation, url: str, of: str) -> str:
     said.ask("list_exports", "GET", "/v1/exports", 200)
     said.ask("get_export", "GET", f"/v1/exports/{export['id']}", 200)
     return str(export["id"])
+
+
+def _webhook(said: Conversation, drive_id: str) -> None:
+    asked, client = {"json": {"url": "https://example.org/hook"}}, said.client
+    said.ask("create_webhook", "POST", "/v1/webhooks", 422, json={"url": "http://example.org"})
+    url = f"/v1/webhooks/{said.post('create_webhook', '/v1/webhooks', 201, **asked)['id']}"
+    said.ask("list_webhooks", "GET", "/v1/webhooks", 200)
+    said.ask("get_webhook", "GET", url, 200)
+    said.post("rotate_webhook", f"{url}:rotate", 200)
+    client.post(f"/v1/jobs/{client.reconstruct(drive_id)['id']}:cancel")
+    (message,) = said.ask("list_deliveries", "GET", f"{url}/deliveries", 200).json()["items"]
+    again = f"{url}/deliveries/{message['id']}:retry"
+    said.ask("retry_delivery", "POST", again, 409)
+    with client.api.database.write() as session:
+        session.get_one(WebhookDelivery, message["id"]).state = "FAILED"
+    said.post("retry_delivery", again, 202)
+    said.ask("delete_webhook", "DELETE", url, 204)
 
 
 def _scene(client: Client, name: str) -> str:

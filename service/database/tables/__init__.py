@@ -22,6 +22,7 @@ from service.database.tables._results import (
     SceneFile,
 )
 from service.database.tables._service import IdempotencyKey, Pass, WorkerSeen
+from service.database.tables._webhooks import Webhook, WebhookDelivery
 
 __all__ = [
     "TERMINAL",
@@ -49,6 +50,8 @@ __all__ = [
     "Scene",
     "SceneFile",
     "Upload",
+    "Webhook",
+    "WebhookDelivery",
     "WorkerSeen",
     "new_id",
     "now_us",
