@@ -34,6 +34,7 @@
 | 30 | drives cut into sub-maps, beside the same in one piece |
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
+| 33 | exports of images for splatting; the client's wheel in an environment of its own |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -63,6 +64,7 @@ from tests.benchmarks.aggregation import crossing, kitti, loop, repeated, speed_
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.correspondence import correspondence
+from tests.benchmarks.export_formats import client_wheel, exports_of_images
 from tests.benchmarks.fisheyes import fisheyes
 from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
@@ -138,6 +140,7 @@ LINES = {
     "30": Line(untimed=(submaps,)),
     "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
+    "33": Line(untimed=(exports_of_images, client_wheel)),
 }
 
 

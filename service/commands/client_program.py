@@ -1,0 +1,28 @@
+"""`mrasfm-client`: all that a user does with a service, without the engine."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from service.commands import client_resources, map, upload
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `mrasfm-client` with its subcommands."""
+    parser = argparse.ArgumentParser(prog="mrasfm-client", description="Use an MRASfM service.")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    upload.register(subparsers)
+    map.register(subparsers)
+    client_resources.register_all(subparsers)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one subcommand."""
+    arguments = build_parser().parse_args(argv)
+    return int(arguments.run(arguments) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
