@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import fields
 from pathlib import Path
 
@@ -98,6 +99,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--tight", action="store_true", help="the manifest declares 0.01 degrees and 1 mm")
     parser.add_argument("--miscalibrated-camera", metavar="NAME", help="camera whose given rotation is wrong")
     add("--miscalibrated-by-deg", float, "error of that rotation, degrees")
+    parser.add_argument("--json", action="store_true", help="print the folders as a JSON list")
     parser.set_defaults(run=run)
 
 
@@ -122,6 +124,9 @@ def run(arguments: argparse.Namespace) -> int:
             bar.update(task, completed=done, total=total)
 
         folders = render_drives(options, arguments.out, force=arguments.force, progress=report)
+    if arguments.json:
+        print(json.dumps([str(folder) for folder in folders]))
+        return 0
     for folder in folders:
         print(folder)
     return 0

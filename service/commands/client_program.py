@@ -14,7 +14,7 @@ def build_parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     upload.register(subparsers)
     map.register(subparsers)
-    client_resources.register_all(subparsers)
+    client_resources.register_resources(subparsers)
     return parser
 
 

@@ -31,7 +31,7 @@ class Summary(CommandSummary):
     items: list[dict[str, Any]] = field(default_factory=list)
 
 
-def register_all(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommands."""
     parser = _command(subparsers, "list", "list what the project has", _list)
     parser.add_argument("what", choices=LISTS, help="kind of what is listed, newest first")
