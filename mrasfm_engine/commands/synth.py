@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
-from rich.progress import Progress
+from rich.console import Console
 
+from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.synthetic.options import SpeedProfile, SynthOptions, World
 
 
@@ -117,12 +119,8 @@ def run(arguments: argparse.Namespace) -> int:
     # The renderer's compiled kernels take a second to load; other subcommands do not pay for it.
     from mrasfm_engine.synthetic.drive_writer import render_drives
 
-    with Progress(transient=True) as bar:
-        task = bar.add_task("rendering", total=None)
-
-        def report(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with stage_progress(Console(stderr=True)) as progress:
+        report = partial(progress, "rendering")
         folders = render_drives(options, arguments.out, force=arguments.force, progress=report)
     if arguments.json:
         print(json.dumps([str(folder) for folder in folders]))
