@@ -47,6 +47,12 @@ EXPORT_FORMATS = {
             description="transforms.json with undistorted pinhole images, masks and points, for nerfstudio",
             needs_images=True,
         ),
+        ExportFormat(
+            name="copc",
+            description="points as a cloud-optimised point cloud in a coordinate reference system of your choice",
+            needs_place=True,
+            takes_crs=True,
+        ),
         ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
         ExportFormat(
             name="geojson", description="path and positions of units and cameras as GeoJSON", needs_place=True

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from mrasfm_engine.export.colmap_workspace import write_colmap
 from mrasfm_engine.export.contract import Writer
+from mrasfm_engine.export.copc_in_crs import write_copc_in_crs
 from mrasfm_engine.export.geojson import write_geojson
 from mrasfm_engine.export.kitti_odometry import write_kitti
 from mrasfm_engine.export.nerfstudio import write_nerfstudio
@@ -16,6 +17,7 @@ from mrasfm_engine.export.nerfstudio import write_nerfstudio
 WRITERS: dict[str, Writer] = {
     "colmap": write_colmap,
     "nerfstudio": write_nerfstudio,
+    "copc": write_copc_in_crs,
     "kitti": write_kitti,
     "geojson": write_geojson,
 }
