@@ -29,6 +29,8 @@ OPENCV = ("--cameras", 6, "--units", 12, "--seed", 7)
 FISHEYE_UNITS, SEED = 8, 3
 MOST_OF_OWN = 1.1  # median reprojection error of the pinhole images, in that of the scene
 MOST_MB = 60.0
+NERFSTUDIO = "MRASFM_TEST_NERFSTUDIO"  # names the interpreter of an environment with nerfstudio
+READER = Path(__file__).resolve().parents[1] / "foreign_readers" / "read_nerfstudio.py"
 SHOWN = 0.9  # of the scene's observations
 
 
@@ -67,6 +69,23 @@ def _workspace(title: str, drive: Path, work: Path) -> Iterator[Figure]:
     yield Figure(line=LINE, what=f"{title}: observations that they show", value=shown, above=SHOWN, most=1.5)
     yield exactly(LINE, f"{title}: cameras that 3DGS takes", _taken_by_splatting(model, out), len(model.cameras))
     yield exactly(LINE, f"{title}: frames of transforms.json with all their files", _frames(out), len(model.images))
+    yield from _of_nerfstudio(title, out, own, len(model.images))
+
+
+def _of_nerfstudio(title: str, out: Path, own_px: float, images: int) -> Iterator[Figure]:
+    """nerfstudio's parsers, where an environment with it is named."""
+    python = os.environ.get(NERFSTUDIO)
+    if not python:
+        yield Figure(line=LINE, what=f"{title}: nerfstudio: skipped", value=0, remark=f"{NERFSTUDIO} names none")
+        return
+    said = json.loads(_run([python, READER, out], out).strip().splitlines()[-1])
+    yield exactly(LINE, f"{title}: nerfstudio, images of both formats", said["images"], images)
+    yield exactly(LINE, f"{title}: nerfstudio, images of transforms.json", said["images_of_transforms"], images)
+    yield exactly(LINE, f"{title}: nerfstudio, all cameras are perspective", int(said["all_perspective"]), 1)
+    what = f"{title}: nerfstudio, median reprojection in that of the scene"
+    yield Figure(line=LINE, what=what, value=said["median_px"] / own_px, above=0.3, most=MOST_OF_OWN)
+    apart = said["formats_apart"]
+    yield Figure(line=LINE, what=f"{title}: nerfstudio, poses of the formats apart", value=apart, above=-1, most=1e-4)
 
 
 def _taken_by_splatting(model: pycolmap.Reconstruction, out: Path) -> int:
