@@ -1,4 +1,4 @@
-"""Prints what nerfstudio's parsers make of an export as `colmap` and `nerfstudio`, as JSON: `read_nerfstudio.py EXPORT`.
+"""Prints what nerfstudio's parsers make of an export with `colmap` and `nerfstudio`, as JSON: `... EXPORT`.
 
 nerfstudio brings gigabytes (torch with CUDA) and old versions of much else: it is no part of the lock. Acceptance line
 33 runs this where `MRASFM_TEST_NERFSTUDIO` names the interpreter of an environment that has it.
