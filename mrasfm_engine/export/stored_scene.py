@@ -108,10 +108,10 @@ def _map(folder: Path) -> ExportSource:
 
 
 def _manifest_in_map(store: StageStore, name: str, fingerprint: str) -> DriveManifest:
-    found = store.load(name, fingerprint)
+    found = store.open(name, fingerprint)  # its arrays, which may be large, are not needed
     if found is None:
         raise ValueError(f"it has no usable {SCENES_FOLDER}/{name}.npz")
-    return DriveManifest.model_validate(found[1]["manifest"])
+    return DriveManifest.model_validate(found.report["manifest"])
 
 
 def _frame_in_map(frame: Frame, scene: str) -> Frame:
