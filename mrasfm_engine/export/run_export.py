@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,10 +22,11 @@ from mrasfm_engine.export.stored_scene import read_source
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.types import Cancel, StageProgress
 from schemas import LabelMap
-from schemas.artifacts import MAP_FILE, REPORT_FILE, drive_of_scene
+from schemas.artifacts import REPORT_FILE, drive_of_scene
 from schemas.exports import EXPORT_FORMATS, MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX, unknown_formats
 
 VERSION = 1  # of the report
+REPORT_KEYS = {"version", "engine_version", "source", "options", "formats"}
 POINT_BYTES, IMAGE_BYTES = 400, 1000  # on disk, at most, of each in any format without images
 
 
@@ -164,13 +166,23 @@ def check_request(request: ExportRequest) -> None:
             remedy=_listed("Formats that do", (f.name for f in EXPORT_FORMATS.values() if f.takes_crs)),
             code="crs-not-taken",
         )
-    out = request.out
-    if out.resolve() == request.folder.resolve() or any((out / name).is_file() for name in ("poses.json", MAP_FILE)):
+    if not _may_be_replaced(request.out):
         raise InputError(
-            f"{out} holds a scene or a map, whose report an export would replace",
-            remedy="Give another folder for the export.",
+            f"{request.out} is not empty, and holds no earlier export: its files could be replaced",
+            remedy="Give a new or empty folder for the export, or that of an earlier one.",
             code="bad-out-folder",
         )
+
+
+def _may_be_replaced(out: Path) -> bool:
+    """Return whether nothing is lost where a folder becomes an export's."""
+    if not out.is_dir() or all(path.name.startswith(".") for path in out.iterdir()):
+        return True
+    try:
+        report = json.loads((out / REPORT_FILE).read_bytes())
+        return set(report) == REPORT_KEYS and set(report["formats"]) <= EXPORT_FORMATS.keys()
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
 
 
 def _listed(what: str, names: Iterator[str]) -> str:

@@ -197,6 +197,11 @@ def test_what_a_scene_does_not_have_is_refused_by_name(scene_folder: Path, tmp_p
     assert refused(options=ExportOptions(image_size_px=5)).code == "bad-image-size"
     assert refused(options=ExportOptions(crs="EPSG:25832")).code == "crs-not-taken"
     assert refused(out=scene_folder).code == "bad-out-folder"
+    (tmp_path / "mine" / "kitti").mkdir(parents=True)
+    assert refused(out=tmp_path / "mine").code == "bad-out-folder"
+    (tmp_path / "mine" / "report.json").write_text('{"version": 1, "formats": {}}')
+    assert refused(out=tmp_path / "mine").code == "bad-out-folder", "another program's report"
+    assert (tmp_path / "mine" / "kitti").is_dir()
     assert refused(folder=tmp_path / "none").code == "not-a-scene"
     (scene_folder / "poses.json").write_text("{}")
     assert "poses.json" in refused().what
