@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
@@ -17,6 +18,7 @@ from mrasfm_engine.errors import CancelledError, MrasfmError
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+EXIT_UNREAD = 141  # as of a program that a broken pipe ends
 GROUP = "mrasfm.commands"
 INDEX = Path(__file__).with_name("command_index.json")  # what each subcommand does, by its name
 DESCRIPTION = "Multi-camera drives to metric maps."
@@ -80,7 +82,12 @@ def main(argv: list[str] | None = None) -> int:
     entries = [commands[words[0]]] if words[0] in commands else list(commands.values())
     arguments = _parser_of([] if words[0] == "--version" else entries).parse_args(words)
     try:
-        return int(arguments.run(arguments) or 0)
+        code = int(arguments.run(arguments) or 0)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # who reads has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_UNREAD
     except CancelledError as error:
         print(f"mrasfm: {error}", file=sys.stderr)
         return EXIT_INTERRUPTED

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 
 from service.commands import client_resources, map, upload
+
+EXIT_UNREAD = 141  # as of a program that a broken pipe ends
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -21,7 +24,13 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run one subcommand."""
     arguments = build_parser().parse_args(argv)
-    return int(arguments.run(arguments) or 0)
+    try:
+        code = int(arguments.run(arguments) or 0)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who reads has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_UNREAD
+    return code
 
 
 if __name__ == "__main__":

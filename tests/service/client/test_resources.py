@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -178,3 +181,19 @@ def test_commands(
         ("export", scene_id, "--format", "kitti", "--image-size", "3"),
     ):
         assert run(client, capsys, *words)[0] == 2, words
+
+
+def test_who_stops_reading_gets_no_traceback(client: Owner) -> None:
+    """As `mrasfm-client list drives | head -1`."""
+    for _ in range(3):
+        client.create()
+    command = [sys.executable, "-m", "service.commands.client_program", "list", "drives", "--url", client.api.url]
+    environment = {**os.environ, "MRASFM_API_KEY": client.key, "PYTHONUNBUFFERED": "1"}
+    done = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert done.stdout is not None
+    done.stdout.close()
+    assert done.stderr is not None
+    said = done.stderr.read().decode()
+    done.stderr.close()
+    assert done.wait(30) == 141
+    assert "Traceback" not in said
