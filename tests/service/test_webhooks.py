@@ -7,10 +7,14 @@ import json
 from typing import Any
 
 import pytest
+from sqlalchemy import false
 from sqlalchemy.orm import Session
 
-from service.database.tables import WebhookDelivery
-from service.domain import jobs, webhooks
+from schemas.api.jobs import JobKind
+from schemas.api.webhooks import WebhookRequest
+from service.database.connections import Database
+from service.database.tables import Export, Scene, WebhookDelivery, now_us
+from service.domain import exports, jobs, maps, webhooks
 from tests.helpers.live_api import Client, problem_of
 
 URL = "https://example.org/hooks/mrasfm?from=us"
@@ -146,3 +150,49 @@ def test_a_project_has_a_bound(client: Client) -> None:
 )  # fmt: skip
 def test_addresses_of_the_internet(address: str, public: bool) -> None:
     assert webhooks.is_public(address) is public
+
+
+def test_messages_are_taken_once_in_every_database(database: Database, project_id: str) -> None:
+    """Two senders at one time get different messages."""
+    with database.write() as session:
+        asked = WebhookRequest(url=URL)
+        webhooks.create(session, project_id=project_id, asked=asked, allow_private=False)
+        for _ in range(3):
+            job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
+            jobs.request_cancel(session, job.id)
+    with database.read() as session:
+        assert webhooks.is_any_due(session)
+    with database.write() as session:
+        first = webhooks.take(session, limit=2)
+    with database.write() as session:
+        rest = webhooks.take(session, limit=2)
+    assert len({message.id for message in (*first, *rest)}) == 3
+    with database.write() as session:
+        for message in first:
+            webhooks.note(session, message, webhooks.Outcome(status=200))
+        webhooks.note(session, rest[0], webhooks.Outcome(status=410, error="answered 410"))
+    with database.write() as session:
+        assert webhooks.forget_old(session, now_us() + 2 * webhooks.KEPT_US) == 3
+        assert not webhooks.is_any_due(session)
+
+
+def test_retention_in_every_database(database: Database, project_id: str) -> None:
+    """Exports that were never made and whose job has gone, and scenes that are being exported."""
+    with database.write() as session:
+        job = jobs.create(
+            session, project_id=project_id, kind=JobKind.EXPORT, drive_id=None, request={"export_id": "exp_1"}
+        )
+        scene = {"project_id": project_id, "drive_id": "drv_1", "name": "s", "fence": 1, "summary": {}, "expires_us": 1}
+        session.add_all([Scene(id="scn_1", job_id="job_1", **scene), Scene(id="scn_2", job_id="job_2", **scene)])
+        session.flush()
+        common = {"project_id": project_id, "inputs_sha256": "0" * 64, "formats": [], "options": {}}
+        session.add(Export(id="exp_1", scene_id="scn_1", job_id=job.id, **common))
+        session.add(Export(id="exp_2", scene_id="scn_1", job_id="job_gone", **common))
+    with database.write() as session:
+        assert exports.forget_expired(session, 2) == 1
+        is_exported = exports.is_exported(Export.scene_id == Scene.id)
+        assert maps.forget_expired(session, 2, unless=lambda table: is_exported if table is Scene else false()) == 1
+    with database.read() as session:
+        assert session.get(Scene, "scn_1") is not None
+        assert session.get(Scene, "scn_2") is None
+        assert session.get(Export, "exp_2") is None
