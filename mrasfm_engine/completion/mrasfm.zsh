@@ -448,7 +448,7 @@ _shtab_mrasfm_upload_defaults_added=0
 
 _shtab_mrasfm_worker_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "--queues[checks (of drives), reconstructions, or both separated by a comma (default\: both)]:queues:"
+  "--queues[checks (of drives, and exports), reconstructions, or both separated by a comma (default\: both)]:queues:"
   "--concurrency[jobs at one time (default\: 1)]:concurrency:"
   "--log-level[least severe messages]:log_level:(debug info warning error)"
 )
