@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 ACCEPTANCE ?=
 
-.PHONY: help setup demo test check docs acceptance lock schema clean
+.PHONY: help setup demo test check docs acceptance lock wheels schema clean
 
 help: ## what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -48,8 +48,12 @@ lock: ## renew the locks: of pyproject.toml all, and what the container image ne
 	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
 	  -o tests/foreign_readers/requirements.lock
 
+wheels: setup ## the wheels of mrasfm and of mrasfm-client, in dist/
+	$(BIN)/python .ci/build_client.py build/client
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./build/client
+
 schema: setup ## export the JSON Schema of the drive manifest
 	$(BIN)/python -m schemas.export
 
 clean: ## remove what make made
-	rm -rf .venv demo build *.egg-info
+	rm -rf .venv demo build dist *.egg-info

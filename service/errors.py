@@ -360,6 +360,40 @@ class CheckActive(ServiceError, status=409):
     """The drive has its check."""
 
 
+# Exports
+
+
+class NotGeoreferenced(ServiceError, status=422):
+    """The result is not georeferenced."""
+
+
+class CrsNotTaken(ServiceError, status=422):
+    """No format takes a coordinate reference system."""
+
+
+class ExportDeleted(ServiceError, status=409):
+    """The export was deleted."""
+
+
+class ExportActive(ServiceError, status=409):
+    """The export is being made."""
+
+
+# Webhooks
+
+
+class AddressRefused(ServiceError, status=422):
+    """The address is not told anything."""
+
+
+class TooManyWebhooks(ServiceError, status=429):
+    """The project has as many webhooks as it may."""
+
+
+class DeliveryPending(ServiceError, status=409):
+    """The message is pending."""
+
+
 # Maps
 
 

@@ -103,6 +103,12 @@ class Settings(BaseSettings):
         1.0, description="an event stream checks for news, and whether its key is still valid, at this interval"
     )
 
+    # Webhooks
+    webhook_private_addresses: bool = Field(
+        False, description="webhooks may lead to addresses of private networks, and be unencrypted"
+    )
+    webhook_seconds: Seconds = Field(2.0, description="messages of webhooks that are due are looked for this often")
+
     # Quotas of a new project
     project_max_bytes: Bytes = Field(1_000_000_000_000, description="stored bytes of a new project")
     project_max_active_jobs: Count = Field(1_000, description="queued and running jobs of a new project")
@@ -151,6 +157,9 @@ class Settings(BaseSettings):
     scene_retention_days: Days | None = Field(None, description="scenes are deleted after this time; by default never")
     map_retention_days: Days | None = Field(
         None, description="maps are deleted this long after their newest version; by default never"
+    )
+    export_retention_days: Days | None = Field(
+        None, description="exports are deleted after this time; by default with their scene or map"
     )
     job_retention_days: Days | None = Field(
         None, description="jobs, and maps without a version, are deleted after this time; by default never"

@@ -10,14 +10,27 @@ from sqlalchemy import ColumnElement, delete, or_, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.database.connections import Database, clock_us
-from service.database.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, Pass, now_us
-from service.domain import job_trees, jobs, maps, workers
+from service.database.tables import (
+    TERMINAL,
+    Drive,
+    Export,
+    IdempotencyKey,
+    Job,
+    JobMember,
+    Map,
+    MapScene,
+    Pass,
+    Scene,
+    now_us,
+)
+from service.domain import exports, job_trees, jobs, maps, webhooks, workers
 from service.job_queue import BrokerError, JobQueue, task_id
 from service.logs import log_fields
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
 from service.storage.garbage_collection import collect_orphans, collect_unused
 from worker.clock_guard import ClockGuard
+from worker.webhook_sender import WebhookSender
 
 log = logging.getLogger("mrasfm.reconciler")
 
@@ -39,6 +52,7 @@ class Reconciler:
         self._database = Database.from_settings(settings)
         self._artifacts = ArtifactStore(settings)
         self._job_queue = JobQueue(settings)
+        self._webhooks = WebhookSender(settings, self._database)
         self._broker_was_there = True
         self._clock_guard = ClockGuard(settings.lease_seconds)
         self._limits = jobs.RetryLimits.from_settings(settings)
@@ -56,6 +70,7 @@ class Reconciler:
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
                 ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
+                ("webhooks", self.send_webhooks, self._settings.webhook_seconds, 0.0),
                 ("orphans", self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
             )
         ]
@@ -119,6 +134,10 @@ class Reconciler:
         with self._database.write() as session:
             jobs.mark_enqueued(session, [job.id for job in missing])
 
+    def send_webhooks(self) -> None:
+        """Send the messages of webhooks that are due."""
+        self._webhooks.send_due()
+
     def sweep(self) -> None:
         """Delete what has passed its retention date, and bytes that nothing needs."""
         self._try("retention", self._expire)
@@ -139,7 +158,9 @@ class Reconciler:
         """Each transaction is short: while one deletes, SQLite lets no worker say that it lives."""
         now = now_us()
         # Of their own: aggregations lock maps and scenes before drives.
-        self._in_batches(lambda session: maps.forget_expired(session, now))
+        self._in_batches(lambda session: exports.forget_expired(session, now))
+        self._in_batches(lambda session: webhooks.forget_old(session, now))
+        self._in_batches(lambda session: maps.forget_expired(session, now, unless=_is_exported))
         with self._database.read() as session:
             expired = session.scalars(select(Drive.id).where(Drive.expires_us < now)).all()
         for drive_id in expired:
@@ -168,6 +189,10 @@ class Reconciler:
             wanted = of_jobs.where(JobMember.drive_id == drive_id, Job.state.not_in(TERMINAL))
             idle = ~or_(active.exists(), in_map.exists(), wanted.exists())
             session.execute(delete(Drive).where(Drive.id == drive_id, Drive.expires_us < now, idle))
+
+
+def _is_exported(table: type[Map] | type[Scene]) -> ColumnElement[bool]:
+    return exports.is_exported((Export.map_id == Map.id) if table is Map else (Export.scene_id == Scene.id))
 
 
 def _delete_some(session: Session, condition: ColumnElement[bool], *key: InstrumentedAttribute[str]) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from mrasfm_engine.commands.named_path import split_name
-from mrasfm_engine.commands.reconstruct import cancel_on_interrupt
+from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, print_report
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
@@ -29,6 +29,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--into", type=Path, metavar="MAP", help="add the scenes to this map")
     parser.add_argument("--remove", action="append", default=[], metavar="NAME", help="take a scene out of the map")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
+    parser.add_argument("--json", action="store_true", help="print report.json instead of a summary")
     parser.set_defaults(run=run)
 
 
@@ -48,7 +49,10 @@ def run(arguments: argparse.Namespace) -> int:
         report = aggregate(
             scenes, out, config, into=arguments.into, remove=arguments.remove, progress=progress, cancel=cancelled
         )
-    _say(report, map_document(out), out)
+    if arguments.json:
+        print_report(out)
+    else:
+        _say(report, map_document(out), out)
     return 0
 
 

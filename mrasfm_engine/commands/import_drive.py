@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,7 @@ def register(subparsers: Any) -> None:
     files.add_argument("--link", action="store_true", help="hard-link images where possible (the default)")
     files.add_argument("--copy", action="store_true", help="copy images")
     parser.add_argument("--force", action="store_true", help="replace a drive that is already at DRIVE")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a summary")
     parser.set_defaults(run=run)
 
 
@@ -54,6 +57,9 @@ def run(arguments: argparse.Namespace) -> int:
         copy=arguments.copy,
         force=arguments.force,
     )
+    if arguments.json:
+        print(json.dumps(asdict(summary), default=str))
+        return 0
     print(
         f"Imported {arguments.folder} ({summary.layout}): {summary.cameras} cameras, {summary.units} units, "
         f"{summary.images} images\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import threading
 from collections import Counter
@@ -16,7 +17,7 @@ from rich.console import Console
 
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
-from schemas.artifacts import component_folder
+from schemas.artifacts import REPORT_FILE, component_folder
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -30,6 +31,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the scene")
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
+    parser.add_argument("--json", action="store_true", help="print report.json instead of a summary")
     parser.set_defaults(run=run)
 
 
@@ -47,8 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
         stage_progress(console) as progress,
     ):
         report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled, is_new=True)
-    _say(report, arguments.out)
+    if arguments.json:
+        print_report(arguments.out)
+    else:
+        _say(report, arguments.out)
     return 0
+
+
+def print_report(out: Path) -> None:
+    """Print the report of a scene or map on one line, as it was written."""
+    print(json.dumps(json.loads((out / REPORT_FILE).read_text(encoding="utf-8")), ensure_ascii=False))
 
 
 @contextmanager

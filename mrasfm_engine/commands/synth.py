@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
-from rich.progress import Progress
+from rich.console import Console
 
+from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.synthetic.options import SpeedProfile, SynthOptions, World
 
 
@@ -98,6 +101,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--tight", action="store_true", help="the manifest declares 0.01 degrees and 1 mm")
     parser.add_argument("--miscalibrated-camera", metavar="NAME", help="camera whose given rotation is wrong")
     add("--miscalibrated-by-deg", float, "error of that rotation, degrees")
+    parser.add_argument("--json", action="store_true", help="print the folders as a JSON list")
     parser.set_defaults(run=run)
 
 
@@ -115,13 +119,12 @@ def run(arguments: argparse.Namespace) -> int:
     # The renderer's compiled kernels take a second to load; other subcommands do not pay for it.
     from mrasfm_engine.synthetic.drive_writer import render_drives
 
-    with Progress(transient=True) as bar:
-        task = bar.add_task("rendering", total=None)
-
-        def report(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with stage_progress(Console(stderr=True)) as progress:
+        report = partial(progress, "rendering")
         folders = render_drives(options, arguments.out, force=arguments.force, progress=report)
+    if arguments.json:
+        print(json.dumps([str(folder) for folder in folders]))
+        return 0
     for folder in folders:
         print(folder)
     return 0

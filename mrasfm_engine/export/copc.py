@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.export.octree import GRID, Octree, build_octree
-from mrasfm_engine.geometry import utm
-from mrasfm_engine.scene.scene import Georeference, Scene
+from mrasfm_engine.geometry.earth_system import EarthSystem, utm_system
+from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import CLASS_NAMES, ROAD
 from mrasfm_engine.types import Floats, Ints32
 
@@ -53,19 +53,26 @@ def fits(scene: Scene) -> bool:
     return len(scene.points_m) > 0 and bool(reach_m <= REACH_M)
 
 
-def write_copc(scene: Scene, path: Path) -> None:
+def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> None:
     """Write the points in steps of 0.1 mm: as UTM and ellipsoidal height, in the local frame without a place on earth.
 
     They must fit.
+
+    Parameters
+    ----------
+    system
+        In place of UTM, of a scene with a place on the earth; steps are then a tenth of a thousandth of its unit.
 
     Raises
     ------
     OSError
         Where the file cannot be written.
+    InputError
+        Where the points have no coordinates in the system.
     """
-    place = scene.georeference
-    wkt = "" if place is None else utm.well_known_text(_zone(place))
-    offset_m, steps = coordinates(scene)
+    system = system or _system_of(scene)
+    wkt = "" if system is None else system.well_known_text
+    offset_m, steps = coordinates(scene, system)
     low, high = steps.min(axis=0), steps.max(axis=0)
     octree = build_octree((steps - low).view(np.uint32))  # without a sign: they may be 400 km apart
     laszip = lazrs.LazVlr.new_for_compression(POINT_FORMAT, POINT["point_id"].itemsize * len(EXTRA), True)
@@ -91,25 +98,29 @@ def write_copc(scene: Scene, path: Path) -> None:
     path.write_bytes(file.getbuffer())
 
 
-def coordinates(scene: Scene) -> tuple[Floats, Ints32]:
+def coordinates(scene: Scene, system: EarthSystem | None) -> tuple[Floats, Ints32]:
     """Offset (3,) in metres, and the points (n, 3) in steps from it, in the file's coordinate reference system."""
-    place = scene.georeference
-    offset_m = np.zeros(3) if place is None else np.floor(_projected(np.zeros((1, 3)), place)[0])
+    offset_m = np.zeros(3) if system is None else np.floor(_projected(scene, np.zeros((1, 3)), system)[0])
     steps = np.empty(scene.points_m.shape, dtype=np.int32)
     for first in range(0, len(steps), BLOCK):
         block = slice(first, first + BLOCK)
         points_m = scene.points_m[block]
-        points_m = points_m if place is None else _projected(points_m, place)
-        steps[block] = np.rint((points_m - offset_m) / STEP_M)
+        points_m = points_m if system is None else _projected(scene, points_m, system)
+        counted = np.rint((points_m - offset_m) / STEP_M)
+        if np.abs(counted).max() > np.iinfo(np.int32).max:
+            raise ValueError("a point is too far from the origin for its 32 bits")
+        steps[block] = counted
     return offset_m, steps
 
 
-def _projected(points_m: Floats, place: Georeference) -> Floats:
-    return utm.utm_from_local(points_m, place.ecef_from_local, _zone(place))
+def _projected(scene: Scene, points_m: Floats, system: EarthSystem) -> Floats:
+    assert scene.georeference is not None
+    return system.projected(points_m, scene.georeference.ecef_from_local)
 
 
-def _zone(place: Georeference) -> int:
-    return utm.epsg_code(place.origin_latitude_deg, place.origin_longitude_deg)
+def _system_of(scene: Scene) -> EarthSystem | None:
+    place = scene.georeference
+    return None if place is None else utm_system(place.origin_latitude_deg, place.origin_longitude_deg)
 
 
 def _chunks(scene: Scene, steps: Ints32, octree: Octree) -> Iterator[NDArray[np.void]]:

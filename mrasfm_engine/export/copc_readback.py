@@ -149,12 +149,18 @@ def _record(file: BinaryIO, kind: np.dtype[Any]) -> Record:
     return Record(head, file.read(size))
 
 
-def copc(scene: Scene, found: CopcFile) -> Rows:
-    """Every field of the file, and every point's coordinates in the file's coordinate reference system."""
+def copc(scene: Scene, found: CopcFile, *, text: str | None = None) -> Rows:
+    """Every field of the file, and every point's coordinates in the file's coordinate reference system.
+
+    Parameters
+    ----------
+    text
+        WKT 1 of that system, where it is not UTM.
+    """
     yield from _records(scene, found)
     yield from _header(scene, found)
     yield from _nodes(found)
-    yield from _points(scene, found)
+    yield from _points(scene, found, text)
 
 
 def _records(scene: Scene, found: CopcFile) -> Rows:
@@ -220,14 +226,15 @@ def _nodes(found: CopcFile) -> Rows:
     yield Row("where a node's points are", nodes["at"].astype(np.int64), begins)
 
 
-def _points(scene: Scene, found: CopcFile) -> Rows:
+def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
     header, information = found.header, found.information
     offset_m = header["offset"]
     system = None
     if scene.georeference is not None:
         place, text = scene.georeference, found.records[2].data
         code = utm.epsg_code(place.origin_latitude_deg, place.origin_longitude_deg)
-        yield Row("its coordinate reference system", text, utm.well_known_text(code).encode() + b"\0")
+        expected = utm.well_known_text(code) if wanted is None else wanted
+        yield Row("its coordinate reference system", text, expected.encode() + b"\0")
         system = _transformer(text)
     origin_m = np.zeros(3) if system is None else _projected(scene, np.zeros((1, 3)), system)[0] - 0.5
     yield Row("its offset, whole metres,", offset_m, np.rint(offset_m))
@@ -266,14 +273,21 @@ def _points(scene: Scene, found: CopcFile) -> Rows:
 
 @cache
 def _transformer(text: bytes) -> Transformer:
-    """Transformer of earth-centred coordinates to the system that the file names."""
-    return Transformer.from_crs("EPSG:4978", CRS.from_wkt(text.decode("ascii").removesuffix("\0")), always_xy=True)
+    """Transformer of longitude, latitude and height to the system that the file names."""
+    return Transformer.from_crs("EPSG:4979", CRS.from_wkt(text.decode("ascii").removesuffix("\0")), always_xy=True)
+
+
+@cache
+def _geodetic() -> Transformer:
+    """Transformer of earth-centred coordinates: PROJ would put them on another system's ellipsoid, 0.1 mm off."""
+    return Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
 
 
 def _projected(scene: Scene, points_m: Floats, system: Transformer) -> Floats:
     assert scene.georeference is not None
     matrix = scene.georeference.ecef_from_local
-    return np.stack(system.transform(*(points_m @ matrix[:3, :3].T + matrix[:3, 3]).T), -1)
+    places = _geodetic().transform(*(points_m @ matrix[:3, :3].T + matrix[:3, 3]).T)
+    return np.stack(system.transform(*places), -1)
 
 
 def _classification(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:

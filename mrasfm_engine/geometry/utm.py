@@ -40,8 +40,12 @@ def well_known_text(code: int) -> str:
 
     A projected system of three axes has no such form: it is the system of two axes beside one of heights.
     """
-    zone = CRS.from_epsg(code)
-    return f'COMPD_CS["{zone.name} + Ellipsoid (metre)",{zone.to_wkt("WKT1_GDAL")},{_ELLIPSOIDAL_HEIGHT}]'
+    return with_ellipsoidal_heights(CRS.from_epsg(code))
+
+
+def with_ellipsoidal_heights(system: CRS) -> str:
+    """A projected system of two axes beside one of ellipsoidal heights in metres, as WKT 1."""
+    return f'COMPD_CS["{system.name} + Ellipsoid (metre)",{system.to_wkt("WKT1_GDAL")},{_ELLIPSOIDAL_HEIGHT}]'
 
 
 @cache

@@ -30,6 +30,8 @@ _TAGS = [
     {"name": "jobs", "description": "How far it is and what became of it; cancel and repeat."},
     {"name": "scenes", "description": "What reconstructions made, to download."},
     {"name": "maps", "description": "Several drives or scenes in one, version by version."},
+    {"name": "exports", "description": "Scenes and maps in formats of other programs, as jobs."},
+    {"name": "webhooks", "description": "Addresses that are told when jobs end."},
     {"name": "operation", "description": "How the service itself is."},
 ]
 _IDS = {
@@ -37,6 +39,9 @@ _IDS = {
     "upload_id": "of the upload, `upl_...`",
     "job_id": "of the job, `job_...`",
     "scene_id": "of the scene, `scn_...`",
+    "webhook_id": "of the webhook, `whk_...`",
+    "delivery_id": "of the message, `msg_...`",
+    "export_id": "of the export, `exp_...`",
     "map_id": "of the map, `map_...`",
     "version": "the version's number, or `current`",
     "path": "the file's name with its folders; slashes stay as they are",

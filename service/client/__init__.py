@@ -11,6 +11,7 @@ What can go wrong is a `ClientError`: an `ApiError` carries the problem that the
 """
 
 from service.client.api import Client, JobEvent, Result
+from service.client.async_client import AsyncClient
 from service.client.download import Downloaded, download
 from service.client.drive_folder import DriveFolder, LocalFile
 from service.client.errors import ApiError, ClientError, DriveFolderError, SceneFolderError, UnreachableError
@@ -22,6 +23,7 @@ from service.client.upload_state import UploadState
 __all__ = [
     "ENDED",
     "ApiError",
+    "AsyncClient",
     "Client",
     "ClientError",
     "Downloaded",

@@ -9,18 +9,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 import httpx
 from pydantic import BaseModel, ValidationError
 
 from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource
+from schemas.api.exports import ExportFileResource, ExportRequest, ExportResource
 from schemas.api.jobs import JobResource, ReconstructionSettings
-from schemas.api.maps import MapFileResource, MapVersionResource
+from schemas.api.maps import MapFileResource, MapResource, MapVersionResource
+from schemas.api.resource import Page
 from schemas.api.scenes import SceneFileResource, SceneResource
 from schemas.api.status import ServiceStatus
 from schemas.api.uploads import UploadResource
+from schemas.api.webhooks import DeliveryResource, WebhookRequest, WebhookResource, WebhookWithSecret
 from service.client.drive_folder import LocalFile
 from service.client.errors import ClientError
 from service.client.transport import (
@@ -35,8 +38,10 @@ from service.client.transport import (
 from service.digests import format_digest
 
 Model = TypeVar("Model", bound=BaseModel)
-Result = SceneResource | MapVersionResource
-ResultFile = SceneFileResource | MapFileResource
+Item = TypeVar("Item", bound=BaseModel)
+Result = SceneResource | MapVersionResource | ExportResource
+ResultFile = SceneFileResource | MapFileResource | ExportFileResource
+PAGE = 200  # items that are asked for at one time
 RETRY_S = 300.0  # a service that is being restarted, or moved
 FIRST_RETRY_S = 6.0
 _TUS = {"Tus-Resumable": "1.0.0"}
@@ -137,6 +142,14 @@ class Client:
         """One drive."""
         return self._get(f"/v1/drives/{_part(drive_id)}", DriveResource)
 
+    def drives(self, *, vehicle: str | None = None) -> Iterator[DriveResource]:
+        """All drives of the project, newest first; of one vehicle alone where that is given."""
+        return self._pages("/v1/drives", Page[DriveResource], vehicle=vehicle)
+
+    def delete_drive(self, drive_id: str) -> None:
+        """Delete a drive. Its scenes stay."""
+        self._delete(f"/v1/drives/{_part(drive_id)}")
+
     def declare(self, drive_id: str, files: Sequence[LocalFile]) -> DeclaredFiles:
         """Say which files there are, and learn which must be sent."""
         stated = [{"path": file.path, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files]
@@ -185,6 +198,10 @@ class Client:
         """One job."""
         return self._get(f"/v1/jobs/{_part(job_id)}", JobResource)
 
+    def jobs(self, *, drive_id: str | None = None) -> Iterator[JobResource]:
+        """All jobs of the project, newest first; of one drive alone where that is given."""
+        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id)
+
     def poll_job(self, job_id: str, etag: str | None) -> tuple[JobResource | None, str | None, float]:
         """A job, if it has changed since it had this ETag.
 
@@ -204,6 +221,10 @@ class Client:
         """Ask for a job's end."""
         return self._post(f"/v1/jobs/{_part(job_id)}:cancel", JobResource)
 
+    def retry_job(self, job_id: str, *, idempotency_key: str | None = None) -> JobResource:
+        """A new job that does again what failed or was cancelled."""
+        return self._post(f"/v1/jobs/{_part(job_id)}:retry", JobResource, key=idempotency_key)
+
     def events(self, job_id: str, *, after: int | None = None) -> Iterator[JobEvent]:
         """A job's events after the one with this id, as they come, until the job or the connection ends.
 
@@ -221,18 +242,105 @@ class Client:
         """One scene and its files."""
         return self._get(f"/v1/scenes/{_part(scene_id)}", SceneResource)
 
+    def scenes(self, *, drive_id: str | None = None) -> Iterator[SceneResource]:
+        """All scenes of the project, newest first and without their files; of one drive where that is given."""
+        return self._pages("/v1/scenes", Page[SceneResource], drive_id=drive_id)
+
+    def delete_scene(self, scene_id: str) -> None:
+        """Delete a scene and its exports."""
+        self._delete(f"/v1/scenes/{_part(scene_id)}")
+
     def aggregate(self, asked: AggregationRequest, *, idempotency_key: str | None = None) -> JobResource:
         """Ask for a map of drives or scenes, or for a new version of one."""
         content = asked.model_dump_json(exclude_none=True).encode()
         return self._post("/v1/aggregations", JobResource, content=content, key=idempotency_key)
 
-    def map_version(self, map_id: str, number: int) -> MapVersionResource:
-        """One version of a map and its files."""
-        return self._get(f"/v1/maps/{_part(map_id)}/versions/{number}", MapVersionResource)
+    def map(self, map_id: str) -> MapResource:
+        """One map and its current version."""
+        return self._get(f"/v1/maps/{_part(map_id)}", MapResource)
+
+    def maps(self) -> Iterator[MapResource]:
+        """All maps of the project, newest first."""
+        return self._pages("/v1/maps", Page[MapResource])
+
+    def delete_map(self, map_id: str) -> None:
+        """Delete a map with all its versions. Its scenes stay."""
+        self._delete(f"/v1/maps/{_part(map_id)}")
+
+    def map_version(self, map_id: str, number: int | str) -> MapVersionResource:
+        """One version of a map and its files, by its number or as `current`."""
+        return self._get(_version_path(map_id, number), MapVersionResource)
+
+    def map_versions(self, map_id: str) -> Iterator[MapVersionResource]:
+        """All versions of a map, newest first and without their files."""
+        return self._pages(f"/v1/maps/{_part(map_id)}/versions", Page[MapVersionResource])
+
+    def show_map_version(self, map_id: str, number: int) -> MapResource:
+        """Make another version of a map the current one."""
+        content = json.dumps({"version": number}).encode()
+        headers = {"Content-Type": "application/json", "Content-Length": str(len(content))}
+        path = f"/v1/maps/{_part(map_id)}/current-version"
+        return _parsed(
+            self._transport.request("PUT", path, headers=headers, body=lambda: iter((content,))), MapResource
+        )
+
+    def delete_map_version(self, map_id: str, number: int) -> None:
+        """Delete a version that is not the current one."""
+        self._delete(_version_path(map_id, number))
+
+    def export_scene(
+        self, scene_id: str, asked: ExportRequest, *, idempotency_key: str | None = None
+    ) -> ExportResource:
+        """Ask for a scene in formats of other programs; what is there already is answered as it is."""
+        return self._export(f"/v1/scenes/{_part(scene_id)}/exports", asked, idempotency_key)
+
+    def export_map(
+        self, map_id: str, number: int | str, asked: ExportRequest, *, idempotency_key: str | None = None
+    ) -> ExportResource:
+        """Ask for a version of a map in formats of other programs, as of a scene."""
+        return self._export(f"{_version_path(map_id, number)}/exports", asked, idempotency_key)
+
+    def export(self, export_id: str) -> ExportResource:
+        """One export and its files."""
+        return self._get(f"/v1/exports/{_part(export_id)}", ExportResource)
+
+    def exports(self) -> Iterator[ExportResource]:
+        """All exports of the project, newest first and without their files."""
+        return self._pages("/v1/exports", Page[ExportResource])
+
+    def delete_export(self, export_id: str) -> None:
+        """Delete an export."""
+        self._delete(f"/v1/exports/{_part(export_id)}")
+
+    def create_webhook(self, asked: WebhookRequest, *, idempotency_key: str | None = None) -> WebhookWithSecret:
+        """Register an address that is told when jobs end; its secret is shown here alone."""
+        content = asked.model_dump_json().encode()
+        return self._post("/v1/webhooks", WebhookWithSecret, content=content, key=idempotency_key)
+
+    def webhooks(self) -> Iterator[WebhookResource]:
+        """All webhooks of the project, newest first."""
+        return self._pages("/v1/webhooks", Page[WebhookResource])
+
+    def rotate_webhook(self, webhook_id: str, *, idempotency_key: str | None = None) -> WebhookWithSecret:
+        """Give a webhook another secret; the one before signs as well for a day."""
+        return self._post(f"/v1/webhooks/{_part(webhook_id)}:rotate", WebhookWithSecret, key=idempotency_key)
+
+    def delete_webhook(self, webhook_id: str) -> None:
+        """Delete a webhook and its messages."""
+        self._delete(f"/v1/webhooks/{_part(webhook_id)}")
+
+    def deliveries(self, webhook_id: str) -> Iterator[DeliveryResource]:
+        """All messages to a webhook of the last month, newest first."""
+        return self._pages(f"/v1/webhooks/{_part(webhook_id)}/deliveries", Page[DeliveryResource])
+
+    def retry_delivery(self, webhook_id: str, delivery_id: str) -> DeliveryResource:
+        """Send a message again that was given up or delivered."""
+        path = f"/v1/webhooks/{_part(webhook_id)}/deliveries/{_part(delivery_id)}:retry"
+        return self._post(path, DeliveryResource)
 
     @contextmanager
     def open_file(self, result: Result, file: ResultFile, *, start: int = 0) -> Iterator[tuple[int, Iterator[bytes]]]:
-        """A file of a scene or of a map's version, from byte `start` on where it still is this one. One try.
+        """A file of a scene, an export or of a map's version, from byte `start` on where it still is this one. One try.
 
         Yields
         ------
@@ -247,7 +355,7 @@ class Client:
             yield (start if partial else 0), response.iter_bytes()
 
     def read_file(self, result: Result, file: ResultFile) -> bytes:
-        """Bytes of a small file of a scene or of a map's version."""
+        """Bytes of a small file of a scene, an export or of a map's version."""
         return self._transport.request("GET", _file_path(result, file)).content
 
     def create_upload(self, drive_id: str, size_bytes: int, metadata: Mapping[str, str]) -> str:
@@ -277,6 +385,25 @@ class Client:
         with self._transport.open("PATCH", path, headers=headers, body=body, read_timeout_s=CHECK_TIMEOUT_S) as answer:
             answer.read()
 
+    def _export(self, path: str, asked: ExportRequest, key: str | None) -> ExportResource:
+        return self._post(path, ExportResource, content=asked.model_dump_json(exclude_none=True).encode(), key=key)
+
+    def _delete(self, path: str) -> None:
+        """Delete something. Where an answer was lost and the request tried again, that is told as 404."""
+        self._transport.request("DELETE", path)
+
+    def _pages(self, path: str, model: type[Page[Item]], **where: str | None) -> Iterator[Item]:
+        """All items of a list, page after page as they are asked for."""
+        given = {name: value for name, value in where.items() if value is not None}
+        cursor: str | None = None
+        while True:
+            query = urlencode({**given, "limit": str(PAGE), **({} if cursor is None else {"cursor": cursor})})
+            page = _parsed(self._transport.request("GET", f"{path}?{query}"), model)
+            yield from page.items
+            cursor = page.next
+            if cursor is None:
+                return
+
     def _get(self, path: str, model: type[Model]) -> Model:
         return _parsed(self._transport.request("GET", path), model)
 
@@ -302,6 +429,10 @@ def _part(identifier: str) -> str:
     return quote(identifier, safe="")
 
 
+def _version_path(map_id: str, number: int | str) -> str:
+    return f"/v1/maps/{_part(map_id)}/versions/{_part(str(number))}"
+
+
 def _upload_path(drive_id: str, upload_id: str) -> str:
     return f"/v1/drives/{_part(drive_id)}/uploads/{_part(upload_id)}"
 
@@ -309,7 +440,9 @@ def _upload_path(drive_id: str, upload_id: str) -> str:
 def _file_path(result: Result, file: ResultFile) -> str:
     if isinstance(result, SceneResource):
         return f"/v1/scenes/{_part(result.id)}/files/{quote(file.path)}"
-    return f"/v1/maps/{_part(result.map_id)}/versions/{result.number}/files/{quote(file.path)}"
+    if isinstance(result, ExportResource):
+        return f"/v1/exports/{_part(result.id)}/files/{quote(file.path)}"
+    return f"{_version_path(result.map_id, result.number)}/files/{quote(file.path)}"
 
 
 def _parsed(response: httpx.Response, model: type[Model]) -> Model:

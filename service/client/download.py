@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from pydantic import TypeAdapter, ValidationError
 
-from schemas.api.scenes import SceneResource
+from schemas.api.maps import MapVersionResource
 from schemas.artifacts import REPORT_FILE
 from schemas.drive import RelativePath
 from service.client.api import Client, Result, ResultFile
@@ -38,7 +38,7 @@ class Downloaded:
 def download(
     client: Client, result: Result, out: Path, *, parallel: int = PARALLEL, report: Report = no_report
 ) -> Downloaded:
-    """Bring all files of a scene or of a map's version into `out`.
+    """Bring all files of a scene, an export or of a map's version into `out`.
 
     Files that are there, whole and unchanged, are not brought again, and one that was interrupted goes on where it was.
 
@@ -51,7 +51,7 @@ def download(
     UnreachableError
         The service does not answer.
     """
-    held = result.id if isinstance(result, SceneResource) else f"{result.map_id}/{result.number}"
+    held = f"{result.map_id}/{result.number}" if isinstance(result, MapVersionResource) else result.id
     require_free(out, held)
     for file in result.files:
         _require_inside(out, file)
@@ -99,7 +99,7 @@ def _scene_in(out: Path) -> str | None:
 
 
 def _kind(held: str) -> str:
-    return "map" if "/" in held else "scene"
+    return "map" if "/" in held else "export" if held.startswith("exp_") else "scene"
 
 
 def _claim(out: Path, scene_id: str) -> None:

@@ -23,6 +23,11 @@ def add_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, metavar="DIR", help="state of a standalone service (MRASFM_DATA_DIR)")
 
 
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that asks for a form that programs read."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
 def administer(action: Action, arguments: argparse.Namespace) -> int:
     """Run an action in one transaction on the service's records; its exit code."""
     from service.database.startup_errors import UnusableDatabaseError, unusable_is_told

@@ -157,6 +157,8 @@ def _conversed(
         summary.problem = error.problem.model_dump(mode="json", exclude_defaults=True)
         lines = "\n".join([str(error), *_items_of(error.problem)])
         return _failed(summary, display, lines, EXIT_UNREACHABLE if _is_trouble(error.status) else EXIT_REFUSED)
+    except BrokenPipeError:  # of what is printed: the program's
+        raise
     except (ClientError, OSError) as error:
         return _failed(summary, display, str(error), EXIT_REFUSED)
     except KeyboardInterrupt:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from typing import TYPE_CHECKING
 
-from service.commands.administration import add_data, administer
+from service.commands.administration import add_data, add_json, administer
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
@@ -20,6 +21,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "keys", help="create, list and revoke API keys", description="Create, list and revoke API keys."
     )
     add_data(parser)
+    add_json(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     create = actions.add_parser("create", help="create a key and print it")
     create.add_argument(
@@ -47,7 +49,8 @@ def _create(session: Session, settings: Settings, arguments: argparse.Namespace)
             print(f"mrasfm: error: {given!r} is not a name of 1 to 200 printable characters", file=sys.stderr)
             return 2
     project = find_project(session, arguments.project) or create_project(session, arguments.project, settings)
-    print(create_key(session, project, arguments.name)[1])
+    key, secret = create_key(session, project, arguments.name)
+    print(json.dumps({"id": key.id, "project": project.name, "key": secret}) if arguments.json else secret)
     return 0
 
 
@@ -57,6 +60,13 @@ def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -
     from service.database.tables import ApiKey, Project
 
     rows = session.execute(select(ApiKey, Project.name).join(Project, ApiKey.project_id == Project.id))
+    if arguments.json:
+        listed = [
+            {"id": key.id, "project": project, "name": key.name, "revoked": key.revoked_us is not None}
+            for key, project in rows
+        ]
+        print(json.dumps(listed))
+        return 0
     for key, project in rows:
         print(f"{key.id}  {project}  {key.name}  {'revoked' if key.revoked_us else 'valid'}")
     return 0

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.commands.administration import add_data, administer
+from service.commands.administration import add_data, add_json, administer
 from service.settings import Bytes, Count, Settings
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "projects", help="list projects and change their quotas", description="List projects and change their quotas."
     )
     add_data(parser)
+    add_json(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     actions.add_parser("list", help="list projects with what they use of their quotas")
     change = actions.add_parser("set", help="change quotas of a project; what it has already stays")
@@ -47,7 +49,12 @@ def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -
 
     from service.database.tables import Project
 
-    for project in session.scalars(select(Project).order_by(Project.name)):
+    projects = session.scalars(select(Project).order_by(Project.name)).all()
+    if arguments.json:
+        names = ("name", "used_bytes", *_QUOTAS)
+        print(json.dumps([{name: getattr(project, name) for name in names} for project in projects]))
+        return 0
+    for project in projects:
         print(
             f"{project.name}  {project.used_bytes} of {project.max_bytes} bytes  "
             f"at most {project.max_active_jobs} active jobs, {project.max_drives} drives"

@@ -34,6 +34,7 @@
 | 30 | drives cut into sub-maps, beside the same in one piece |
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
+| 33 | exports of images for splatting; the client's wheel in an environment of its own |
 | 35 | the whole command on real drives beside COLMAP's extraction, matching and global mapper |
 | 36 | simulated routes whose descriptors lie on disk: memory and time of matching and mapping |
 | 37 | maps of 15 and of 60 simulated scenes: time and memory of a scene |
@@ -66,6 +67,7 @@ from tests.benchmarks.aggregation import crossing, kitti, loop, repeated, speed_
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.correspondence import correspondence
+from tests.benchmarks.export_formats import client_wheel, exports_of_images
 from tests.benchmarks.fisheyes import fisheyes
 from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
@@ -143,6 +145,7 @@ LINES = {
     "30": Line(untimed=(submaps,)),
     "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
+    "33": Line(untimed=(exports_of_images, client_wheel)),
     "35": Line(timed=(whole_command,)),
     "36": Line(timed=(from_descriptors,)),
     "37": Line(timed=(many_scenes,)),

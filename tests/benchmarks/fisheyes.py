@@ -52,7 +52,7 @@ def fisheyes(work: Path, seed: int) -> Iterator[Figure]:
     render_drives(options, pinholes)
     rig = true_cameras(CAMERAS, width=WIDTH, height=HEIGHT, rng=np.random.default_rng([seed, 1]))
     faces = work / "faces"
-    render_drives(options, faces, rig=[face for camera in rig for face in _faces(camera)])
+    render_drives(options, faces, rig=[face for camera in rig for face in faces_of(camera)])
     error_m: dict[str, float] = {}
     for title, drive in (
         ("pinholes of 100 deg", pinholes),
@@ -71,7 +71,7 @@ def fisheyes(work: Path, seed: int) -> Iterator[Figure]:
         yield Figure(line="32", what=f"{what}: verified matches", value=matches)
 
 
-def _faces(camera: TrueCamera) -> list[TrueCamera]:
+def faces_of(camera: TrueCamera) -> list[TrueCamera]:
     """Perspective cameras at the place of a camera that together see all but what is behind it."""
     focal_px = 0.5 * FACE_PX / np.tan(np.radians(FACE_DEG) / 2)
     return [

@@ -1,4 +1,4 @@
-"""Writes the generated pages of docs/; with `--check`, compares them and follows all links.
+"""Writes the generated pages of docs/ and the command's files; with `--check`, compares them and follows all links.
 
 `python -m tests.documentation` is `make docs`.
 """
@@ -9,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from tests.documentation.command_files import command_files
 from tests.documentation.commands import command_page
 from tests.documentation.links import broken_links
 from tests.documentation.problems import problems_page
@@ -28,12 +29,18 @@ def pages() -> dict[str, str]:
     }
 
 
-def outdated(docs: Path) -> list[str]:
-    """Generated pages that differ from what the sources say."""
+def generated(repository: Path) -> dict[Path, str]:
+    """All files that are made of the sources."""
+    texts = {repository / "docs" / name: text for name, text in pages().items()}
+    return texts | {repository / "mrasfm_engine" / name: text for name, text in command_files().items()}
+
+
+def outdated(repository: Path) -> list[str]:
+    """Generated files that differ from what the sources say."""
     return [
-        f"docs/{name} is not current: run make docs"
-        for name, text in pages().items()
-        if not (docs / name).is_file() or (docs / name).read_text(encoding="utf-8") != text
+        f"{path.relative_to(repository)} is not current: run make docs"
+        for path, text in generated(repository).items()
+        if not path.is_file() or path.read_text(encoding="utf-8") != text
     ]
 
 
@@ -42,12 +49,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="documentation", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing")
     arguments = parser.parse_args()
-    docs = REPOSITORY / "docs"
-    problems = outdated(docs) if arguments.check else []
+    problems = outdated(REPOSITORY) if arguments.check else []
     if not arguments.check:
-        for name, text in pages().items():
-            (docs / name).parent.mkdir(parents=True, exist_ok=True)
-            (docs / name).write_text(text, encoding="utf-8")
+        for path, text in generated(REPOSITORY).items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
     problems += broken_links(REPOSITORY)
     for problem in problems:
         print(problem, file=sys.stderr)

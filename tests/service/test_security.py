@@ -12,6 +12,7 @@ import pytest
 
 from service.database.connections import migrate
 from service.database.tables import ApiKey
+from service.domain import exports
 from service.domain.keys import ensure_first_key, revoke_key
 from tests.helpers.live_api import Api, Client, api_process, problem_of, settings_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
@@ -22,8 +23,22 @@ OPEN = {"/livez", "/readyz", "/metrics"}
 BODIES: dict[str, Any] = {
     "/v1/drives": json.loads(tiny_drive().raw),
     "/v1/maps/{map_id}/current-version": {"version": 1},
+    "/v1/scenes/{scene_id}/exports": {"formats": ["kitti"]},
+    "/v1/maps/{map_id}/versions/{version}/exports": {"formats": ["kitti"]},
+    "/v1/webhooks": {"url": "https://example.org/"},
     "/v1/drives/{drive_id}/files:declare": {"files": [{"path": "a", "size_bytes": 1, "sha256": "0" * 64}]},
 }
+
+
+def with_export_and_webhook(client: Client, scene_id: str) -> dict[str, str]:
+    """Ids of an export with the file `points.ply`, and of a webhook with a message."""
+    webhook_id = client.post("/v1/webhooks", json={"url": "https://example.org/"}).json()["id"]
+    export = client.post(f"/v1/scenes/{scene_id}/exports", json={"formats": ["kitti"]}).json()
+    stored, held = client._store({"points.ply": b"secret"}), client.claim(export["job_id"])
+    with client.api.database.write() as session:
+        exports.publish(session, held, files=stored, results=[], expires_us=None)
+    (message,) = client.get(f"/v1/webhooks/{webhook_id}/deliveries").json()["items"]
+    return {"export_id": export["id"], "webhook_id": webhook_id, "delivery_id": message["id"]}
 
 
 def operations(api: Api) -> list[tuple[str, str]]:
@@ -64,6 +79,7 @@ def foreign(api: Api) -> dict[str, str]:
         "map_id": new_version(other, {"points.ply": b"secret"}, drives=drives)["map_id"],
         "version": "1",
         "path": "points.ply",
+        **with_export_and_webhook(other, scene_id),
     }
 
 
@@ -108,6 +124,7 @@ def test_head_is_get_without_a_body(api: Api, client: Client) -> None:
     scene = client.get(f"/v1/scenes/{scene_id}").json()
     ids = {"scene_id": scene_id, "drive_id": scene["drive_id"], "job_id": scene["job_id"], "path": "points.ply"}
     drives = [client.frozen(tiny_drive(f"head-{i}", seed=f"head-{i}")) for i in range(2)]
+    ids |= with_export_and_webhook(client, scene_id)
     ids |= {"map_id": new_version(client, {"points.ply": b"ply"}, drives=drives)["map_id"], "version": "1"}
     readable = [path for method, path in operations(api) if method == "GET"]
     assert len(readable) >= 20

@@ -21,7 +21,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--queues",
         default=",".join(QUEUES),
-        help="checks (of drives), reconstructions, or both separated by a comma (default: both)",
+        help="checks (of drives, and exports), reconstructions, or both separated by a comma (default: both)",
     )
     parser.add_argument("--concurrency", type=int, default=1, help="jobs at one time (default: 1)")
     add_log_level(parser)

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
 from service.database.tables import TERMINAL, Job, JobAttempt, JobEvent, JobState, now_us
+from service.domain import webhooks
 
 ACTIVE = (JobState.QUEUED, JobState.RUNNING)
 
@@ -89,7 +90,7 @@ def drop_progress(session: Session, job_id: str) -> None:
 
 
 def tell_state(session: Session, job_id: str) -> None:
-    """Add the job's state to its event stream."""
+    """Add the job's state to its event stream, and where that is an end, to the project's webhooks."""
     job = session.get_one(Job, job_id, populate_existing=True)
     data: dict[str, Any] = {"state": job.state, "attempt": job.attempt, "percent": job.percent}
     if job.cancel_requested_us is not None:
@@ -100,7 +101,10 @@ def tell_state(session: Session, job_id: str) -> None:
         data["scene_id"] = job.scene_id
     if job.map_version is not None:
         data |= {"map_id": job.map_id, "map_version": job.map_version}
+    if job.kind == JobKind.EXPORT:
+        data["export_id"] = (job.request or {})["export_id"]
     session.add(JobEvent(job_id=job_id, kind="state", data=data))
+    webhooks.record(session, job)
 
 
 def tell_progress(session: Session, job: Job) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine.config import EngineConfig
-from tests.documentation.__main__ import outdated, pages
+from tests.documentation.__main__ import generated, outdated, pages
 from tests.documentation.links import NAVIGATION, broken_links
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -64,16 +64,16 @@ def test_navigation_to_no_page_is_named(site: Path) -> None:
 
 
 def test_outdated_page_is_named(tmp_path: Path) -> None:
-    for name, text in pages().items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text, encoding="utf-8")
+    for path, text in generated(tmp_path).items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
     assert outdated(tmp_path) == []
-    with (tmp_path / "cli.md").open("a") as page:
+    with (tmp_path / "docs" / "cli.md").open("a") as page:
         page.write("by hand\n")
-    (tmp_path / "configuration.md").unlink()
-    assert outdated(tmp_path) == [
-        f"docs/{name} is not current: run make docs" for name in ("cli.md", "configuration.md")
-    ]
+    (tmp_path / "docs" / "configuration.md").unlink()
+    (tmp_path / "mrasfm_engine" / "command_index.json").write_text("{}")
+    files = ("docs/cli.md", "docs/configuration.md", "mrasfm_engine/command_index.json")
+    assert outdated(tmp_path) == [f"{name} is not current: run make docs" for name in files]
 
 
 def test_generated_pages_are_complete() -> None:

@@ -1,0 +1,152 @@
+"""Projected coordinate reference systems that users name, as `EPSG:25832` or, with a vertical datum, `EPSG:25832+7837`.
+
+A system without a vertical datum has heights above the ellipsoid. Transformations whose grids are not installed are
+refused with the grid's name: PROJ would take another one, metres off, without a word. Nothing is fetched over the
+network.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import geodesy, utm
+from mrasfm_engine.types import Floats
+from schemas.findings import listed
+
+_SOURCE = "EPSG:4979"
+_NAMED = re.compile(r"EPSG:([0-9]{4,6})(?:\+([0-9]{4,6}))?")
+_NEAR_DEG = 6.0  # of a system's area
+_REMEDY = "Give a projected system, as EPSG:25832, if need be with a vertical datum, as EPSG:25832+7837."
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarthSystem:
+    """A coordinate reference system of points on the earth.
+
+    Attributes
+    ----------
+    well_known_text
+        WKT 1 (OGC 01-009), with a system of heights.
+    code
+        UTM's zone where the scene's own is meant, else None.
+    """
+
+    name: str
+    well_known_text: str
+    code: int | None = None
+    transformer: Transformer | None = None
+
+    def projected(self, points_local: Floats, ecef_from_local: Floats) -> Floats:
+        """Easting, northing and height (n, 3), in the system's units, of local points (n, 3).
+
+        Raises
+        ------
+        InputError
+            Where a point has none.
+        """
+        if self.code is not None:
+            return utm.utm_from_local(points_local, ecef_from_local, self.code)
+        assert self.transformer is not None
+        geodetic = geodesy.geodetic_from_local(points_local, ecef_from_local)
+        try:
+            xyz = self.transformer.transform(geodetic[..., 1], geodetic[..., 0], geodetic[..., 2], errcheck=True)
+        except ProjError as error:
+            raise self._outside(str(error)) from error
+        result = np.stack(xyz, -1)
+        if not np.isfinite(result).all():
+            raise self._outside("points have no coordinates in it")
+        return result
+
+    def _outside(self, why: str) -> InputError:
+        return InputError(
+            f"the scene cannot be given in {self.name}: {why}",
+            remedy="Give a system whose area the scene lies in.",
+            code="outside-crs",
+        )
+
+
+def utm_system(latitude_deg: float, longitude_deg: float) -> EarthSystem:
+    """The UTM zone of a place, with ellipsoidal heights."""
+    code = utm.epsg_code(latitude_deg, longitude_deg)
+    return EarthSystem(name=f"EPSG:{code}", well_known_text=utm.well_known_text(code), code=code)
+
+
+def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
+    """The system that a user names.
+
+    Parameters
+    ----------
+    at
+        Latitude and longitude of the scene's origin.
+
+    Raises
+    ------
+    InputError
+        Where there is none of this name, it is not a projected one, the scene is far from its area, or its grid is not
+        installed.
+    """
+    match = _NAMED.fullmatch(name)
+    if match is None:
+        raise InputError(f"{name!r} names no coordinate reference system", remedy=_REMEDY, code="bad-crs")
+    horizontal = _known(name, match[1])
+    vertical = None if match[2] is None else _known(name, match[2])
+    if not horizontal.is_projected or horizontal.is_compound or len(horizontal.axis_info) != 2:
+        raise InputError(
+            f"EPSG:{match[1]} ({horizontal.name}) is no projected system of two axes", remedy=_REMEDY, code="bad-crs"
+        )
+    if vertical is not None and (not vertical.is_vertical or vertical.is_compound):
+        raise InputError(f"EPSG:{match[2]} ({vertical.name}) is no vertical datum", remedy=_REMEDY, code="bad-crs")
+    _require_near(name, horizontal, at)
+    target = horizontal.to_3d() if vertical is None else CRS.from_user_input(name)
+    text = utm.with_ellipsoidal_heights(horizontal) if vertical is None else target.to_wkt("WKT1_GDAL")
+    return EarthSystem(name=name, well_known_text=text, transformer=_transformer(name, target))
+
+
+def _require_near(name: str, system: CRS, at: tuple[float, float]) -> None:
+    """Refuse places where a projection gives numbers that mean nothing. The next zone is often used on purpose."""
+    area = system.area_of_use
+    if area is None:
+        return
+    south, north = area.south - _NEAR_DEG, area.north + _NEAR_DEG
+    east_of_west = (at[1] - area.west + _NEAR_DEG) % 360.0
+    width = (area.east - area.west) % 360.0 or 360.0
+    if not south <= at[0] <= north or east_of_west > width + 2.0 * _NEAR_DEG:
+        raise InputError(
+            f"{name} is for {area.name}, and the scene lies at {at[0]:.3f}, {at[1]:.3f}",
+            remedy="Give a system whose area the scene lies in.",
+            code="outside-crs",
+        )
+
+
+def _known(name: str, code: str) -> CRS:
+    try:
+        return CRS.from_epsg(int(code))
+    except CRSError:
+        raise InputError(f"EPSG:{code} of {name!r} is not known", remedy=_REMEDY, code="bad-crs") from None
+
+
+def _transformer(name: str, target: CRS) -> Transformer:
+    """The best transformation that is known, and no other."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of missing grids, which become an error here
+        group = TransformerGroup(_SOURCE, target, always_xy=True, allow_ballpark=False)
+    if not group.best_available:
+        grids = [grid.short_name for operation in group.unavailable_operations for grid in operation.grids]
+        named = listed(list(dict.fromkeys(grids))[:3]) or "a grid"
+        raise InputError(
+            f"{name} needs {named}, which is not installed",
+            remedy="Install it (projsync --file NAME, or the folder named by PROJ_DATA), or give another system; "
+            "without a vertical datum heights are above the ellipsoid.",
+            code="missing-geoid-grid",
+        )
+    if not group.transformers:
+        raise InputError(f"no transformation to {name} is known", remedy=_REMEDY, code="bad-crs")
+    return group.transformers[0]

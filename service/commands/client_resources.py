@@ -1,0 +1,270 @@
+"""Commands of `mrasfm-client` for what a service holds: list, show, delete, jobs, download, export, webhooks."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from schemas.exports import EXPORT_FORMATS
+from service.commands.client_common import CommandSummary, Conversation, add_command, run_command
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from schemas.api.exports import ExportRequest, ExportResource
+    from service.client import Client, Result
+
+Converse = Callable[[Conversation, "Summary"], int]
+LISTS = ("drives", "jobs", "scenes", "maps", "exports", "webhooks")
+_KINDS = {"drv": "drive", "job": "job", "scn": "scene", "map": "map", "exp": "export", "whk": "webhook"}
+_SHOWN = ("name", "kind", "state", "formats", "url", "event", "created_at")
+
+
+@dataclass(kw_only=True)
+class Summary(CommandSummary):
+    """The object that `--json` prints."""
+
+    items: list[dict[str, Any]] = field(default_factory=list)
+
+
+def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommands."""
+    parser = _command(subparsers, "list", "list what the project has", _list)
+    parser.add_argument("what", choices=LISTS, help="kind of what is listed, newest first")
+    parser.add_argument("--limit", type=int, default=50, metavar="N", help="how many (default: 50)")
+    parser = _command(subparsers, "show", "show a drive, job, scene, map, export or webhook", _show)
+    parser.add_argument("id", metavar="ID", help="id as `list` prints it; of a map also MAP/VERSION")
+    parser = _command(subparsers, "delete", "delete a drive, scene, map, export or webhook", _delete)
+    parser.add_argument("id", metavar="ID", help="id as `list` prints it; of a map's version MAP/VERSION")
+    parser = _command(subparsers, "cancel", "cancel a job", _cancel)
+    parser.add_argument("id", metavar="JOB", help="id of the job")
+    parser = _command(subparsers, "retry", "do a job again that failed or was cancelled", _retry)
+    parser.add_argument("id", metavar="JOB", help="id of the job")
+    parser.add_argument("--wait", action="store_true", help="wait for the end of the new job")
+    parser = _command(subparsers, "wait", "wait for the end of a job", _wait)
+    parser.add_argument("id", metavar="JOB", help="id of the job")
+    parser = _command(subparsers, "download", "download a scene, a map or an export", _download, has_out=True)
+    parser.add_argument("id", metavar="ID", help="id of a scene or export; of a map MAP or MAP/VERSION")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for its files")
+    parser = _command(subparsers, "export", "get a scene or map in formats of other programs", _export, has_out=True)
+    parser.add_argument("id", metavar="ID", help="id of a scene; of a map MAP or MAP/VERSION")
+    parser.add_argument(
+        "--format",
+        action="append",
+        required=True,
+        dest="formats",
+        metavar="FORMAT",
+        choices=list(EXPORT_FORMATS),
+        help=f"format, may be repeated: {', '.join(EXPORT_FORMATS)}",
+    )
+    parser.add_argument("--image-size", type=int, metavar="PX", help="scale images down to this longest side")
+    parser.add_argument("--crs", metavar="EPSG:CODE", help="coordinate reference system, for formats that take one")
+    parser.add_argument("--out", type=Path, metavar="OUT", help="folder for its files; waits for them")
+    parser = _command(subparsers, "webhook", "register an address that is told when jobs end", _webhook)
+    parser.add_argument("address", metavar="ADDRESS", help="https address that takes POST requests")
+    parser.add_argument("--event", action="append", dest="events", metavar="EVENT", help="job.succeeded, job.failed or "
+                        "job.cancelled, may be repeated (default: all)")  # fmt: skip
+    parser = _command(subparsers, "rotate", "give a webhook another secret", _rotate)
+    parser.add_argument("id", metavar="WEBHOOK", help="id of the webhook")
+    parser = _command(subparsers, "deliveries", "list the messages to a webhook", _deliveries)
+    parser.add_argument("id", metavar="WEBHOOK", help="id of the webhook")
+    parser.add_argument("--limit", type=int, default=50, metavar="N", help="how many (default: 50)")
+
+
+def _command(
+    subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    meaning: str,
+    converse: Converse,
+    *,
+    has_out: bool = False,
+) -> argparse.ArgumentParser:
+    parser = add_command(subparsers, name, meaning=meaning, description=f"{meaning[:1].upper()}{meaning[1:]}.")
+
+    def run(arguments: argparse.Namespace) -> int:
+        summary = Summary()
+        return run_command(arguments, summary, lambda conversation: converse(conversation, summary))
+
+    parser.set_defaults(run=run, **({} if has_out else {"out": None}))
+    return parser
+
+
+def _list(conversation: Conversation, summary: Summary) -> int:
+    items: Iterable[BaseModel] = getattr(conversation.client, conversation.arguments.what)()
+    return _print(conversation, summary, items, limit=conversation.arguments.limit)
+
+
+def _deliveries(conversation: Conversation, summary: Summary) -> int:
+    arguments = conversation.arguments
+    return _print(conversation, summary, conversation.client.deliveries(arguments.id), limit=arguments.limit)
+
+
+def _print(conversation: Conversation, summary: Summary, items: Iterable[BaseModel], *, limit: int) -> int:
+    for _, item in zip(range(limit), items, strict=False):
+        shown = item.model_dump(mode="json")
+        summary.items.append(shown)
+        if not conversation.arguments.json:
+            words = [str(shown[name]) for name in _SHOWN if shown.get(name) not in (None, "")]
+            print("  ".join([shown["id"], *words]), flush=True)
+    return 0
+
+
+def _show(conversation: Conversation, summary: Summary) -> int:
+    return _tell(conversation, summary, _found(conversation.client, conversation.arguments.id))
+
+
+def _found(client: Client, given: str) -> BaseModel:
+    kind, first, version = _kind_of(given)
+    if kind == "map" and version:
+        return client.map_version(first, version)
+    if kind == "webhook":
+        found = next((webhook for webhook in client.webhooks() if webhook.id == given), None)
+        if found is None:
+            raise _unknown(f"there is no webhook {given}")
+        return found
+    shown: BaseModel = getattr(client, kind)(first)
+    return shown
+
+
+def _kind_of(given: str) -> tuple[str, str, str]:
+    """Kind, id, and version of a map where one is given."""
+    first, _, version = given.partition("/")
+    kind = _KINDS.get(first.partition("_")[0])
+    if kind is None or (version and kind != "map"):
+        raise _unknown(f"{given!r} is no id")
+    return kind, first, version
+
+
+def _unknown(what: str) -> Exception:
+    from service.client import ClientError
+
+    return ClientError(f"{what}. Give one that `list` prints.")
+
+
+def _tell(conversation: Conversation, summary: Summary, item: BaseModel) -> int:
+    summary.items.append(item.model_dump(mode="json"))
+    if not conversation.arguments.json:
+        print(json.dumps(summary.items[-1], indent=1, ensure_ascii=False))
+    return 0
+
+
+def _delete(conversation: Conversation, summary: Summary) -> int:
+    kind, first, version = _kind_of(conversation.arguments.id)
+    if kind == "job":
+        raise _unknown("jobs are not deleted, but cancelled")
+    if version:
+        conversation.client.delete_map_version(first, int(version) if version.isdecimal() else 0)
+    else:
+        getattr(conversation.client, f"delete_{kind}")(first)
+    conversation.say(f"{conversation.arguments.id} is deleted")
+    return 0
+
+
+def _cancel(conversation: Conversation, summary: Summary) -> int:
+    conversation.note_job(conversation.client.cancel_job(conversation.arguments.id))
+    return 0
+
+
+def _retry(conversation: Conversation, summary: Summary) -> int:
+    job = conversation.client.retry_job(conversation.arguments.id)
+    conversation.note_job(job)
+    return _ended(conversation, job.id) if conversation.arguments.wait else 0
+
+
+def _wait(conversation: Conversation, summary: Summary) -> int:
+    return _ended(conversation, conversation.arguments.id)
+
+
+def _ended(conversation: Conversation, job_id: str) -> int:
+    from schemas.api.jobs import JobState
+
+    job = conversation.wait(conversation.client.job(job_id))
+    return 0 if job.state == JobState.SUCCEEDED else conversation.job_failed(job)
+
+
+def _download(conversation: Conversation, summary: Summary) -> int:
+    conversation.download(_result(conversation.client, conversation.arguments.id))
+    return 0
+
+
+def _result(client: Client, given: str) -> Result:
+    kind, first, version = _kind_of(given)
+    match kind:
+        case "scene":
+            return client.scene(first)
+        case "export":
+            return client.export(first)
+        case "map":
+            return client.map_version(first, version or "current")
+    raise _unknown(f"{given} has no files to download")
+
+
+def _export(conversation: Conversation, summary: Summary) -> int:
+    from schemas.api.jobs import JobState
+
+    client, arguments = conversation.client, conversation.arguments
+    kind, first, version = _kind_of(arguments.id)
+    asked = _asked(arguments)
+    if kind == "scene":
+        export = client.export_scene(first, asked)
+    elif kind == "map":
+        export = client.export_map(first, version or "current", asked)
+    else:
+        raise _unknown(f"{arguments.id} is no scene or map")
+    conversation.say(f"export {export.id}: {client.url}/v1/exports/{export.id}")
+    if arguments.out is not None:
+        job = client.job(export.job_id)
+        if export.state != JobState.SUCCEEDED:
+            job = conversation.wait(job)
+            export = client.export(export.id)
+        if export.state != JobState.SUCCEEDED:
+            return conversation.job_failed(job)
+        _say_withheld(conversation, export)
+        conversation.download(export)
+    summary.items.append(export.model_dump(mode="json"))
+    return 0
+
+
+def _say_withheld(conversation: Conversation, export: ExportResource) -> None:
+    for result in export.results:
+        if result.withheld is not None:
+            conversation.say(f"  warning: {result.withheld}")
+        for note in result.notes:
+            conversation.say(f"  {result.format}: {note}")
+
+
+def _asked(arguments: argparse.Namespace) -> ExportRequest:
+    from pydantic import ValidationError
+
+    from schemas.api.exports import ExportRequest
+    from service.client import ClientError
+
+    try:
+        return ExportRequest(formats=arguments.formats, image_size_px=arguments.image_size, crs=arguments.crs)
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = {"image_size_px": "image-size", "formats": "format"}.get(str(first["loc"][0]), first["loc"][0])
+        raise ClientError(f"--{option} is {first['input']!r}: {first['msg']}. Correct it.") from None
+
+
+def _webhook(conversation: Conversation, summary: Summary) -> int:
+    from pydantic import ValidationError
+
+    from schemas.api.webhooks import WebhookRequest
+    from service.client import ClientError
+
+    arguments = conversation.arguments
+    events = {} if arguments.events is None else {"events": arguments.events}
+    try:
+        asked = WebhookRequest.model_validate({"url": arguments.address, **events})
+    except ValidationError as error:
+        raise ClientError(f"{error.errors()[0]['input']!r}: {error.errors()[0]['msg']}. Correct it.") from None
+    return _tell(conversation, summary, conversation.client.create_webhook(asked))
+
+
+def _rotate(conversation: Conversation, summary: Summary) -> int:
+    return _tell(conversation, summary, conversation.client.rotate_webhook(conversation.arguments.id))

@@ -1,0 +1,199 @@
+"""Lists, deletion, retry, maps, exports and webhooks with the library, with and without an event loop, and commands."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.api.exports import ExportRequest
+from schemas.api.jobs import JobState
+from schemas.api.webhooks import WebhookEvent, WebhookRequest
+from service.client import ApiError, AsyncClient, Client, ClientError, download, watch_job
+from service.client import api as client_api
+from service.commands.client_program import main
+from service.domain import exports
+from tests.helpers.live_api import Client as Owner
+from tests.service.client.conftest import Connect
+
+FILES = {"kitti/00/poses.txt": b"1 0 0\n", "report.json": b"{}"}
+RESULTS = [{"format": "kitti", "files": 1, "size_bytes": 6, "withheld": None, "notes": ["as seen"]}]
+
+
+def publish(client: Owner, job_id: str) -> None:
+    stored, held = client._store(FILES), client.claim(job_id)
+    with client.api.database.write() as session:
+        exports.publish(session, held, files=stored, results=RESULTS, expires_us=None)
+
+
+def test_lists_go_on_page_after_page(client: Owner, connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_api, "PAGE", 2)
+    drives = [client.create() for _ in range(5)]
+    library = connect(client)
+    assert [drive.id for drive in library.drives()] == drives[::-1]
+    first = next(iter(library.drives()))
+    assert first.id == drives[-1]
+    library.delete_drive(drives[2])
+    assert [drive.id for drive in library.drives()] == [d for d in drives[::-1] if d != drives[2]]
+    with pytest.raises(ApiError) as raised:
+        library.delete_drive(drives[2])
+    assert raised.value.status == 404
+
+
+def test_scenes_maps_and_jobs(client: Owner, connect: Connect) -> None:
+    scene_ids = [client.scene({"points.ply": name}) for name in (b"a", b"b")]
+    library = connect(client)
+    assert [scene.id for scene in library.scenes()] == scene_ids[::-1]
+    job = client.aggregate(scenes=scene_ids)
+    library.cancel_job(job["id"])
+    again = library.retry_job(job["id"])
+    assert again.retry_of == job["id"]
+    client.publish_map(client.claim(again.id), {"map.json": b"{}"})
+    assert again.map_id is not None
+    assert library.map(again.map_id).current_version == 1
+    assert [found.id for found in library.maps()] == [again.map_id]
+    assert [version.number for version in library.map_versions(again.map_id)] == [1]
+    assert library.map_version(again.map_id, "current").number == 1
+    assert library.show_map_version(again.map_id, 1).current_version == 1
+    with pytest.raises(ApiError, match="current"):
+        library.delete_map_version(again.map_id, 1)
+    with pytest.raises(ApiError, match="is part of"):
+        library.delete_scene(scene_ids[0])
+    library.delete_map(again.map_id)
+    library.delete_scene(scene_ids[0])
+    assert [scene.id for scene in library.scenes()] == scene_ids[1:]
+    assert again.id in [found.id for found in library.jobs()]
+
+
+def test_an_export_is_asked_for_and_downloaded(client: Owner, connect: Connect, tmp_path: Path) -> None:
+    library, scene_id = connect(client), client.scene({"points.ply": b"ply"})
+    asked = ExportRequest(formats=["kitti"])
+    export = library.export_scene(scene_id, asked)
+    publish(client, export.job_id)
+    assert watch_job(library, export.job_id).export_id == export.id
+    export = library.export_scene(scene_id, asked)
+    assert export.state == JobState.SUCCEEDED
+    assert download(library, export, tmp_path / "out").files_received == 2
+    assert (tmp_path / "out" / "kitti" / "00" / "poses.txt").read_bytes() == b"1 0 0\n"
+    assert [found.id for found in library.exports()] == [export.id]
+    library.delete_export(export.id)
+    with pytest.raises(ApiError):
+        library.export(export.id)
+
+
+def test_webhooks_are_registered_and_rotated(client: Owner, connect: Connect) -> None:
+    library = connect(client)
+    made = library.create_webhook(WebhookRequest(url="https://example.org/", events=[WebhookEvent.JOB_CANCELLED]))
+    job = client.reconstruct(client.committed())
+    library.cancel_job(job["id"])
+    (message,) = library.deliveries(made.id)
+    assert message.job_id == job["id"]
+    with pytest.raises(ApiError, match="pending"):
+        library.retry_delivery(made.id, message.id)
+    assert library.rotate_webhook(made.id).secret != made.secret
+    assert [webhook.id for webhook in library.webhooks()] == [made.id]
+    library.delete_webhook(made.id)
+    assert list(library.webhooks()) == []
+
+
+def test_the_same_in_an_event_loop(client: Owner, tmp_path: Path) -> None:
+    scene_ids = [client.scene({"points.ply": bytes([number])}) for number in range(3)]
+
+    async def converse() -> None:
+        async with AsyncClient(client.api.url, client.key) as library:
+            shown = await asyncio.gather(*(library.scene(scene_id) for scene_id in scene_ids))
+            assert [scene.id for scene in shown] == scene_ids
+            assert [scene.id async for scene in library.scenes()] == scene_ids[::-1]
+            done = await library.call(download, shown[0], tmp_path / "scene")
+            assert done.files_received == 1
+            with pytest.raises(ApiError):
+                await library.drive("drv_0")
+            waiting = asyncio.create_task(library.call(watch_job, client.reconstruct(client.committed())["id"]))
+            await asyncio.sleep(0.2)
+            assert not waiting.done()
+            library.stop()
+            with pytest.raises(ClientError):
+                await waiting
+
+    asyncio.run(converse())
+
+
+def test_both_clients_have_the_same_methods() -> None:
+    own = {"client", "call", "stop", "close"}
+    others = {"stopped", "url", "require_open", "pause", "retry_budget", "close", "stop"}
+    # What sends and receives pieces is for the functions that `call` runs.
+    pieces = {"open_file", "events", "poll_job", "create_upload", "upload_offset", "append_to_upload"}
+    blocking = {name for name, _ in inspect.getmembers(Client) if not name.startswith("_")}
+    awaited = {name for name, _ in inspect.getmembers(AsyncClient) if not name.startswith("_")}
+    assert blocking - others - pieces == awaited - own
+
+
+def run(client: Owner, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
+    code = main([*words, "--url", client.api.url, "--json"])
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return code, told
+
+
+def test_commands(
+    client: Owner, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MRASFM_API_KEY", client.key)
+    scene_id = client.scene({"points.ply": b"ply", "report.json": b"{}"})
+    code, told = run(client, capsys, "list", "scenes")
+    assert (code, [item["id"] for item in told["items"]]) == (0, [scene_id])
+    assert main(["list", "scenes", "--url", client.api.url]) == 0
+    assert capsys.readouterr().out.startswith(scene_id)
+    code, told = run(client, capsys, "export", scene_id, "--format", "kitti")
+    (export,) = told["items"]
+    assert (code, export["state"]) == (0, "QUEUED")
+    assert run(client, capsys, "delete", export["id"])[0] == 2, "it is being made"
+    publish(client, export["job_id"])
+    assert run(client, capsys, "wait", export["job_id"])[0] == 0
+    code, told = run(client, capsys, "export", scene_id, "--format", "kitti", "--out", str(tmp_path / "out"))
+    assert (code, (tmp_path / "out" / "report.json").read_bytes()) == (0, b"{}")
+    assert run(client, capsys, "download", scene_id, "--out", str(tmp_path / "scene"))[0] == 0
+    assert run(client, capsys, "show", export["id"])[1]["items"][0]["state"] == "SUCCEEDED"
+    assert run(client, capsys, "delete", export["id"])[0] == 0
+    job = client.reconstruct(client.committed())
+    assert run(client, capsys, "cancel", job["id"])[1]["job_state"] == "CANCELLED"
+    assert run(client, capsys, "wait", job["id"])[0] == 3
+    assert run(client, capsys, "retry", job["id"])[1]["job_id"] != job["id"]
+    code, told = run(client, capsys, "webhook", "https://example.org/", "--event", "job.failed")
+    assert told["items"][0]["secret"].startswith("whsec_")
+    webhook_id = told["items"][0]["id"]
+    assert run(client, capsys, "rotate", webhook_id)[0] == 0
+    assert run(client, capsys, "deliveries", webhook_id)[1]["items"] == []
+    assert run(client, capsys, "show", webhook_id)[1]["items"][0]["events"] == ["job.failed"]
+    assert run(client, capsys, "delete", webhook_id)[0] == 0
+    for words in (
+        ("show", "abc"),
+        ("show", "scn_0/1"),
+        ("delete", job["id"]),
+        ("webhook", "ftp://x"),
+        ("export", job["id"], "--format", "kitti"),
+        ("export", scene_id, "--format", "kitti", "--image-size", "3"),
+    ):
+        assert run(client, capsys, *words)[0] == 2, words
+
+
+def test_who_stops_reading_gets_no_traceback(client: Owner) -> None:
+    """As `mrasfm-client list drives | head -1`."""
+    for _ in range(3):
+        client.create()
+    command = [sys.executable, "-m", "service.commands.client_program", "list", "drives", "--url", client.api.url]
+    environment = {**os.environ, "MRASFM_API_KEY": client.key, "PYTHONUNBUFFERED": "1"}
+    done = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert done.stdout is not None
+    done.stdout.close()
+    assert done.stderr is not None
+    said = done.stderr.read().decode()
+    done.stderr.close()
+    assert done.wait(30) == 141
+    assert "Traceback" not in said

@@ -1,0 +1,198 @@
+"""Webhooks over HTTP: registered, told of jobs that end, rotated, listed, and what is refused."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any
+
+import pytest
+from sqlalchemy import false
+from sqlalchemy.orm import Session
+
+from schemas.api.jobs import JobKind
+from schemas.api.webhooks import WebhookRequest
+from service.database.connections import Database
+from service.database.tables import Export, Scene, WebhookDelivery, now_us
+from service.domain import exports, jobs, maps, webhooks
+from tests.helpers.live_api import Client, problem_of
+
+URL = "https://example.org/hooks/mrasfm?from=us"
+
+
+def register(client: Client, **more: Any) -> dict[str, Any]:
+    answer = client.post("/v1/webhooks", json={"url": URL, **more})
+    assert answer.status_code == 201, answer.text
+    return dict(answer.json())
+
+
+def messages(client: Client, webhook_id: str) -> list[dict[str, Any]]:
+    answer = client.get(f"/v1/webhooks/{webhook_id}/deliveries")
+    assert answer.status_code == 200, answer.text
+    return list(answer.json()["items"])
+
+
+def test_a_webhook_is_registered_shown_and_deleted(client: Client) -> None:
+    made = register(client, description="of the depot")
+    assert made["secret"].startswith("whsec_")
+    assert len(base64.b64decode(made["secret"].removeprefix("whsec_"))) == 32
+    shown = client.get(f"/v1/webhooks/{made['id']}").json()
+    assert shown == {name: value for name, value in made.items() if name != "secret"}
+    assert client.get("/v1/webhooks").json()["items"] == [shown]
+    assert shown["events"] == ["job.cancelled", "job.failed", "job.succeeded"]
+    other = client.api.client()
+    for url in (f"/v1/webhooks/{made['id']}", f"/v1/webhooks/{made['id']}/deliveries"):
+        problem_of(other.get(url), 404, "not-found")
+    problem_of(other.post(f"/v1/webhooks/{made['id']}:rotate"), 404, "not-found")
+    assert client.delete(f"/v1/webhooks/{made['id']}").status_code == 204
+    problem_of(client.get(f"/v1/webhooks/{made['id']}"), 404, "not-found")
+
+
+def test_jobs_that_end_leave_one_message_each(client: Client) -> None:
+    wanted, other = register(client, events=["job.succeeded"]), register(client, events=["job.cancelled"])
+    scene_id = client.scene({"points.ply": b"ply"})
+    (message,) = (m for m in messages(client, wanted["id"]) if m["event"] == "job.succeeded")
+    assert (message["state"], message["attempts"], message["job_id"][:4]) == ("PENDING", 0, "job_")
+    with client.api.database.read() as session:
+        body = json.loads(session.get_one(WebhookDelivery, message["id"]).body)
+    assert body["type"] == "job.succeeded"
+    assert (body["data"]["scene_id"], body["data"]["kind"]) == (scene_id, "RECONSTRUCTION")
+    assert body["data"]["job_id"] == message["job_id"]
+    # The check of the drive's images was cancelled nowhere; a reconstruction is, now.
+    drive_id = client.get(f"/v1/scenes/{scene_id}").json()["drive_id"]
+    job = client.reconstruct(drive_id)
+    for _ in range(2):
+        assert client.post(f"/v1/jobs/{job['id']}:cancel").status_code == 202
+    assert [m["job_id"] for m in messages(client, other["id"])] == [job["id"]]
+    assert len(messages(client, wanted["id"])) == 1
+
+
+def test_a_message_is_rolled_back_with_its_transaction(client: Client) -> None:
+    made = register(client)
+    job = client.reconstruct(client.committed())
+
+    def cancel_and_fail(session: Session) -> None:
+        jobs.request_cancel(session, job["id"])
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        client.api.database.transact(cancel_and_fail)
+    assert messages(client, made["id"]) == []
+
+
+def test_rotating_keeps_the_secret_before_for_a_day(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = register(client)
+    rotated = client.post(f"/v1/webhooks/{made['id']}:rotate").json()
+    assert rotated["secret"] != made["secret"]
+    assert rotated["previous_secret_until"] is not None
+    client.post(f"/v1/jobs/{client.reconstruct(client.committed())['id']}:cancel")
+    with client.api.database.write() as session:
+        taken = [m for m in webhooks.take(session, limit=100) if m.webhook_id == made["id"]]
+    assert taken[0].secrets == [rotated["secret"], made["secret"]]
+    headers = webhooks.signed_headers(taken[0], timestamp_s=1)
+    assert len(headers["webhook-signature"].split(" ")) == 2
+
+
+def test_the_signature_is_that_of_standard_webhooks() -> None:
+    """The example of the specification's libraries."""
+    message = webhooks.Message(
+        id="msg_p5jXN8AQM9LWM0D4loKWxJek",
+        webhook_id="",
+        url="",
+        body='{"test": 2432232314}',
+        secrets=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"],
+        attempts=1,
+    )
+    signed = webhooks.signed_headers(message, timestamp_s=1614265330)
+    assert signed["webhook-signature"] == "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://example.org/hook",
+        "https://user:secret@example.org/",
+        "https://127.0.0.1/",
+        "https://localhost/",
+        "https://10.1.2.3:8443/",
+        "https://169.254.169.254/latest/meta-data",
+        "https://[::1]/",
+        "https://[::ffff:192.168.1.1]/",
+        "https://[64:ff9b::a00:1]/",
+        "https://[fe80::1]/",
+        "https://example.org/#part",
+        "https://:443/",
+        "https://example.org:99999/",
+    ],
+)
+def test_addresses_that_are_refused(client: Client, url: str) -> None:
+    problem_of(client.post("/v1/webhooks", json={"url": url}), 422, "address-refused")
+
+
+@pytest.mark.parametrize("wrong", [{}, {"url": "ftp://example.org/"}, {"url": URL, "events": ["job.began"]}])
+def test_requests_that_are_none(client: Client, wrong: dict[str, Any]) -> None:
+    problem_of(client.post("/v1/webhooks", json=wrong), 422, "invalid-document")
+
+
+def test_a_project_has_a_bound(client: Client) -> None:
+    for number in range(webhooks.MAX_OF_PROJECT):
+        register(client, description=str(number))
+    problem_of(client.post("/v1/webhooks", json={"url": URL}), 429, "too-many-webhooks")
+
+
+@pytest.mark.parametrize(
+    ("address", "public"),
+    [
+        ("8.8.8.8", True), ("2606:4700::1111", True), ("127.0.0.1", False), ("0.0.0.0", False), ("100.64.0.1", False),
+        ("224.0.0.1", False), ("192.0.2.1", False), ("::", False), ("fd00::1", False), ("::ffff:8.8.8.8", True),
+        ("::ffff:10.0.0.1", False), ("2002:0a00:0001::1", False), ("64:ff9b::7f00:1", False), ("fe80::1%eth0", False),
+    ],
+)  # fmt: skip
+def test_addresses_of_the_internet(address: str, public: bool) -> None:
+    assert webhooks.is_public(address) is public
+
+
+def test_messages_are_taken_once_in_every_database(database: Database, project_id: str) -> None:
+    """Two senders at one time get different messages."""
+    with database.write() as session:
+        asked = WebhookRequest(url=URL)
+        webhooks.create(session, project_id=project_id, asked=asked, allow_private=False)
+        for _ in range(3):
+            job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
+            jobs.request_cancel(session, job.id)
+    with database.read() as session:
+        assert webhooks.is_any_due(session)
+    with database.write() as session:
+        first = webhooks.take(session, limit=2)
+    with database.write() as session:
+        rest = webhooks.take(session, limit=2)
+    assert len({message.id for message in (*first, *rest)}) == 3
+    with database.write() as session:
+        for message in first:
+            webhooks.note(session, message, webhooks.Outcome(status=200))
+        webhooks.note(session, rest[0], webhooks.Outcome(status=410, error="answered 410"))
+    with database.write() as session:
+        assert webhooks.forget_old(session, now_us() + 2 * webhooks.KEPT_US) == 3
+        assert not webhooks.is_any_due(session)
+
+
+def test_retention_in_every_database(database: Database, project_id: str) -> None:
+    """Exports that were never made and whose job has gone, and scenes that are being exported."""
+    with database.write() as session:
+        job = jobs.create(
+            session, project_id=project_id, kind=JobKind.EXPORT, drive_id=None, request={"export_id": "exp_1"}
+        )
+        scene = {"project_id": project_id, "drive_id": "drv_1", "name": "s", "fence": 1, "summary": {}, "expires_us": 1}
+        session.add_all([Scene(id="scn_1", job_id="job_1", **scene), Scene(id="scn_2", job_id="job_2", **scene)])
+        session.flush()
+        common = {"project_id": project_id, "inputs_sha256": "0" * 64, "formats": [], "options": {}}
+        session.add(Export(id="exp_1", scene_id="scn_1", job_id=job.id, **common))
+        session.add(Export(id="exp_2", scene_id="scn_1", job_id="job_gone", **common))
+    with database.write() as session:
+        assert exports.forget_expired(session, 2) == 1
+        is_exported = exports.is_exported(Export.scene_id == Scene.id)
+        assert maps.forget_expired(session, 2, unless=lambda table: is_exported if table is Scene else false()) == 1
+    with database.read() as session:
+        assert session.get(Scene, "scn_1") is not None
+        assert session.get(Scene, "scn_2") is None
+        assert session.get(Export, "exp_2") is None
