@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.importers.layouts import import_recording
+
+OPTIONS = ("topics", "rig_frame", "world_frame", "calibration", "antenna_m", "gnss_sigma_m")  # of single layouts
+MAX_SIGMA_M = 1000.0
 
 
 def register(subparsers: Any) -> None:
     """Add the command to the `mrasfm` parser."""
     parser = subparsers.add_parser(
         "import",
-        help="turn a recording (rig folder, KITTI, nuScenes, PandaSet) into a drive",
+        help="turn a recording (ROS bag, rig folder, KITTI, nuScenes, PandaSet) into a drive",
         description="Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of "
-        "KITTI odometry, a drive of KITTI raw, nuScenes, or PandaSet.",
+        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, or a ROS bag (ROS 1, or ROS 2 in MCAP or SQLite).",
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="the recording")
+    parser.add_argument("folder", type=Path, metavar="RECORDING", help="the recording: a folder, or a bag's file")
     parser.add_argument("--out", type=Path, required=True, metavar="DRIVE", help="folder of the drive")
     parser.add_argument(
         "--frames",
         metavar="START:STOP:STEP",
         help="slice of the frames, STOP not included; where START is negative, write --frames=-10:",
     )
-    parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in FOLDER or the working directory")
+    parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in RECORDING or the working directory")
     parser.add_argument("--scene", metavar="NAME", help="name of the scene, if the recording holds several")
     parser.add_argument(
         "--vehicle", metavar="NAME", help="which vehicle drove, where the recording does not say or is wrong"
@@ -34,11 +38,63 @@ def register(subparsers: Any) -> None:
         action="store_true",
         help="write truth.tum also where the true poses and the GNSS come from one system (KITTI raw)",
     )
+    _add_bag_options(parser)
     files = parser.add_mutually_exclusive_group()
     files.add_argument("--link", action="store_true", help="hard-link images where possible (the default)")
     files.add_argument("--copy", action="store_true", help="copy images")
     parser.add_argument("--force", action="store_true", help="replace a drive that is already at DRIVE")
     parser.set_defaults(run=run)
+
+
+def _add_bag_options(parser: argparse.ArgumentParser) -> None:
+    bag = parser.add_argument_group("ROS bags")
+    bag.add_argument(
+        "--topics",
+        type=_words,
+        metavar="TOPIC,...",
+        help="topics of images and of the receiver; by default all, where each camera has one",
+    )
+    bag.add_argument("--rig-frame", metavar="FRAME", help="the vehicle's frame in tf, by default base_link")
+    bag.add_argument(
+        "--world-frame", metavar="FRAME", help="frame of tf, as odom or map: the vehicle's poses in it are rough poses"
+    )
+    bag.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="Kalibr's camchain.yaml instead of CameraInfo, or a rig.json instead of CameraInfo and tf",
+    )
+    bag.add_argument(
+        "--antenna",
+        dest="antenna_m",
+        type=_three_numbers,
+        metavar="X,Y,Z",
+        help="the receiver's antenna in the rig frame: metres forward, left and up; with a minus: --antenna=-1,0,2",
+    )
+    bag.add_argument(
+        "--gnss-sigma",
+        dest="gnss_sigma_m",
+        type=_metres,
+        metavar="METRES",
+        help="standard deviation of horizontal positions, where the receiver states none; heights have twice that",
+    )
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _three_numbers(text: str) -> list[float]:
+    values = [float(word) for word in text.split(",")]
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers as 0.4,0,1.8")
+    return values
+
+
+def _metres(text: str) -> float:
+    if not 0.0 < (value := float(text)) <= MAX_SIGMA_M:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0 and up to {MAX_SIGMA_M:g}")
+    return value
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -49,6 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
         frames=arguments.frames,
         gnss_file=arguments.gnss,
         scene=arguments.scene,
+        options={name: getattr(arguments, name) for name in OPTIONS},
         vehicle=arguments.vehicle,
         truth=arguments.truth,
         copy=arguments.copy,
@@ -63,4 +120,6 @@ def run(arguments: argparse.Namespace) -> int:
         f"  truth:        {'yes, in truth.tum' if summary.truth else 'no'}\n"
         f"  drive:        {summary.drive}"
     )
+    for note in summary.notes:
+        print(f"  note:         {note}")
     return 0

@@ -24,7 +24,7 @@ from schemas import Camera
 from schemas.drive import MAX_VEHICLE_CHARACTERS, Finite, RelativePath, Vector3
 
 DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
-HAS_SCENES = True
+OPTIONS = ("scene",)
 LIDAR = "LIDAR_TOP"
 FLAT_NOTE = "The truth is nuScenes' ego poses: they are plane (z = 0) and good to about 0.1 m; compare x and y apart."
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]+")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -22,14 +22,18 @@ PIXEL_CENTER_PX = 0.5
 
 T = TypeVar("T")
 
+# An image in a file that holds many: of a bag the topic and the stamp.
+ImageKey = tuple[str, int]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SourceImage:
     """One image where the recording has it."""
 
-    file: Path
+    file: Path  # of an image with a key, only the suffix counts
     timestamp_us: int | None = None  # None: taken with its unit
     mask: Path | None = None
+    key: ImageKey | None = None  # of one that `Recording.contents` reads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +62,8 @@ class Recording:
     label_map: LabelMap | None = None
     notes: list[str] = field(default_factory=list)
     vehicle: str | None = None
+    # Files of images with these keys, in any order, one at a time in memory.
+    contents: Callable[[Collection[ImageKey]], Iterator[tuple[ImageKey, bytes]]] | None = None
 
 
 def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T:
