@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.importers.layouts import import_recording
+from mrasfm_engine.importers.recording import RoughQuality
 
 OPTIONS = ("topics", "rig_frame", "world_frame", "calibration", "antenna_m", "gnss_sigma_m")  # of single layouts
 MAX_SIGMA_M = 1000.0
@@ -17,9 +18,10 @@ def register(subparsers: Any) -> None:
     """Add the command to the `mrasfm` parser."""
     parser = subparsers.add_parser(
         "import",
-        help="turn a recording (ROS bag, rig folder, KITTI, nuScenes, PandaSet) into a drive",
+        help="turn a recording (ROS bag, rig folder, KITTI, nuScenes, PandaSet, Argoverse 2) into a drive",
         description="Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of "
-        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, or a ROS bag (ROS 1, or ROS 2 in MCAP or SQLite).",
+        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, or a ROS bag (ROS 1, or ROS 2 in MCAP "
+        "or SQLite).",
     )
     parser.add_argument("folder", type=Path, metavar="RECORDING", help="the recording: a folder, or a bag's file")
     parser.add_argument("--out", type=Path, required=True, metavar="DRIVE", help="folder of the drive")
@@ -29,6 +31,7 @@ def register(subparsers: Any) -> None:
         help="slice of the frames, STOP not included; where START is negative, write --frames=-10:",
     )
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in RECORDING or the working directory")
+    parser.add_argument("--cameras", type=_words, metavar="NAME,...", help="cameras that are wanted (default: all)")
     parser.add_argument("--scene", metavar="NAME", help="name of the scene, if the recording holds several")
     parser.add_argument(
         "--vehicle", metavar="NAME", help="which vehicle drove, where the recording does not say or is wrong"
@@ -37,6 +40,13 @@ def register(subparsers: Any) -> None:
         "--truth",
         action="store_true",
         help="write truth.tum also where the true poses and the GNSS come from one system (KITTI raw)",
+    )
+    parser.add_argument(
+        "--rough-noise",
+        type=_rough_quality,
+        metavar="METRES,DEGREES",
+        help="the recording's poses (nuScenes, Argoverse 2, ...) with this noise become rough poses: a trial of drives "
+        "without GNSS",
     )
     _add_bag_options(parser)
     files = parser.add_mutually_exclusive_group()
@@ -91,6 +101,13 @@ def _three_numbers(text: str) -> list[float]:
     return values
 
 
+def _rough_quality(text: str) -> RoughQuality:
+    values = [float(word) for word in text.split(",")]
+    if len(values) != 2 or not all(0.0 < value <= MAX_SIGMA_M for value in values):
+        raise argparse.ArgumentTypeError(f"{text!r} is not two numbers above 0 as 0.5,2")
+    return RoughQuality(sigma_m=values[0], sigma_deg=values[1])
+
+
 def _metres(text: str) -> float:
     if not 0.0 < (value := float(text)) <= MAX_SIGMA_M:
         raise argparse.ArgumentTypeError(f"{text} is not above 0 and up to {MAX_SIGMA_M:g}")
@@ -103,6 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.folder,
         arguments.out,
         frames=arguments.frames,
+        cameras=arguments.cameras,
+        rough_noise=arguments.rough_noise,
         gnss_file=arguments.gnss,
         scene=arguments.scene,
         options={name: getattr(arguments, name) for name in OPTIONS},

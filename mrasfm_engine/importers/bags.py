@@ -27,7 +27,7 @@ from mrasfm_engine.importers.bag_images import file_content
 from mrasfm_engine.importers.bag_positions import gnss_of_bag
 from mrasfm_engine.importers.bag_reader import Bag, bag_files
 from mrasfm_engine.importers.bag_rig import cameras_of_bag
-from mrasfm_engine.importers.frame_grouping import grouped_by_time
+from mrasfm_engine.importers.frame_grouping import units_by_time
 from mrasfm_engine.importers.recording import ImageKey, Recording, SourceImage, SourceUnit
 
 DESCRIPTION = "*.bag, *.mcap, *.db3 or metadata.yaml (ROS bag)"
@@ -102,34 +102,13 @@ def read(
 
 
 def _units(content: BagContent) -> list[SourceUnit]:
-    """Images of about one time together; a unit's time is the mean of theirs."""
-    stamps = {topic: sorted(images.suffixes) for topic, images in content.images.items() if images.suffixes}
-    times_us = {topic: np.array([us_from_ns(ns) for ns in own], dtype=np.int64) for topic, own in stamps.items()}
-    units: list[SourceUnit] = []
-    for frame in grouped_by_time(times_us):
-        own_us = {topic: int(times_us[topic][i]) for topic, i in frame.items()}
-        mean_us = round(sum(own_us.values()) / len(own_us))
-        images = {}
-        for topic, i in sorted(frame.items()):
-            stamp = stamps[topic][i]
-            images[camera_name(topic)] = SourceImage(
-                file=Path(f"{topic.strip('/')}/{stamp}{content.images[topic].suffixes[stamp]}"),
-                timestamp_us=None if own_us[topic] == mean_us else own_us[topic],
-                key=(topic, stamp),
-            )
-        units.append(SourceUnit(source_frame=0, timestamp_us=mean_us, images=images))
-    units.sort(key=lambda unit: unit.timestamp_us)
-    times = _rising([unit.timestamp_us for unit in units])
-    return [
-        replace(unit, source_frame=i, timestamp_us=time)
-        for i, (unit, time) in enumerate(zip(units, times, strict=True))
-    ]
-
-
-def _rising(times_us: list[int]) -> list[int]:
-    """Sorted times with those moved on by a microsecond that repeat; images keep their own."""
-    rising = np.array(times_us, dtype=np.int64) - np.arange(len(times_us))
-    return [int(time) for time in np.maximum.accumulate(rising) + np.arange(len(times_us))]
+    images = {}
+    for topic, found in content.images.items():
+        images[camera_name(topic)] = [
+            SourceImage(file=Path(f"{stamp}{suffix}"), timestamp_us=us_from_ns(stamp), key=(topic, stamp))
+            for stamp, suffix in sorted(found.suffixes.items())
+        ]
+    return units_by_time(images)
 
 
 def _rough_poses(content: BagContent, units: list[SourceUnit], world_frame: str, rig_frame: str) -> list[SourceUnit]:

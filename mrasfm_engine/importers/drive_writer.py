@@ -177,7 +177,7 @@ def _manifest(recording: Recording) -> DriveManifest:
             rig=Rig(cameras=recording.cameras),
             frames=frames,
             gnss=recording.gnss,
-            rough_poses=RoughTrajectory(poses=rough) if rough else None,
+            rough_poses=_trajectory(recording, rough) if rough else None,
             label_map=recording.label_map,
             notes=recording.notes,
         )
@@ -189,6 +189,14 @@ def _manifest(recording: Recording) -> DriveManifest:
         what = f"the drive's file {problem.path} {problem.what}"
         raise InputError(f"recording {recording.name}: {what}", remedy="Rename its camera at its source.")
     return manifest
+
+
+def _trajectory(recording: Recording, poses: list[RoughPose]) -> RoughTrajectory:
+    quality = recording.rough_quality
+    sigmas = (
+        {} if quality is None else {"sigma_translation_m": quality.sigma_m, "sigma_rotation_deg": quality.sigma_deg}
+    )
+    return RoughTrajectory(poses=poses, common_world=recording.common_world, **sigmas)
 
 
 def _frame_image(camera: str, frame: int, image: SourceImage) -> FrameImage:

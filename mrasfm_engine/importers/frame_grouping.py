@@ -2,15 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from mrasfm_engine.importers.recording import SourceImage, SourceUnit
 from mrasfm_engine.types import Ints
 
 # Of the fastest camera's period: images farther apart than this, each corrected by its camera's usual delay, belong to
 # different frames.
 SAME_FRAME = 0.5
+
+
+def units_by_time(images: Mapping[str, Sequence[SourceImage]]) -> list[SourceUnit]:
+    """Units of the images of about one time, numbered in order; a unit's time is the mean of its images' times.
+
+    Parameters
+    ----------
+    images
+        By camera, each with its time, in order of time. Cameras without images have no part in it.
+    """
+    times_us = {
+        name: np.array([image.timestamp_us for image in own], dtype=np.int64) for name, own in images.items() if own
+    }
+    frames = []
+    for frame in grouped_by_time(times_us):
+        mean_us = round(sum(int(times_us[name][i]) for name, i in frame.items()) / len(frame))
+        frames.append((mean_us, {name: images[name][i] for name, i in sorted(frame.items())}))
+    frames.sort(key=lambda frame: frame[0])
+    units: list[SourceUnit] = []
+    for number, (mean_us, taken) in enumerate(frames):
+        # No two units have one time; images keep theirs.
+        time_us = max(mean_us, units[-1].timestamp_us + 1) if units else mean_us
+        own = {name: _timed(image, time_us) for name, image in taken.items()}
+        units.append(SourceUnit(source_frame=number, timestamp_us=time_us, images=own))
+    return units
+
+
+def _timed(image: SourceImage, unit_us: int) -> SourceImage:
+    return replace(image, timestamp_us=None) if image.timestamp_us == unit_us else image
 
 
 def grouped_by_time(times_us: Mapping[str, Ints]) -> list[dict[str, int]]:

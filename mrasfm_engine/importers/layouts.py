@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.importers import bags, kitti, kitti_raw, nuscenes, pandaset, rig_folder
+from mrasfm_engine.importers import argoverse2, bags, kitti, kitti_raw, nuscenes, pandaset, rig_folder
 from mrasfm_engine.importers.drive_writer import ImportSummary, write_recording
-from mrasfm_engine.importers.recording import Recording, SourceUnit, select_cameras, select_units
+from mrasfm_engine.importers.recording import Recording, RoughQuality, SourceUnit, select_cameras, select_units
+from mrasfm_engine.importers.rough_poses import with_rough_poses
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
 from schemas.drive import MAX_RIG_EXTENT_M
 
-LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, kitti_raw, nuscenes, pandaset, bags)
+LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, kitti_raw, nuscenes, pandaset, argoverse2, bags)
 
 # GNSS samples this long before the first and after the last image are kept: they smooth the ends of the track.
 GNSS_MARGIN_US = 2_000_000
@@ -36,6 +37,7 @@ def import_recording(
     options: Mapping[str, Any] | None = None,
     vehicle: str | None = None,
     truth: bool = False,
+    rough_noise: RoughQuality | None = None,
     copy: bool = False,
     force: bool = False,
 ) -> ImportSummary:
@@ -62,6 +64,8 @@ def import_recording(
         Which vehicle drove, instead of what the recording says.
     truth
         Whether the units' poses become the truth where they are outputs of the system that the GNSS is of, too.
+    rough_noise
+        Noise with which the units' poses become rough poses.
     copy, force
         See `write_recording`.
 
@@ -82,6 +86,8 @@ def import_recording(
     recording = select_units(select_cameras(_read(folder, {**(options or {}), "scene": scene}), cameras), frames)
     if vehicle is not None:
         recording = replace(recording, vehicle=vehicle)
+    if rough_noise is not None:
+        recording = with_rough_poses(recording, rough_noise)
     if recording.truth_is_gnss and not truth:
         recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
     return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)

@@ -48,6 +48,14 @@ class SourceUnit:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RoughQuality:
+    """Standard deviations of rough poses, along and about each axis."""
+
+    sigma_m: float
+    sigma_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Recording:
     """A recording with all rotations in the engine's axes: x forward, y left, z up."""
 
@@ -58,6 +66,8 @@ class Recording:
     body_axes: BodyAxes = BodyAxes.FLU  # of files that belong to the recording, as the antenna's position
     default_gnss: Path | None = None
     gnss: Gnss | None = None
+    rough_quality: RoughQuality | None = None  # None: the manifest's defaults
+    common_world: str | None = None  # of the units' poses, where other recordings have it, too
     truth_is_gnss: bool = False  # the units' poses are of the system that the GNSS is of: truth only where asked for
     label_map: LabelMap | None = None
     notes: list[str] = field(default_factory=list)
@@ -103,6 +113,11 @@ def interpolated_poses(times_us: Ints, world_from_any: Floats, at_us: Ints) -> l
     poses = se3.interpolate(times_us, world_from_any, at_us)
     known = (at_us >= times_us[0]) & (at_us <= times_us[-1])
     return [pose if there else None for pose, there in zip(poses, known, strict=True)]
+
+
+def with_truth(units: Sequence[SourceUnit], poses: Sequence[Floats | None]) -> list[SourceUnit]:
+    """The units with true poses (4, 4), where there are any."""
+    return [replace(unit, world_from_rig=pose) for unit, pose in zip(units, poses, strict=True)]
 
 
 def gnss_of_vehicle(

@@ -199,8 +199,13 @@ def pinhole_camera(name: str, images: dict[int, Path], k: Floats, rig_from_cam: 
     )
 
 
-def numbered_images(folder: Path) -> dict[int, Path]:
+def numbered_images(folder: Path, *, digits: int = 12) -> dict[int, Path]:
     """Images of a folder by their frame number.
+
+    Parameters
+    ----------
+    digits
+        Of the longest number.
 
     Raises
     ------
@@ -214,7 +219,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
     for file in sorted(folder.iterdir()):
         if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
             continue
-        if not re.fullmatch(r"[0-9]{1,12}", file.stem):
+        if not re.fullmatch(rf"[0-9]{{1,{digits}}}", file.stem):
             raise InputError(
                 f"image {file} is not named by its frame number", remedy="Name images as 000000.png.", code="bad-name"
             )
