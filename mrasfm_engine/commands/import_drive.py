@@ -10,7 +10,15 @@ from typing import Any
 from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.importers.recording import RoughQuality
 
-OPTIONS = ("topics", "rig_frame", "world_frame", "calibration", "antenna_m", "gnss_sigma_m")  # of single layouts
+OPTIONS = (
+    "topics",
+    "rig_frame",
+    "world_frame",
+    "calibration",
+    "antenna_m",
+    "gnss_sigma_m",
+    "sweeps",
+)  # of single layouts
 MAX_SIGMA_M = 1000.0
 
 
@@ -47,6 +55,9 @@ def register(subparsers: Any) -> None:
         metavar="METRES,DEGREES",
         help="the recording's poses (nuScenes, Argoverse 2, ...) with this noise become rough poses: a trial of drives "
         "without GNSS",
+    )
+    parser.add_argument(
+        "--sweeps", action="store_true", default=None, help="of nuScenes all images, at 12 Hz, not the keyframes alone"
     )
     _add_bag_options(parser)
     files = parser.add_mutually_exclusive_group()
