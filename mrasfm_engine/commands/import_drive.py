@@ -26,10 +26,10 @@ def register(subparsers: Any) -> None:
     """Add the command to the `mrasfm` parser."""
     parser = subparsers.add_parser(
         "import",
-        help="turn a recording (ROS bag, rig folder, KITTI, nuScenes, PandaSet, Argoverse 2) into a drive",
+        help="turn a recording (ROS bag, rig folder, KITTI, nuScenes, PandaSet, Argoverse 2, Waymo) into a drive",
         description="Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of "
-        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, or a ROS bag (ROS 1, or ROS 2 in MCAP "
-        "or SQLite).",
+        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, Waymo (version 2), or a ROS bag (ROS "
+        "1, or ROS 2 in MCAP or SQLite).",
     )
     parser.add_argument("folder", type=Path, metavar="RECORDING", help="the recording: a folder, or a bag's file")
     parser.add_argument("--out", type=Path, required=True, metavar="DRIVE", help="folder of the drive")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.recording import proper_transform
 from mrasfm_engine.types import Floats
 
-MAX_BYTES = 2_000_000_000
+MAX_BYTES = 20_000_000_000  # images of a segment of Waymo are 1 to 2 GB, and are read row by row
 EXTRA = "av2"
 
 
@@ -100,6 +101,19 @@ class Columns:
             raise self._defect(name, "holds a value that is no text")
         return values
 
+    def contents(self, name: str) -> list[bytes]:
+        """Values of a column of bytes.
+
+        Raises
+        ------
+        InputError
+            If it is missing or holds something else.
+        """
+        values = self._values(name)
+        if not all(isinstance(value, bytes) for value in values):
+            raise self._defect(name, "holds a value without bytes")
+        return values
+
     def poses(self, quaternion: Sequence[str], translation: Sequence[str]) -> Floats:
         """Transforms (rows, 4, 4) of columns w, x, y, z and x, y, z.
 
@@ -158,6 +172,38 @@ def read_feather(path: Path) -> Columns:
         raise InputError(
             f"table {path} cannot be read: {said}", remedy="Download it again.", code="bad-table"
         ) from None
+
+
+def read_parquet(path: Path, columns: Sequence[str]) -> Columns:
+    """Some columns of a Parquet file; those that it lacks are named where they are asked for.
+
+    Raises
+    ------
+    InputError
+        If it is missing, too large or no Parquet file.
+    """
+    with _parquet_file(path) as file:
+        known = [name for name in columns if name in file.schema_arrow.names]
+        return Columns(file.read(columns=known), str(path))
+
+
+def parquet_batches(path: Path, columns: Sequence[str], rows: int) -> Iterator[Columns]:
+    """The same, some rows at a time."""
+    with _parquet_file(path) as file:
+        for batch in file.iter_batches(batch_size=rows, columns=list(columns)):
+            yield Columns(arrow("lib").Table.from_batches([batch]), str(path))
+
+
+@contextmanager
+def _parquet_file(path: Path) -> Iterator[Any]:
+    parquet = arrow("parquet")
+    require_file(path)
+    try:
+        with parquet.ParquetFile(path) as file:
+            yield file
+    except (arrow("lib").ArrowException, OSError, ValueError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"table {path}: {said}", remedy="Download it again.", code="bad-table") from None
 
 
 def require_file(path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.bag_cameras import (
-    Lens,
     camera_name,
     frame_from_camera,
     image_base,
@@ -19,6 +18,7 @@ from mrasfm_engine.importers.bag_cameras import (
 )
 from mrasfm_engine.importers.bag_contents import BagContent, ImageTopic
 from mrasfm_engine.importers.kalibr import read_camchain
+from mrasfm_engine.importers.lenses import Lens
 from mrasfm_engine.importers.rig_folder import checked_camera, read_rig
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.types import Floats

@@ -17,6 +17,7 @@ from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, write_manifest
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import DriveManifest, Frame, FrameImage, Rig, RoughPose, RoughTrajectory
+from schemas.drive import FIELDS_OF_VERSION_2
 from schemas.parsing import file_problems
 
 TRUTH_NAME = "truth.tum"
@@ -172,7 +173,8 @@ def _manifest(recording: Recording) -> DriveManifest:
     ]
     try:
         manifest = DriveManifest(
-            **({} if recording.vehicle is None else {"version": 2, "vehicle": recording.vehicle}),
+            version=2 if _needs_version_2(recording) else 1,
+            **({} if recording.vehicle is None else {"vehicle": recording.vehicle}),
             name=recording.name,
             rig=Rig(cameras=recording.cameras),
             frames=frames,
@@ -189,6 +191,11 @@ def _manifest(recording: Recording) -> DriveManifest:
         what = f"the drive's file {problem.path} {problem.what}"
         raise InputError(f"recording {recording.name}: {what}", remedy="Rename its camera at its source.")
     return manifest
+
+
+def _needs_version_2(recording: Recording) -> bool:
+    fields = (FIELDS_OF_VERSION_2 & camera.model_fields_set for camera in recording.cameras)
+    return recording.vehicle is not None or any(fields)
 
 
 def _trajectory(recording: Recording, poses: list[RoughPose]) -> RoughTrajectory:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.bag_cameras import Lens, kalibr_params, lens_from_distortion
+from mrasfm_engine.importers.lenses import Lens, kalibr_params, lens_from_distortion
 from mrasfm_engine.importers.recording import proper_transform
 from mrasfm_engine.io.documents import read_bytes
 from mrasfm_engine.types import Floats
