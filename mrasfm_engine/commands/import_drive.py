@@ -11,6 +11,8 @@ from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.importers.recording import RoughQuality
 
 OPTIONS = (
+    "forward_camera",
+    "rate_hz",
     "topics",
     "rig_frame",
     "world_frame",
@@ -26,10 +28,10 @@ def register(subparsers: Any) -> None:
     """Add the command to the `mrasfm` parser."""
     parser = subparsers.add_parser(
         "import",
-        help="turn a recording (ROS bag, rig folder, KITTI, nuScenes, PandaSet, Argoverse 2, Waymo) into a drive",
+        help="turn a recording (ROS bag, rig folder, data set, COLMAP rig) into a drive",
         description="Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of "
-        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, Waymo (version 2), or a ROS bag (ROS "
-        "1, or ROS 2 in MCAP or SQLite).",
+        "KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, Waymo (version 2), COLMAP's "
+        "rig_config.json, or a ROS bag (ROS 1, or ROS 2 in MCAP or SQLite).",
     )
     parser.add_argument("folder", type=Path, metavar="RECORDING", help="the recording: a folder, or a bag's file")
     parser.add_argument("--out", type=Path, required=True, metavar="DRIVE", help="folder of the drive")
@@ -59,7 +61,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument(
         "--sweeps", action="store_true", default=None, help="of nuScenes all images, at 12 Hz, not the keyframes alone"
     )
-    _add_bag_options(parser)
+    _add_layout_options(parser)
     files = parser.add_mutually_exclusive_group()
     files.add_argument("--link", action="store_true", help="hard-link images where possible (the default)")
     files.add_argument("--copy", action="store_true", help="copy images")
@@ -67,7 +69,30 @@ def register(subparsers: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def _add_bag_options(parser: argparse.ArgumentParser) -> None:
+def _add_layout_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--antenna",
+        dest="antenna_m",
+        type=_three_numbers,
+        metavar="X,Y,Z",
+        help="of a bag or a COLMAP rig: the receiver's antenna in the rig frame, metres forward, left and up; with a "
+        "minus: --antenna=-1,0,2",
+    )
+    parser.add_argument(
+        "--gnss-sigma",
+        dest="gnss_sigma_m",
+        type=_positive,
+        metavar="METRES",
+        help="of a bag or a COLMAP rig: standard deviation of horizontal positions, where the receiver states none; "
+        "heights have twice that",
+    )
+    rig = parser.add_argument_group("COLMAP rigs")
+    rig.add_argument(
+        "--forward-camera",
+        metavar="NAME",
+        help="camera that looks level and straight ahead (default: the reference camera)",
+    )
+    rig.add_argument("--rate-hz", type=_positive, metavar="HZ", help="frames a second, where EXIF has no times")
     bag = parser.add_argument_group("ROS bags")
     bag.add_argument(
         "--topics",
@@ -84,20 +109,6 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="Kalibr's camchain.yaml instead of CameraInfo, or a rig.json instead of CameraInfo and tf",
-    )
-    bag.add_argument(
-        "--antenna",
-        dest="antenna_m",
-        type=_three_numbers,
-        metavar="X,Y,Z",
-        help="the receiver's antenna in the rig frame: metres forward, left and up; with a minus: --antenna=-1,0,2",
-    )
-    bag.add_argument(
-        "--gnss-sigma",
-        dest="gnss_sigma_m",
-        type=_metres,
-        metavar="METRES",
-        help="standard deviation of horizontal positions, where the receiver states none; heights have twice that",
     )
 
 
@@ -119,7 +130,7 @@ def _rough_quality(text: str) -> RoughQuality:
     return RoughQuality(sigma_m=values[0], sigma_deg=values[1])
 
 
-def _metres(text: str) -> float:
+def _positive(text: str) -> float:
     if not 0.0 < (value := float(text)) <= MAX_SIGMA_M:
         raise argparse.ArgumentTypeError(f"{text} is not above 0 and up to {MAX_SIGMA_M:g}")
     return value

@@ -11,7 +11,17 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.importers import argoverse2, bags, kitti, kitti_raw, nuscenes, pandaset, rig_folder, waymo
+from mrasfm_engine.importers import (
+    argoverse2,
+    bags,
+    colmap_rig,
+    kitti,
+    kitti_raw,
+    nuscenes,
+    pandaset,
+    rig_folder,
+    waymo,
+)
 from mrasfm_engine.importers.drive_writer import ImportSummary, write_recording
 from mrasfm_engine.importers.recording import Recording, RoughQuality, SourceUnit, select_cameras, select_units
 from mrasfm_engine.importers.rough_poses import with_rough_poses
@@ -20,7 +30,17 @@ from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
 from schemas.drive import MAX_RIG_EXTENT_M
 
-LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, kitti_raw, nuscenes, pandaset, argoverse2, waymo, bags)
+LAYOUTS: tuple[ModuleType, ...] = (
+    rig_folder,
+    kitti,
+    kitti_raw,
+    nuscenes,
+    pandaset,
+    argoverse2,
+    waymo,
+    colmap_rig,
+    bags,
+)
 
 # GNSS samples this long before the first and after the last image are kept: they smooth the ends of the track.
 GNSS_MARGIN_US = 2_000_000

@@ -82,9 +82,11 @@ def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T
     Raises
     ------
     InputError
-        If there is none of this name, or none is named and there are several.
+        If there is none at all or none of this name, or none is named and there are several.
     """
     known = ", ".join(sorted(scenes)[:20]) or "none"
+    if not scenes:
+        raise InputError(f"{folder} holds no scenes", remedy="Unpack the recording again.", code="no-scenes")
     if wanted is None and len(scenes) > 1:
         raise InputError(
             f"{folder} holds {len(scenes)} scenes: {known}",

@@ -269,6 +269,12 @@ def test_scene_must_be_named(dataset: Path, tmp_path: Path) -> None:
         import_recording(dataset, tmp_path / "drive", scene="scene-9")
 
 
+def test_tables_without_scenes(dataset: Path, tmp_path: Path) -> None:
+    (dataset / "v1.0-mini/scene.json").write_text("[]")
+    with pytest.raises(InputError, match="holds no scenes"):
+        import_recording(dataset, tmp_path / "drive")
+
+
 def test_missing_files(dataset: Path, tmp_path: Path) -> None:
     min((dataset / "samples/CAM_FRONT").iterdir()).unlink()
     with pytest.raises(InputError, match="does not exist") as caught:
