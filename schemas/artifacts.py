@@ -105,3 +105,10 @@ def is_read_by_aggregation(path: str) -> bool:
 def is_read_by_next_version(path: str) -> bool:
     """Return whether an aggregation that goes on from a map's version reads this file of it."""
     return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))
+
+
+def is_read_by_export(path: str) -> bool:
+    """Return whether an export reads this file of a scene or map; of a scene's smaller components none is read."""
+    files = (MAP_FILE, REPORT_FILE, "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply")
+    folders = (f"{OWN_CAR_FOLDER}/", f"{SCENES_FOLDER}/", "calibration/")
+    return path in files or path in ("model/images.bin", "model/points3D.bin") or path.startswith(folders)

@@ -360,6 +360,25 @@ class CheckActive(ServiceError, status=409):
     """The drive has its check."""
 
 
+# Exports
+
+
+class NotGeoreferenced(ServiceError, status=422):
+    """The result is not georeferenced."""
+
+
+class CrsNotTaken(ServiceError, status=422):
+    """No format takes a coordinate reference system."""
+
+
+class ExportDeleted(ServiceError, status=409):
+    """The export was deleted."""
+
+
+class ExportActive(ServiceError, status=409):
+    """The export is being made."""
+
+
 # Maps
 
 

@@ -26,6 +26,7 @@ QUEUES = {
     JobKind.RECONSTRUCTION: "reconstructions",
     JobKind.AGGREGATION: "reconstructions",
     JobKind.SUBMAP: "reconstructions",
+    JobKind.EXPORT: "checks",  # of minutes: it does not wait behind reconstructions of hours
 }
 _ANSWER_WITHIN_S = 2
 _NOTICE_WITHIN_S = 10  # that the broker has vanished: a worker's main process waits for its answers

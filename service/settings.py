@@ -152,6 +152,9 @@ class Settings(BaseSettings):
     map_retention_days: Days | None = Field(
         None, description="maps are deleted this long after their newest version; by default never"
     )
+    export_retention_days: Days | None = Field(
+        None, description="exports are deleted after this time; by default with their scene or map"
+    )
     job_retention_days: Days | None = Field(
         None, description="jobs, and maps without a version, are deleted after this time; by default never"
     )

@@ -21,6 +21,7 @@ class Work(StrEnum):
     PREFLIGHT = "preflight"
     AGGREGATION = "aggregation"
     SUBMAP = "submap"
+    EXPORT = "export"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +48,9 @@ class Attempt:
         does all of it.
     submap
         Number of the sub-map that is mapped.
+    source, drives, formats, options
+        Of an export: folder of the scene or map, folders of drives by the names of scenes, names of formats, and
+        options as the API's `ExportRequest` has them.
     """
 
     work: Work
@@ -61,6 +65,10 @@ class Attempt:
     leave_out: bool = False
     submap_workers: int = 0
     submap: int = 0
+    source: Path | None = None
+    drives: Mapping[str, Path] = field(default_factory=dict)
+    formats: Sequence[str] = field(default_factory=list)
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,9 +105,10 @@ class ChildRequest(Attempt):
         """The request in a file."""
         values = json.loads(path.read_text(encoding="utf-8"))
         values["work"] = Work(values["work"])
-        for name in ("drive", "into", "out", "cancel_file", "result_file"):
+        for name in ("drive", "into", "source", "out", "cancel_file", "result_file"):
             values[name] = None if values[name] is None else Path(values[name])
-        values["scenes"] = {name: Path(folder) for name, folder in values["scenes"].items()}
+        for name in ("scenes", "drives"):
+            values[name] = {key: Path(folder) for key, folder in values[name].items()}
         return cls(**values)
 
 

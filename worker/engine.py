@@ -12,6 +12,8 @@ from mrasfm_engine import stages
 from mrasfm_engine.aggregation import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, ReconstructionError, StorageError
+from mrasfm_engine.export.contract import ExportOptions
+from mrasfm_engine.export.run_export import ExportRequest, run_export
 from mrasfm_engine.learned.model_folder import default_folder
 from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
 from mrasfm_engine.preflight.drive_check import UnsoundDriveError, is_sound
@@ -25,6 +27,7 @@ from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter
 
 CANCEL_INTERVAL_S = 0.2
+_PARTS = 1000  # of each format, in which an export's progress is told
 _AT_ONE_TIME = 2  # a single sub-map is mapped by the process that goes on with it
 
 # Other errors than these are a disk's, or a scene that contradicts itself or does not read back as it was written.
@@ -204,11 +207,50 @@ def _preflight(
     return {"findings": [as_json(finding) for finding in findings], "sound": is_sound(findings)}
 
 
+def _export(
+    request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    """The formats of an export, as the API shows them; the files lie in folders of their names."""
+    assert request.source is not None, "every export has one"
+    formats = list(request.formats)
+
+    def pass_on(name: str, done: int, total: int) -> None:
+        """Pass the progress of a format on as a part of that of all."""
+        within = done / total if total > 0 else 0.0
+        progress(Stage.EXPORT, round(_PARTS * (formats.index(name) + within)), _PARTS * len(formats))
+
+    report = run_export(
+        ExportRequest(
+            folder=request.source,
+            out=request.out,
+            formats=formats,
+            options=ExportOptions(**request.options),
+            drives=request.drives,
+            threads=config.threads,
+        ),
+        progress=pass_on,
+        cancel=cancelled,
+    )
+    return {"results": [_export_result(name, result) for name, result in report["formats"].items()]}
+
+
+def _export_result(name: str, result: Mapping[str, Any]) -> dict[str, Any]:
+    files = result.get("files", ())
+    return {
+        "format": name,
+        "files": len(files),
+        "size_bytes": sum(file["bytes"] for file in files),
+        "withheld": result.get("withheld"),
+        "notes": list(result.get("notes", ())),
+    }
+
+
 _WORK = {
     Work.RECONSTRUCTION: _reconstruct,
     Work.PREFLIGHT: _preflight,
     Work.AGGREGATION: _aggregate,
     Work.SUBMAP: _map_submap,
+    Work.EXPORT: _export,
 }
 
 
@@ -227,7 +269,9 @@ def described(problem: MrasfmError, request: ChildRequest) -> ChildError:
 
 def _without_paths(what: str, request: ChildRequest) -> str:
     """Files by their names in the drive or scene: where these lie on this machine is of no interest to who asked."""
-    given = (request.drive, request.into, request.out, *request.scenes.values())
+    given = (
+        request.drive, request.into, request.source, request.out, *request.scenes.values(), *request.drives.values()
+    )  # fmt: skip
     for folder in (folder for folder in given if folder is not None):
         for path in (folder, folder.resolve()):
             what = what.replace(f"{path}/", "").replace(str(path), path.name)

@@ -22,6 +22,7 @@ from schemas.artifacts import Stage
 from service.database.connections import Database
 from service.domain import jobs
 from service.domain.drive_checkout import DriveGoneError
+from service.domain.exports import ExportGoneError
 from service.logs import log_fields
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
@@ -55,6 +56,7 @@ _FAILED = {
     JobKind.RECONSTRUCTION: "The drive could not be reconstructed",
     JobKind.AGGREGATION: "No map could be made",
     JobKind.SUBMAP: "A part of the drive could not be mapped",
+    JobKind.EXPORT: "Nothing could be exported",
 }
 
 _PARTING_BUDGET_S = 5.0  # a process that was told to end does not wait long for the database
@@ -171,11 +173,19 @@ class _Execution:
         count = partial(self._meter.update, Stage.FETCH)
         try:
             attempt = watched(lambda: self._handler.lay_out(folder, self._fetch, count), check_stop)
-        except DriveGoneError:
+        except DriveGoneError as gone:
             return Failed(
                 code="drive-deleted",
-                what=f"drive {self._held.drive_id} was deleted",
+                what=f"drive {gone} was deleted",
                 remedy="Upload it again.",
+                retryable=False,
+                stage=Stage.FETCH,
+            )
+        except ExportGoneError as gone:
+            return Failed(
+                code="export-deleted",
+                what=f"export {gone} was deleted",
+                remedy="Ask for it anew.",
                 retryable=False,
                 stage=Stage.FETCH,
             )

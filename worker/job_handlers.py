@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -18,7 +19,7 @@ from schemas.api.scenes import SceneSummary
 from schemas.artifacts import PLAN_CHECKPOINTS, Stage, checkpoint_file, submap_checkpoint, submap_number
 from service.database.connections import Database
 from service.database.tables import now_us
-from service.domain import checkpoints, jobs, maps, scenes, workers
+from service.domain import checkpoints, exports, jobs, maps, scenes, workers
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.domain.drive_checkout import materialise
 from service.domain.map_inputs import MapInputs, inputs_of
@@ -232,7 +233,63 @@ class AggregationHandler:
         return {"map_id": self._held.map_id, "version": number}
 
 
-JobHandler = PreflightHandler | ReconstructionHandler | SubmapHandler | AggregationHandler
+class ExportHandler:
+    """An export of a scene or a version of a map."""
+
+    shelf: Shelf | None = None  # it shares no stages
+
+    def __init__(self, database: Database, held: jobs.Claim) -> None:
+        self._database, self._held = database, held
+
+    def is_wanted(self, name: str) -> bool:
+        """Return whether a finished stage is brought, likewise."""
+        return True
+
+    def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
+        """The scene or map as a folder, and the drives whose images are needed.
+
+        Raises
+        ------
+        DriveGoneError, ExportGoneError
+            Where a drive or the export was deleted.
+        """
+        with self._database.read() as session:
+            inputs = exports.inputs_of(session, self._held)
+        source, drives = folder.root / "source", folder.root / "drives"
+        total = len(inputs.files) + len(inputs.drives)  # a drive counts as one until its files are known
+        for i, file in enumerate(inputs.files):
+            target = source / file.path
+            target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            fetch(file.key, target)
+            progress(i + 1, total)
+        folders: dict[str, Path] = {}
+        for drive_id in sorted(set(inputs.drives.values())):
+            folders[drive_id] = drives / drive_id
+            materialise(self._database, drive_id, folders[drive_id], fetch=fetch, progress=progress)
+        return Attempt(
+            work=Work.EXPORT,
+            settings=self._held.settings,
+            source=source,
+            drives={name: folders[drive_id] for name, drive_id in inputs.drives.items()},
+            formats=inputs.formats,
+            options=inputs.options,
+        )
+
+    def publish(
+        self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
+    ) -> dict[str, Any]:
+        """Record the export's files, likewise."""
+        export_id = exports.publish(
+            session,
+            self._held,
+            files=files,
+            results=done.report["results"],
+            expires_us=_expires_us(settings.export_retention_days),
+        )
+        return {"export_id": export_id}
+
+
+JobHandler = PreflightHandler | ReconstructionHandler | SubmapHandler | AggregationHandler | ExportHandler
 
 
 def handler_of(database: Database, held: jobs.Claim, settings: Settings) -> JobHandler:
@@ -244,6 +301,8 @@ def handler_of(database: Database, held: jobs.Claim, settings: Settings) -> JobH
             return ReconstructionHandler(database, held, settings)
         case JobKind.SUBMAP:
             return SubmapHandler(database, held)
+        case JobKind.EXPORT:
+            return ExportHandler(database, held)
         case _:
             return PreflightHandler(database, held)
 

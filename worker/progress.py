@@ -43,6 +43,7 @@ WEIGHTS: Mapping[Work, Mapping[str, float]] = MappingProxyType(
             Stage.MAPPING: 25.0,
             Stage.PUBLISH: 1.0,
         },
+        Work.EXPORT: {Stage.FETCH: 20.0, Stage.EXPORT: 65.0, Stage.PUBLISH: 15.0},
         Work.PREFLIGHT: {Stage.FETCH: 20.0, Stage.PREFLIGHT: 30.0, Stage.CALIBRATION: 50.0},
     }
 )

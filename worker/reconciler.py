@@ -10,8 +10,20 @@ from sqlalchemy import ColumnElement, delete, or_, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.database.connections import Database, clock_us
-from service.database.tables import TERMINAL, Drive, IdempotencyKey, Job, JobMember, MapScene, Pass, now_us
-from service.domain import job_trees, jobs, maps, workers
+from service.database.tables import (
+    TERMINAL,
+    Drive,
+    Export,
+    IdempotencyKey,
+    Job,
+    JobMember,
+    Map,
+    MapScene,
+    Pass,
+    Scene,
+    now_us,
+)
+from service.domain import exports, job_trees, jobs, maps, workers
 from service.job_queue import BrokerError, JobQueue, task_id
 from service.logs import log_fields
 from service.settings import Settings
@@ -139,7 +151,8 @@ class Reconciler:
         """Each transaction is short: while one deletes, SQLite lets no worker say that it lives."""
         now = now_us()
         # Of their own: aggregations lock maps and scenes before drives.
-        self._in_batches(lambda session: maps.forget_expired(session, now))
+        self._in_batches(lambda session: exports.forget_expired(session, now))
+        self._in_batches(lambda session: maps.forget_expired(session, now, unless=_is_exported))
         with self._database.read() as session:
             expired = session.scalars(select(Drive.id).where(Drive.expires_us < now)).all()
         for drive_id in expired:
@@ -168,6 +181,10 @@ class Reconciler:
             wanted = of_jobs.where(JobMember.drive_id == drive_id, Job.state.not_in(TERMINAL))
             idle = ~or_(active.exists(), in_map.exists(), wanted.exists())
             session.execute(delete(Drive).where(Drive.id == drive_id, Drive.expires_us < now, idle))
+
+
+def _is_exported(table: type[Map] | type[Scene]) -> ColumnElement[bool]:
+    return exports.is_exported((Export.map_id == Map.id) if table is Map else (Export.scene_id == Scene.id))
 
 
 def _delete_some(session: Session, condition: ColumnElement[bool], *key: InstrumentedAttribute[str]) -> int:

@@ -34,11 +34,20 @@ TEXT_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.t
 
 def write_model(scene: Scene, folder: Path) -> None:
     """Write the binary model of all registered images into an existing folder."""
-    (folder / "cameras.bin").write_bytes(_cameras(scene))
-    (folder / "rigs.bin").write_bytes(_rigs(scene))
-    (folder / "frames.bin").write_bytes(_frames(scene))
-    (folder / "images.bin").write_bytes(_images(scene))
-    (folder / "points3D.bin").write_bytes(_points(scene))
+    for name in BINARY_FILES:
+        (folder / name).write_bytes(binary_file(scene, name))
+
+
+def binary_file(scene: Scene, name: str) -> bytes:
+    """Content of one of `BINARY_FILES`."""
+    writers = {
+        "cameras.bin": _cameras,
+        "rigs.bin": _rigs,
+        "frames.bin": _frames,
+        "images.bin": _images,
+        "points3D.bin": _points,
+    }
+    return writers[name](scene)
 
 
 def write_text_model(binary_folder: Path, folder: Path) -> None:

@@ -145,6 +145,16 @@ def points_text(scene: Scene, found: ModelPoints) -> Rows:
     yield Row("a track", _sorted_rows(found.observations), _sorted_rows(np.column_stack(observations)))
 
 
+def points_binary(scene: Scene, found: ModelPoints) -> Rows:
+    """Every point, its colour, its error and its track, to the last bit."""
+    yield Row("its point ids", found.ids, np.arange(1, len(scene.points_m) + 1))
+    yield Row("a point", found.xyz, scene.points_m)
+    yield Row("a colour", found.colors, scene.point_colors.astype(np.float64))
+    yield Row("an error", found.errors, scene.point_error_px)
+    observations = (scene.observation_point + 1, scene.observation_image + 1, scene.observation_keypoint)
+    yield Row("a track", found.observations, np.column_stack(observations))
+
+
 def ply(scene: Scene, rows: NDArray[Any]) -> Rows:
     """Coordinates, colours, classes, patches of the road, and the sum of the tracks' lengths."""
     yield Row("a point", np.stack([rows[name] for name in "xyz"], -1), scene.points_m, PLY_TOLERANCE_M)

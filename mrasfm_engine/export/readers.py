@@ -50,6 +50,7 @@ class ModelPoints(NamedTuple):
     ids: Ints  # (p,)
     xyz: Floats  # (p, 3)
     colors: Floats  # (p, 3)
+    errors: Floats  # (p,)
     observations: Ints  # (n, 3) point id, image id, keypoint
 
 
@@ -179,7 +180,27 @@ def points_text(path: Path) -> ModelPoints:
     ids = heads[:, 0].astype(np.int64)
     tracks = numbers[in_tracks].astype(np.int64).reshape(-1, 2)
     observations = np.column_stack([np.repeat(ids, (counts - 8) // 2), tracks])
-    return ModelPoints(ids, heads[:, 1:4], heads[:, 4:7], observations)
+    return ModelPoints(ids, heads[:, 1:4], heads[:, 4:7], heads[:, 7], observations)
+
+
+def points_binary(path: Path) -> ModelPoints:
+    """All points of a binary model."""
+    head = struct.Struct("<Q3d3BdQ")
+    data = path.read_bytes()
+    (count,) = struct.unpack_from("<Q", data)
+    at, heads, tracks = 8, [], []
+    for _ in range(count):
+        *values, length = head.unpack_from(data, at)
+        at += head.size
+        track = np.frombuffer(data, "<u4", count=2 * length, offset=at).reshape(length, 2).astype(np.int64)
+        at += track.size * 4
+        heads.append(values)
+        tracks.append(np.column_stack([np.full(length, values[0]), track]))
+    if at != len(data):
+        raise ValueError("bytes are left over")
+    rows = np.array(heads, dtype=np.float64).reshape(-1, 8)
+    observations = np.concatenate([np.zeros((0, 3), np.int64), *tracks])
+    return ModelPoints(rows[:, 0].astype(np.int64), rows[:, 1:4], rows[:, 4:7], rows[:, 7], observations)
 
 
 def _pose(numbers: list[float]) -> Floats:

@@ -61,6 +61,7 @@ class JobKind(StrEnum):
     RECONSTRUCTION = "RECONSTRUCTION"
     AGGREGATION = "AGGREGATION"
     SUBMAP = "SUBMAP"
+    EXPORT = "EXPORT"
 
 
 class JobState(StrEnum):
@@ -204,6 +205,7 @@ class JobResource(Times):
                     "scene_id": None,
                     "map_id": None,
                     "map_version": None,
+                    "export_id": None,
                     "members": [],
                     "parent_id": None,
                     "submap": None,
@@ -221,9 +223,11 @@ class JobResource(Times):
     id: str
     kind: JobKind = Field(
         description="PREFLIGHT is the check of a drive's images, which its commit starts; SUBMAP is a piece of a long "
-        "drive, which its reconstruction starts"
+        "drive, which its reconstruction starts; EXPORT writes a scene or map in formats of other programs"
     )
-    drive_id: str | None = Field(None, description="null for an aggregation, which has members")
+    drive_id: str | None = Field(
+        None, description="null for an aggregation, which has members, and for the export of a map"
+    )
     state: JobState = Field(
         description="STALLED is RUNNING without a recent heartbeat: another worker will take over. An aggregation is "
         "QUEUED, in stage 'reconstructions', while its drives are reconstructed, and the reconstruction of a long "
@@ -238,6 +242,7 @@ class JobResource(Times):
     scene_id: str | None = Field(None, description="what it made")
     map_id: str | None = Field(None, description="of which an aggregation makes a version")
     map_version: int | None = Field(None, description="the version that it made")
+    export_id: str | None = Field(None, description="the export that an EXPORT job makes")
     members: list[JobMember] = Field(default_factory=list, description="what an aggregation brings into its map")
     parent_id: str | None = Field(None, description="the reconstruction that a sub-map is a piece of")
     submap: int | None = Field(None, description="number of a SUBMAP's sub-map along the drive, from 1")

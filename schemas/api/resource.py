@@ -14,6 +14,7 @@ EXAMPLE_OTHER_DRIVE = "drv_77aa0c2a9d3b7e4f5a6c8d9e0f1a2b"
 EXAMPLE_JOB = "job_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
 EXAMPLE_SCENE = "scn_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
 EXAMPLE_MAP = "map_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
+EXAMPLE_EXPORT = "exp_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
 EXAMPLE_SHA256 = "ab" * 32
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]

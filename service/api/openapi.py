@@ -30,6 +30,7 @@ _TAGS = [
     {"name": "jobs", "description": "How far it is and what became of it; cancel and repeat."},
     {"name": "scenes", "description": "What reconstructions made, to download."},
     {"name": "maps", "description": "Several drives or scenes in one, version by version."},
+    {"name": "exports", "description": "Scenes and maps in formats of other programs, as jobs."},
     {"name": "operation", "description": "How the service itself is."},
 ]
 _IDS = {
@@ -37,6 +38,7 @@ _IDS = {
     "upload_id": "of the upload, `upl_...`",
     "job_id": "of the job, `job_...`",
     "scene_id": "of the scene, `scn_...`",
+    "export_id": "of the export, `exp_...`",
     "map_id": "of the map, `map_...`",
     "version": "the version's number, or `current`",
     "path": "the file's name with its folders; slashes stay as they are",

@@ -7,13 +7,13 @@ from typing import TypeVar
 
 from sqlalchemy.orm import Session
 
-from service.database.tables import Drive, Job, Map, Scene, Upload
+from service.database.tables import Drive, Export, Job, Map, Scene, Upload
 from service.errors import not_found
 
-Row = TypeVar("Row", Drive, Job, Map, Scene, Upload)
+Row = TypeVar("Row", Drive, Export, Job, Map, Scene, Upload)
 
 _ID = re.compile(r"[a-z]{3}_[0-9a-f]{1,36}")
-_NAMES = {Drive: "drive", Job: "job", Map: "map", Scene: "scene", Upload: "upload"}
+_NAMES = {Drive: "drive", Export: "export", Job: "job", Map: "map", Scene: "scene", Upload: "upload"}
 
 
 def is_id(text: str) -> bool:

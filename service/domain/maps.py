@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, or_, select, update
+from sqlalchemy import ColumnElement, delete, false, or_, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.maps import MapSummary
@@ -225,11 +225,19 @@ def require_unused(session: Session, *, what: str, drive_id: str | None = None, 
         raise UsedByJob(f"{what} is needed by the aggregation {job_id}", remedy="Wait for its end, or cancel it.")
 
 
-def forget_expired(session: Session, now: int, *, limit: int = 20) -> int:
+def forget_expired(
+    session: Session,
+    now: int,
+    *,
+    unless: Callable[[type[Map] | type[Scene]], ColumnElement[bool]] = lambda table: false(),
+    limit: int = 20,
+) -> int:
     """Delete maps, then scenes, that have passed their retention dates; what a map or a job needs stays.
 
     Parameters
     ----------
+    unless
+        The condition under which a map or scene stays all the same.
     limit
         Of each no more than this, with their files: the transaction is to be short.
 
@@ -245,8 +253,8 @@ def forget_expired(session: Session, now: int, *, limit: int = 20) -> int:
         .where(JobMember.scene_id == Scene.id, Job.state.not_in(TERMINAL))
     )
     in_map = select(MapScene.map_id).where(MapScene.scene_id == Scene.id)
-    return _forget(session, Map, (Map.expires_us < now) & ~busy, limit) + _forget(
-        session, Scene, (Scene.expires_us < now) & ~or_(in_map.exists(), in_job.exists()), limit
+    return _forget(session, Map, (Map.expires_us < now) & ~or_(busy, unless(Map)), limit) + _forget(
+        session, Scene, (Scene.expires_us < now) & ~or_(in_map.exists(), in_job.exists(), unless(Scene)), limit
     )
 
 

@@ -19,6 +19,7 @@ from service.database.tables import (
     Checkpoint,
     Drive,
     DriveFile,
+    ExportFile,
     MapCheckpoint,
     MapFile,
     Project,
@@ -232,6 +233,7 @@ def unused() -> ColumnElement[bool]:
         | sql_exists().where(Checkpoint.blob_id == Blob.id)
         | sql_exists().where(MapFile.blob_id == Blob.id)
         | sql_exists().where(MapCheckpoint.blob_id == Blob.id)
+        | sql_exists().where(ExportFile.blob_id == Blob.id)
     )
 
 

@@ -183,8 +183,8 @@ class World:
     def add_unchecked_drive(self, folder: Path) -> tuple[str, str]:
         """Store a drive; its id, and that of the job that checks it."""
         manifest = facts_of(parse_manifest((folder / "drive.json").read_bytes()))
-        stored = self._store(folder / "drive.json")
-        files = {path: self._store(folder / path) for path, _ in manifest.files}
+        stored = self.store(folder / "drive.json")
+        files = {path: self.store(folder / path) for path, _ in manifest.files}
         with self.database.write() as session:
             drive = drives.create(
                 session,
@@ -200,7 +200,8 @@ class World:
                 )
             return drive.id, drives.commit(session, drive, []).id
 
-    def _store(self, path: Path) -> StoredFile:
+    def store(self, path: Path) -> StoredFile:
+        """Put a file into the artifact store."""
         spool = self.settings.spool_dir
         spool.mkdir(parents=True, exist_ok=True)
         copy = Path(shutil.copy(path, spool / new_id("f")))

@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.domain import exports
 from tests.helpers.live_api import Api, Client
 from tests.helpers.tiny_drive import tiny_drive
 from tests.helpers.tus_client import VERSION, create, head, metadata, patch
@@ -53,7 +54,11 @@ def heard(api: Api) -> dict[tuple[str, str], list[set[str]]]:
     said.ask("get_preflight", "GET", f"/v1/drives/{drive_id}/preflight", 200)
     scene_id = _reconstruct(said, drive_id)
     _download(said, "scene", f"/v1/scenes/{scene_id}/files/points.ply")
+    export_id = _export(said, f"/v1/scenes/{scene_id}/exports", "scene")
+    _download(said, "export", f"/v1/exports/{export_id}/files/points.ply")
     map_id = _aggregate(said, scene_id)
+    _export(said, f"/v1/maps/{map_id}/versions/1/exports", "map")
+    said.ask("delete_export", "DELETE", f"/v1/exports/{export_id}", 204)
     _download(said, "map", f"/v1/maps/{map_id}/versions/current/files/points.ply")
     _delete(said, map_id, scene_id)
     for name, url in (
@@ -160,6 +165,24 @@ def _aggregate(said: Conversation, scene_id: str) -> str:
     said.ask("get_map_version", "GET", f"{url}/versions/1", 200)
     said.ask("delete_map_version", "DELETE", f"{url}/versions/2", 204)
     return str(job["map_id"])
+
+
+def _export(said: Conversation, url: str, of: str) -> str:
+    client, asked = said.client, {"json": {"formats": ["kitti"]}}
+    name = f"create_{of}_export"
+    export = said.post(name, url, 202, **asked)
+    said.ask(name, "POST", url, 200, headers={"Idempotency-Key": f"under-way-{url}"}, **asked)
+    said.ask(name, "POST", url, 422, json={"formats": []})
+    said.ask("delete_export", "DELETE", f"/v1/exports/{export['id']}", 409)
+    held, stored = client.claim(export["job_id"]), client._store(FILES)
+    with client.api.database.write() as session:
+        exports.publish(session, held, files=stored, results=[], expires_us=None)
+    for _ in range(2):
+        said.ask(name, "POST", url, 200, headers={"Idempotency-Key": f"there-{url}"}, **asked)
+    said.ask(f"list_{of}_exports", "GET", url, 200)
+    said.ask("list_exports", "GET", "/v1/exports", 200)
+    said.ask("get_export", "GET", f"/v1/exports/{export['id']}", 200)
+    return str(export["id"])
 
 
 def _scene(client: Client, name: str) -> str:

@@ -117,7 +117,7 @@ def publish_scene(world: World, folder: Path, drive: Path) -> tuple[str, str]:
     drive_id = world.add_drive(drive)
     job_id = world.ask(drive_id, wake=False)
     files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    stored = {name: world._store(path) for name, path in files.items()}
+    stored = {name: world.store(path) for name, path in files.items()}
     with world.database.write() as session:
         held = jobs.claim(session, job_id, owner="worker@test", lease_us=60_000_000)
         assert held is not None

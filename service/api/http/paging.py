@@ -12,10 +12,10 @@ from sqlalchemy import Row, Select, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from schemas.drive import MAX_PATH_CHARACTERS
-from service.database.tables import Drive, Job, Map, Scene
+from service.database.tables import Drive, Export, Job, Map, Scene
 from service.errors import BadCursor
 
-Paged = TypeVar("Paged", Drive, Job, Map, Scene)
+Paged = TypeVar("Paged", Drive, Export, Job, Map, Scene)
 
 MAX_LIMIT = 1000
 # Of the longest position, a path: four bytes a character in UTF-8, and four characters of base64 for three bytes.

@@ -13,18 +13,19 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
+from schemas.api.exports import ExportFileResource
 from schemas.api.maps import MapFileResource
 from schemas.api.resource import EXAMPLE_SHA256
 from schemas.api.scenes import SceneFileResource
 from service.api.context import Context
 from service.api.http.ranges import Part, content_disposition, none_match, requested_part, require_match
 from service.api.http.responses import gives, precondition_failed, problems
-from service.database.tables import Blob, MapFile, SceneFile
+from service.database.tables import Blob, ExportFile, MapFile, SceneFile
 from service.digests import format_digest
 from service.errors import not_found, store_unavailable
 
-File = TypeVar("File", SceneFile, MapFile)
-FileResource = TypeVar("FileResource", SceneFileResource, MapFileResource)
+File = TypeVar("File", SceneFile, MapFile, ExportFile)
+FileResource = TypeVar("FileResource", SceneFileResource, MapFileResource, ExportFileResource)
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 Found = TypeVar("Found")
 
@@ -143,7 +144,7 @@ async def send_file(
     context: Context,
     request: Request,
     path: str,
-    find: Callable[[Session], tuple[str, SceneFile | MapFile, Blob]],
+    find: Callable[[Session], tuple[str, SceneFile | MapFile | ExportFile, Blob]],
 ) -> Response:
     """The bytes of a file, or the part that is asked for.
 

@@ -88,6 +88,7 @@ def _shown(
             "scene_id": job.scene_id,
             "map_id": job.map_id,
             "map_version": job.map_version,
+            "export_id": (job.request or {}).get("export_id") if job.kind == JobKind.EXPORT else None,
             "members": [_shown_member(member, child, settings) for member, child in members],
             "parent_id": job.parent_id,
             "submap": None if job.parent_id is None else jobs.number_of(job),

@@ -23,7 +23,7 @@ from service.api.http.responses import gives, problems
 from service.api.routes.aggregations import ACCEPTED, accepted
 from service.api.routes.job_views import RETRY_AFTER_S, etag_of, view_of, views_of
 from service.database.tables import TERMINAL, Job, JobEvent, JobState, now_us
-from service.domain import aggregations, job_trees, jobs
+from service.domain import aggregations, exports, job_trees, jobs
 from service.domain.access import require
 from service.domain.idempotency import Answer
 
@@ -129,6 +129,9 @@ def retry_job(job_id: str, once: IdempotentDep, caller: CallerDep, context: Cont
         job = require(session, Job, caller.project_id, job_id)
         if job.kind == JobKind.AGGREGATION:
             return accepted(session, context, *aggregations.retry(session, job, expires_us=expires_us))
+        if job.kind == JobKind.EXPORT:
+            again = exports.retry(session, job, expires_us=expires_us)
+            return accepted(session, context, again, [again])
         new = jobs.retry(session, job, expires_us=expires_us)
         return accepted(session, context, new, [new])
 

@@ -16,8 +16,8 @@ from service.api.http.paging import newest, page_of
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import gives, problems
 from service.api.routes.downloads import download_route, files_of, find_file, send_file
-from service.database.tables import Blob, Map, MapFile, MapScene, MapVersion
-from service.domain import maps
+from service.database.tables import Blob, Export, Map, MapFile, MapScene, MapVersion
+from service.domain import exports, maps
 from service.storage.garbage_collection import collect_unused
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
@@ -49,7 +49,9 @@ def get_map(map_id: str, caller: CallerDep, context: ContextDep) -> MapResource:
 def delete_map(map_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a map with all its versions. Its scenes and drives stay."""
     with context.database.write() as session:
-        maps.remove(session, maps.get(session, caller.project_id, map_id, lock=True))
+        found = maps.get(session, caller.project_id, map_id, lock=True)
+        exports.require_none_active(session, what=f"map {map_id}", mine=Export.map_id == map_id)
+        maps.remove(session, found)
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 
@@ -113,7 +115,11 @@ def delete_map_version(
 ) -> None:
     """Delete a version that is not the current one. Its scenes stay."""
     with context.database.write() as session:
-        maps.remove_version(session, maps.get(session, caller.project_id, map_id, lock=True), version)
+        found = maps.get(session, caller.project_id, map_id, lock=True)
+        number = maps.version_of(session, found, version).number
+        mine = (Export.map_id == map_id) & (Export.map_version == number)
+        exports.require_none_active(session, what=f"version {number} of map {map_id}", mine=mine)
+        maps.remove_version(session, found, version)
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 

@@ -14,7 +14,8 @@ from service.api.dependencies import CallerDep, ContextDep, Cursor, Limit, momen
 from service.api.http.paging import newest
 from service.api.http.responses import gives, problems
 from service.api.routes.downloads import download_route, files_of, find_file, send_file
-from service.database.tables import Blob, Scene, SceneFile
+from service.database.tables import Blob, Export, Scene, SceneFile
+from service.domain import exports
 from service.domain.access import require
 from service.domain.maps import require_unused
 from service.storage.garbage_collection import collect_unused
@@ -56,6 +57,7 @@ def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, backgrou
     with context.database.write() as session:
         require(session, Scene, caller.project_id, scene_id, lock=True)
         require_unused(session, what=f"scene {scene_id}", scene_id=scene_id)
+        exports.require_none_active(session, what=f"scene {scene_id}", mine=Export.scene_id == scene_id)
         session.execute(delete(Scene).where(Scene.id == scene_id))
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 

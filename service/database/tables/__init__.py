@@ -10,7 +10,17 @@ from service.database.tables._base import Base, new_id, now_us
 from service.database.tables._drives import Checkpoint, Drive, DriveFile, Upload
 from service.database.tables._jobs import TERMINAL, Job, JobAttempt, JobEvent, JobMember, JobState
 from service.database.tables._projects import ApiKey, Blob, Project
-from service.database.tables._results import Map, MapCheckpoint, MapFile, MapScene, MapVersion, Scene, SceneFile
+from service.database.tables._results import (
+    Export,
+    ExportFile,
+    Map,
+    MapCheckpoint,
+    MapFile,
+    MapScene,
+    MapVersion,
+    Scene,
+    SceneFile,
+)
 from service.database.tables._service import IdempotencyKey, Pass, WorkerSeen
 
 __all__ = [
@@ -21,6 +31,8 @@ __all__ = [
     "Checkpoint",
     "Drive",
     "DriveFile",
+    "Export",
+    "ExportFile",
     "IdempotencyKey",
     "Job",
     "JobAttempt",

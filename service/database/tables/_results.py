@@ -1,4 +1,4 @@
-"""Scenes and maps: what jobs publish."""
+"""Scenes, maps and exports: what jobs publish."""
 
 from __future__ import annotations
 
@@ -114,3 +114,40 @@ class MapCheckpoint(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     blob_id: Mapped[str] = mapped_column(ForeignKey("blobs.id"), index=True)
     created_us: Mapped[int] = mapped_column(default=now_us)
+
+
+class Export(Base):
+    """A scene or a version of a map in formats of other programs: recorded when it is asked for, with its job."""
+
+    __tablename__ = "exports"
+    __table_args__ = (
+        ForeignKeyConstraint(["map_id", "map_version"], _VERSION, ondelete="CASCADE"),
+        Index(None, "project_id", "created_us", "id"),
+        Index(None, "project_id", "inputs_sha256"),
+        Index(None, "map_id", "map_version"),
+    )
+
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=lambda: new_id("exp"))
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    scene_id: Mapped[str | None] = mapped_column(ForeignKey("scenes.id", ondelete="CASCADE"), index=True)
+    map_id: Mapped[str | None] = mapped_column(Id)
+    map_version: Mapped[int | None]
+    job_id: Mapped[str] = mapped_column(Id, index=True)  # the newest that makes it
+    fence: Mapped[int | None]  # of the attempt that published it
+    inputs_sha256: Mapped[str] = mapped_column(Sha256)  # of all that its files are made of: the same gives the same
+    formats: Mapped[list[Any]]
+    options: Mapped[dict[str, Any]]
+    results: Mapped[list[Any] | None]  # by format; null until it is published
+    created_us: Mapped[int] = mapped_column(default=now_us)
+    expires_us: Mapped[int | None] = mapped_column(index=True)
+
+
+class ExportFile(Base):
+    """One file of an export."""
+
+    __tablename__ = "export_files"
+
+    export_id: Mapped[str] = mapped_column(ForeignKey("exports.id", ondelete="CASCADE"), primary_key=True)
+    path: Mapped[str] = mapped_column(Path, primary_key=True)
+    blob_id: Mapped[str] = mapped_column(ForeignKey("blobs.id"), index=True)
+    media_type: Mapped[str] = mapped_column(String(100))

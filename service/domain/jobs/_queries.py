@@ -100,6 +100,8 @@ def tell_state(session: Session, job_id: str) -> None:
         data["scene_id"] = job.scene_id
     if job.map_version is not None:
         data |= {"map_id": job.map_id, "map_version": job.map_version}
+    if job.kind == JobKind.EXPORT:
+        data["export_id"] = (job.request or {})["export_id"]
     session.add(JobEvent(job_id=job_id, kind="state", data=data))
 
 

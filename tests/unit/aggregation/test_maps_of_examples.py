@@ -13,6 +13,7 @@ from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.commands.stage_progress import StageLines
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.export.run_export import ExportRequest, run_export
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.scene.drive import Drive
 from schemas import Pose
@@ -85,3 +86,21 @@ def test_drives_with_rough_poses_alone_and_the_same_names_of_frames(tmp_path: Pa
     with pytest.raises(InputError, match="again and first are of the same drive") as raised:
         aggregate([first, again], tmp_path / "twice", CONFIG)
     assert raised.value.code == "same-drive"
+
+
+def test_a_map_is_exported_with_a_sequence_for_each_scene(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        write_scene(make_scene(folder=name, moving=True), tmp_path / name, REPORT)
+    aggregate([tmp_path / "one", tmp_path / "two"], tmp_path / "map", CONFIG)
+    request = ExportRequest(folder=tmp_path / "map", out=tmp_path / "export", formats=["kitti", "geojson"], drives={})
+    report = run_export(request, progress=lambda *_: None, cancel=lambda: False)
+    assert report["source"] == {"name": "map", "kind": "map"}
+    files = [file["path"] for file in report["formats"]["kitti"]["files"]]
+    assert files == [f"kitti/{scene}/{name}.txt" for scene in ("one", "two") for name in KITTI_FILES]
+    assert (tmp_path / "export" / "kitti" / "two" / "calib.txt").read_text().startswith("Tr_left: 1.000000000 ")
+    positions = json.loads((tmp_path / "export" / "geojson" / "unit_positions.geojson").read_text())["features"]
+    units = json.loads((tmp_path / "map" / "poses.json").read_text())["units"]
+    assert [f["properties"]["scene"] for f in positions] == [u["scene"] for u in units if u["registered"]]
+
+
+KITTI_FILES = ("calib", "frames", "poses", "times")

@@ -1,0 +1,21 @@
+"""Export formats: one table of their writers.
+
+A format is its line in `schemas.exports.EXPORT_FORMATS` (name, description, needs), a module with its writer
+(`export.contract.Writer`), and its line here. `export.run_export` does the rest: it reads the scene or map, calls the
+writers, reads all files back by the checks that they return, withholds what fails and puts the others in place.
+"""
+
+from __future__ import annotations
+
+from mrasfm_engine.export.colmap_workspace import write_colmap
+from mrasfm_engine.export.contract import Writer
+from mrasfm_engine.export.geojson import write_geojson
+from mrasfm_engine.export.kitti_odometry import write_kitti
+from mrasfm_engine.export.nerfstudio import write_nerfstudio
+
+WRITERS: dict[str, Writer] = {
+    "colmap": write_colmap,
+    "nerfstudio": write_nerfstudio,
+    "kitti": write_kitti,
+    "geojson": write_geojson,
+}

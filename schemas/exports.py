@@ -1,0 +1,60 @@
+"""Formats of exports, by the names that commands and the HTTP API give them.
+
+A new one is its line here and its writer in `mrasfm_engine.export.formats`; commands, the API, the client and the
+documentation follow from the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+MIN_IMAGE_SIZE_PX, MAX_IMAGE_SIZE_PX = 64, 20_000
+MAX_FORMATS = 32  # of one export
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportFormat:
+    """A format as users choose it.
+
+    Attributes
+    ----------
+    needs_images
+        Its writer reads the images of the drives.
+    needs_place
+        Only a georeferenced scene or map has it.
+    takes_crs
+        Its coordinates can be in a coordinate reference system of the user's choice.
+    """
+
+    name: str
+    description: str
+    needs_images: bool = False
+    needs_place: bool = False
+    takes_crs: bool = False
+
+
+EXPORT_FORMATS = {
+    known.name: known
+    for known in (
+        ExportFormat(
+            name="colmap",
+            description="COLMAP workspace with undistorted pinhole images and masks, for 3DGS, nerfstudio and MVS",
+            needs_images=True,
+        ),
+        ExportFormat(
+            name="nerfstudio",
+            description="transforms.json with undistorted pinhole images, masks and points, for nerfstudio",
+            needs_images=True,
+        ),
+        ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
+        ExportFormat(
+            name="geojson", description="path and positions of units and cameras as GeoJSON", needs_place=True
+        ),
+    )
+}
+
+
+def unknown_formats(names: Iterable[str]) -> list[str]:
+    """Names that are of no format, each once."""
+    return sorted(set(names) - EXPORT_FORMATS.keys())

@@ -1,0 +1,213 @@
+"""The registry of export formats and the run of an export: what is written, read back, withheld and refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.errors import CancelledError, InputError, MrasfmError
+from mrasfm_engine.export import run_export as exports
+from mrasfm_engine.export.check import Check
+from mrasfm_engine.export.comparisons import nothing
+from mrasfm_engine.export.contract import ExportOptions, ExportWork, Written
+from mrasfm_engine.export.formats import WRITERS
+from mrasfm_engine.export.geojson import _cut
+from mrasfm_engine.export.run_export import ExportRequest, run_export
+from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.export.stored_scene import read_source
+from schemas.exports import EXPORT_FORMATS
+from tests.helpers.export_example import MISSING_UNIT, UNITS, make_scene
+
+SMALL = ("kitti", "geojson")
+
+
+def _nothing(*_: object) -> None:
+    return None
+
+
+def _never() -> bool:
+    return False
+
+
+@pytest.fixture
+def scene_folder(tmp_path: Path) -> Path:
+    write_scene(make_scene(moving=True), tmp_path / "scene", {})
+    return tmp_path / "scene"
+
+
+def _exported(folder: Path, *formats: str, **options: object) -> dict[str, Any]:
+    request = ExportRequest(
+        folder=folder, out=folder.parent / "out", formats=formats, options=ExportOptions(**options), drives={}
+    )
+    return run_export(request, progress=_nothing, cancel=_never)
+
+
+def test_every_format_that_users_can_name_has_a_writer() -> None:
+    assert WRITERS.keys() == EXPORT_FORMATS.keys()
+    assert all(name == known.name for name, known in EXPORT_FORMATS.items())
+
+
+def test_a_written_scene_reads_back_as_it_was(scene_folder: Path) -> None:
+    given, found = make_scene(moving=True), read_source(scene_folder).scene
+    for name in ("unit_registered", "image_registered", "observation_point", "observation_image"):
+        assert np.array_equal(getattr(found, name), getattr(given, name)), name
+    assert np.array_equal(found.observation_keypoint, given.observation_keypoint)
+    registered = given.image_registered
+    assert np.allclose(found.world_from_cam[registered], given.world_from_cam[registered], atol=1e-9)
+    assert np.allclose(found.points_m, given.points_m, atol=0)
+    for one, other in zip(found.calibration, given.calibration, strict=True):
+        assert np.allclose(one.rig_from_cam, other.rig_from_cam, atol=1e-12)
+        assert np.array_equal(one.params, other.params)
+
+
+def test_kitti_poses_are_those_of_the_first_camera_from_its_first_one(scene_folder: Path) -> None:
+    report = _exported(scene_folder, "kitti")
+    scene, folder = make_scene(moving=True), scene_folder.parent / "out" / "kitti" / "00"
+    rows = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
+    units = [u for u in range(UNITS) if u != MISSING_UNIT]
+    world_from_cam = scene.world_from_rig[units] @ scene.calibration[0].rig_from_cam
+    assert np.allclose(rows, (np.linalg.inv(world_from_cam[0]) @ world_from_cam)[:, :3], atol=1e-9)
+    assert (folder / "times.txt").read_text().split() == ["0.000000", "1.000000", "1.500000", "2.000000"]
+    assert (folder / "frames.txt").read_text().split() == ["0", "20", "30", "40"]
+    right = (folder / "calib.txt").read_text().splitlines()[1]
+    expected = np.linalg.inv(scene.calibration[1].rig_from_cam) @ scene.calibration[0].rig_from_cam
+    assert right.startswith("Tr_right: ")
+    assert np.allclose(np.array(right.split()[1:], dtype=float).reshape(3, 4), expected[:3], atol=1e-12)
+    listed = {file["path"]: file["bytes"] for file in report["formats"]["kitti"]["files"]}
+    assert listed["kitti/00/poses.txt"] == (folder / "poses.txt").stat().st_size
+    assert json.loads((folder.parents[1] / "report.json").read_text()) == report
+
+
+def test_geojson_has_the_positions_of_poses_json(scene_folder: Path) -> None:
+    _exported(scene_folder, "geojson")
+    images = [i for i in json.loads((scene_folder / "poses.json").read_text())["images"] if i["registered"]]
+    document = json.loads((scene_folder.parent / "out" / "geojson" / "camera_positions.geojson").read_text())
+    assert [f["properties"]["image"] for f in document["features"]] == [i["file"] for i in images]
+    for feature, image in zip(document["features"], images, strict=True):
+        place = image["geodetic"]
+        longitude, latitude, height = feature["geometry"]["coordinates"]
+        assert abs(longitude - place["longitude_deg"]) < 1e-9
+        assert abs(latitude - place["latitude_deg"]) < 1e-9
+        assert abs(height - place["ellipsoidal_height_m"]) < 1e-3
+
+
+def test_a_line_is_cut_where_it_crosses_the_antimeridian() -> None:
+    parts = _cut(np.array([[179.0, 10.0, 5.0], [-179.0, 12.0, 7.0], [-178.0, 12.0, 7.0]]))
+    assert parts == [
+        [[179.0, 10.0, 5.0], [180.0, 11.0, 6.0]],
+        [[-180.0, 11.0, 6.0], [-179.0, 12.0, 7.0], [-178.0, 12.0, 7.0]],
+    ]
+
+
+def _changed(path: Path) -> Iterator[bytes]:
+    """Its content with one digit changed, for digits all over the file."""
+    content = path.read_bytes()
+    digits = [at for at, byte in enumerate(content) if byte in b"123456789"]
+    for at in digits[:: max(1, len(digits) // 25)]:
+        yield content[:at] + (b"8" if content[at : at + 1] != b"8" else b"3") + content[at + 1 :]
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_changed_digit_withholds_the_format_and_names_the_file(name: str, scene_folder: Path) -> None:
+    source = read_source(scene_folder)
+    work = ExportWork(source=source, options=ExportOptions(), folder=scene_folder.parent / "one", step=_nothing)
+    work.folder.mkdir()
+    written = WRITERS[name](work)
+    for path in [path for path in work.folder.rglob("*") if path.is_file()]:
+        content = path.read_bytes()
+        refused = total = 0
+        for changed in _changed(path):
+            path.write_bytes(changed)
+            fault = exports._fault(written, work.folder)
+            refused += fault is not None and path.name in fault
+            total += 1
+        path.write_bytes(content)
+        assert exports._fault(written, work.folder) is None
+        assert refused == total > 2, path.name
+    path.write_bytes(content[:-5])
+    assert path.name in str(exports._fault(written, work.folder))
+    path.unlink()
+    assert "it is missing" in str(exports._fault(written, work.folder))
+
+
+def test_a_defect_withholds_one_format_and_leaves_the_others(
+    scene_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(work: ExportWork) -> Written:
+        written = WRITERS_BEFORE["kitti"](work)
+        path = work.folder / "00" / "times.txt"
+        path.write_text(path.read_text().replace("1.500000", "1.500001"))
+        return written
+
+    def unread(work: ExportWork) -> Written:
+        (work.folder / "surplus").write_text("x")
+        return Written(checks=[])
+
+    def broken(work: ExportWork) -> Written:
+        raise ZeroDivisionError("of nothing")
+
+    for writer, said in (
+        (damaged, "kitti is withheld: 00/times.txt was written but does not read back: a time"),
+        (unread, "kitti is withheld: surplus was written but does not read back: no check covers it"),
+        (broken, "kitti is withheld: it cannot be written: ZeroDivisionError: of nothing"),
+    ):
+        monkeypatch.setitem(WRITERS, "kitti", writer)
+        report = _exported(scene_folder, *SMALL)
+        assert report["formats"]["kitti"]["withheld"].startswith(said)
+        assert not (scene_folder.parent / "out" / "kitti").exists()
+        assert len(report["formats"]["geojson"]["files"]) == 3
+        with pytest.raises(MrasfmError, match="nothing was exported") as found:
+            _exported(scene_folder, "kitti")
+        assert found.value.code == "export-check-failed"
+
+
+WRITERS_BEFORE = dict(WRITERS)
+
+
+def test_a_later_export_replaces_what_it_does_not_have(scene_folder: Path) -> None:
+    _exported(scene_folder, *SMALL)
+    _exported(scene_folder, "geojson")
+    assert sorted(path.name for path in (scene_folder.parent / "out").iterdir()) == ["geojson", "report.json"]
+
+
+def test_cancelling_publishes_nothing(scene_folder: Path) -> None:
+    request = ExportRequest(folder=scene_folder, out=scene_folder.parent / "out", formats=SMALL, drives={})
+    with pytest.raises(CancelledError):
+        run_export(request, progress=_nothing, cancel=lambda: True)
+    assert sorted(path.name for path in scene_folder.parent.iterdir()) == ["scene"]
+
+
+def test_what_a_scene_does_not_have_is_refused_by_name(scene_folder: Path, tmp_path: Path) -> None:
+    def refused(**changes: object) -> InputError:
+        request = ExportRequest(folder=scene_folder, out=tmp_path / "out", formats=["kitti"], drives={})
+        with pytest.raises(InputError) as found:
+            run_export(replace(request, **changes), progress=_nothing, cancel=_never)
+        return found.value
+
+    write_scene(make_scene(georeferenced=False), tmp_path / "nowhere", {})
+    assert "geojson needs" in refused(folder=tmp_path / "nowhere", formats=["geojson"]).what
+    assert refused(formats=["dxf"]).code == "unknown-format"
+    assert refused(formats=[]).code == "unknown-format"
+    assert refused(options=ExportOptions(image_size_px=5)).code == "bad-image-size"
+    assert refused(options=ExportOptions(crs="EPSG:25832")).code == "crs-not-taken"
+    assert refused(out=scene_folder).code == "bad-out-folder"
+    assert refused(folder=tmp_path / "none").code == "not-a-scene"
+    (scene_folder / "poses.json").write_text("{}")
+    assert "poses.json" in refused().what
+    points = scene_folder / "model" / "points3D.bin"
+    points.write_bytes(points.read_bytes()[:-9])
+    assert not (tmp_path / "out").exists()
+
+
+def test_checks_can_be_given_for_folders(tmp_path: Path) -> None:
+    """As formats with many images do it: one check reads all files of a folder."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a").write_text("a")
+    assert exports._fault(Written(checks=[Check("images", sorted, nothing)]), tmp_path) is not None
+    assert exports._fault(Written(checks=[Check("images", lambda p: None, nothing)]), tmp_path) is None
