@@ -47,6 +47,11 @@ EXPORT_FORMATS = {
             description="transforms.json with undistorted pinhole images, masks and points, for nerfstudio",
             needs_images=True,
         ),
+        ExportFormat(
+            name="nuscenes",
+            description="tables of nuScenes with pinhole images as keyframes, for its development kit and converters",
+            needs_images=True,
+        ),
         ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
         ExportFormat(
             name="geojson", description="path and positions of units and cameras as GeoJSON", needs_place=True

@@ -12,10 +12,12 @@ from mrasfm_engine.export.contract import Writer
 from mrasfm_engine.export.geojson import write_geojson
 from mrasfm_engine.export.kitti_odometry import write_kitti
 from mrasfm_engine.export.nerfstudio import write_nerfstudio
+from mrasfm_engine.export.nuscenes import write_nuscenes
 
 WRITERS: dict[str, Writer] = {
     "colmap": write_colmap,
     "nerfstudio": write_nerfstudio,
+    "nuscenes": write_nuscenes,
     "kitti": write_kitti,
     "geojson": write_geojson,
 }
