@@ -52,6 +52,11 @@ EXPORT_FORMATS = {
             description="tables of nuScenes with pinhole images as keyframes, for its development kit and converters",
             needs_images=True,
         ),
+        ExportFormat(
+            name="mcap",
+            description="one MCAP file with Foxglove's schemas, for Foxglove, Lichtblick and rerun",
+            needs_images=True,
+        ),
         ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
         ExportFormat(
             name="geojson", description="path and positions of units and cameras as GeoJSON", needs_place=True
