@@ -36,6 +36,7 @@ DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
 OPTIONS = ("scene", "sweeps")
 LIDAR = "LIDAR_TOP"
 FLAT_NOTE = "The truth is nuScenes' ego poses: they are plane (z = 0) and good to about 0.1 m; compare x and y apart."
+FLAT_M = 1e-6  # other data sets come in these tables, too, with heights
 SHUTTER_NOTE = "Shutter: the tables do not say whether a camera reads its rows one after the other."
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]+")
 MAX_TABLE_BYTES = 4_000_000_000  # sample_data.json of the full set has over 1 GB
@@ -158,7 +159,7 @@ def read(folder: Path, scene: str | None = None, *, sweeps: bool = False) -> Rec
         name=f"nuscenes-{chosen.name}",
         cameras=cameras,
         units=units,
-        notes=[FLAT_NOTE, SHUTTER_NOTE],
+        notes=[*([FLAT_NOTE] if all(abs(pose.translation[2]) < FLAT_M for pose in ego.values()) else []), SHUTTER_NOTE],
         vehicle=_name(log.vehicle if log else None),
         common_world=None if city is None else f"nuscenes-{city}",
     )

@@ -34,6 +34,7 @@
 | 30 | drives cut into sub-maps, beside the same in one piece |
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
+| 34 | recordings of other programs in, and scenes out to the development kits of data sets |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -75,6 +76,7 @@ from tests.benchmarks.own_car import bar_with_time, real_own_car, rendered_own_c
 from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
+from tests.benchmarks.recordings import recordings
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.road_picture import real_pictures, rendered_markings
 from tests.benchmarks.road_shapes import road_shapes
@@ -138,6 +140,7 @@ LINES = {
     "30": Line(untimed=(submaps,)),
     "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
+    "34": Line(timed=(recordings,)),
 }
 
 

@@ -143,7 +143,8 @@ def test_a_writer_that_errs_is_found(tmp_path: Path, what: str) -> None:
     written(tmp_path, MODELS)
     made, folder = exported(tmp_path)
     (check,) = made.checks
-    source, *rest = check.compare.args
+    given: Any = check.compare
+    source, *rest = given.args
     scene = source.scene
     calibration = list(scene.calibration)
     calibration[1] = replace(calibration[1], params=calibration[1].params + 1e-6)
@@ -160,7 +161,7 @@ def test_a_writer_that_errs_is_found(tmp_path: Path, what: str) -> None:
     other = replace(source, scene=replace(scene, **changes))
     if what == "calibration":
         rest[0] = sent_cameras(other, None)
-    again = replace(check, compare=lambda found: type(check.compare)(check.compare.func, other, *rest)(found))
+    again = replace(check, compare=lambda found: given.func(other, *rest, found))
     assert exports._fault(Written(checks=[again]), folder) is not None
 
 

@@ -97,6 +97,7 @@ def test_imported_again_they_are_the_scene(tmp_path: Path) -> None:
     exported(tmp_path)
     summary = import_recording(tmp_path / "out" / "nuscenes", tmp_path / "again")
     assert (summary.layout, summary.units, summary.truth) == ("nuScenes", UNITS - 1, True)
+    assert not any("plane" in note for note in summary.notes)
     again = read_drive(tmp_path / "again")
     assert [f.code for f in check_drive(again)] == []
     for k, (camera, name) in enumerate(zip(again.cameras, ("CAM_LEFT", "CAM_RIGHT"), strict=True)):

@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -128,7 +129,7 @@ def changed(file: Path, **columns: object) -> None:
     feather.write_feather(table({name: values for name, values in rows.items() if values is not None}), file)
 
 
-def _columns(file: Path) -> tuple[list[str], list]:
+def _columns(file: Path) -> tuple[list[str], list[Any]]:
     read = feather.read_table(file)
     return read.column_names, read.columns
 

@@ -93,8 +93,8 @@ def test_segment(given: Drive, segment: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(drive.rig_from_cam, given.rig_from_cam, atol=1e-12)
     assert drive.timestamps_us.tolist() == given.timestamps_us.tolist()
     assert [image.timestamp_us for image in drive.images] == [image.timestamp_us for image in given.images]
-    for one, other in zip(drive.images, given.images, strict=True):
-        assert (drive.root / one.file).read_bytes() == (given.root / other.file).read_bytes()
+    for image, source in zip(drive.images, given.images, strict=True):
+        assert (drive.root / image.file).read_bytes() == (given.root / source.file).read_bytes()
     truth = np.loadtxt(tmp_path / "drive" / "truth.tum")
     np.testing.assert_allclose(truth[1, 1:4], pose(START_US + 122_000)[:3, 3], atol=1e-5)
 
