@@ -44,9 +44,9 @@ lock: ## renew the locks: of pyproject.toml all, and what the container image ne
 	uv pip compile pyproject.toml --extra build --constraints requirements.lock --universal --python-version 3.11 \
 	  --generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
 	  -o requirements-runtime.lock
-	uv pip compile tests/foreign_readers/requirements.in --universal --python-version 3.11 --generate-hashes \
+	for readers in requirements datasets; do uv pip compile tests/foreign_readers/$$readers.in --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
-	  -o tests/foreign_readers/requirements.lock
+	  -o tests/foreign_readers/$$readers.lock || exit 1; done
 
 wheels: setup ## the wheels of mrasfm and of mrasfm-client, in dist/
 	$(BIN)/python .ci/build_client.py build/client

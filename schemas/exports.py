@@ -48,6 +48,16 @@ EXPORT_FORMATS = {
             needs_images=True,
         ),
         ExportFormat(
+            name="nuscenes",
+            description="tables of nuScenes with pinhole images as keyframes, for its development kit and converters",
+            needs_images=True,
+        ),
+        ExportFormat(
+            name="mcap",
+            description="one MCAP file with Foxglove's schemas, for Foxglove, Lichtblick and rerun",
+            needs_images=True,
+        ),
+        ExportFormat(
             name="copc",
             description="points as a cloud-optimised point cloud in a coordinate reference system of your choice",
             needs_place=True,

@@ -15,10 +15,14 @@ from mrasfm_engine.evaluation.trajectory import MIN_POSES
 from mrasfm_engine.geometry.alignment import align_rigid
 from mrasfm_engine.importers import nuscenes
 from mrasfm_engine.importers.layouts import import_recording
+from mrasfm_engine.importers.recording import RoughQuality
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.types import Floats
 
 STEREO_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))  # of KITTI; the grey one is preferred
+
+# Of the rough poses of nuScenes: what a usual receiver with a compass and an odometer gives.
+ROUGH_NOISE = RoughQuality(sigma_m=0.5, sigma_deg=2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,9 +140,28 @@ def nuscenes_scenes(folder: Path, wanted: str | None) -> list[str]:
 
 
 def bench_nuscenes(
-    folder: Path, scenes: Sequence[str], work: Path, settings: Settings, *, frames: str | None = None
+    folder: Path,
+    scenes: Sequence[str],
+    work: Path,
+    settings: Settings,
+    *,
+    frames: str | None = None,
+    sweeps: bool = False,
+    rough_noise: RoughQuality | None = ROUGH_NOISE,
 ) -> list[SceneResult]:
-    """Reconstruct the keyframes of scenes, all cameras.
+    """Reconstruct scenes with all cameras.
+
+    The method takes rough poses of the vehicle, which nuScenes does not have beside the true ones: they are those with
+    noise. Errors are against the true poses without it.
+
+    Parameters
+    ----------
+    frames
+        A slice START:STOP:STEP of every scene's frames.
+    sweeps
+        Whether all images are taken, at 12 Hz, not the keyframes alone.
+    rough_noise
+        None: there are no rough poses.
 
     Raises
     ------
@@ -146,11 +169,23 @@ def bench_nuscenes(
         Before anything is reconstructed, where a table or an image is missing.
     """
     drives = []
+    options = {"sweeps": True} if sweeps else {}
     for name in scenes:
         drive = work / f"nuscenes-{name}" / "drive"
-        import_recording(folder, drive, scene=name, frames=frames, force=True)
+        import_recording(folder, drive, scene=name, frames=frames, options=options, rough_noise=rough_noise, force=True)
         drives.append(drive)
     return [_bench(name, drive, settings) for name, drive in zip(scenes, drives, strict=True)]
+
+
+def nuscenes_setting(sweeps: bool, rough_noise: RoughQuality | None) -> str:
+    """A sentence on what `bench_nuscenes` reconstructs."""
+    images = "All images, at 12 Hz" if sweeps else "Keyframes, at 2 Hz"
+    if rough_noise is None:
+        return f"{images}, without rough poses."
+    return (
+        f"{images}, with rough poses: the true ones with noise of {rough_noise.sigma_m:g} m and "
+        f"{rough_noise.sigma_deg:g} deg along and about each axis."
+    )
 
 
 def _bench(name: str, drive: Path, settings: Settings) -> SceneResult:

@@ -18,7 +18,7 @@ DEFAULT_UNITS = "100"
 
 # Which options go with which of the things to measure on.
 OF_DRIVE, OF_SIMULATION = {"truth"}, {"units", "seed", "descriptors"}
-OF_KITTI, OF_NUSCENES = {"sequences", "frames"}, {"scenes", "frames"}
+OF_KITTI, OF_NUSCENES = {"sequences", "frames"}, {"scenes", "frames", "sweeps", "no_rough_poses"}
 
 
 def register(subparsers: Any) -> None:
@@ -46,6 +46,15 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--sequences", metavar="LIST", help="as 00-10 or 00,05 (default: all that have true poses)")
     parser.add_argument("--nuscenes", type=Path, metavar="FOLDER", help="nuScenes: v1.0-*/ and samples/")
     parser.add_argument("--scenes", metavar="LIST", help="names of scenes, separated by commas (default: all)")
+    parser.add_argument(
+        "--sweeps", action="store_true", default=None, help="all images of nuScenes, at 12 Hz, not the keyframes alone"
+    )
+    parser.add_argument(
+        "--no-rough-poses",
+        action="store_true",
+        default=None,
+        help="of nuScenes nothing but images; else the true poses with noise of 0.5 m and 2 deg are rough poses",
+    )
     parser.add_argument("--frames", metavar="START:STOP:STEP", help="slice of the frames of every sequence or scene")
     parser.add_argument(
         "--baselines",
@@ -107,7 +116,9 @@ def _require_one_kind(arguments: argparse.Namespace) -> None:
     for option in sorted(set().union(*kinds.values()) - kinds[given[0]]):
         if getattr(arguments, option) is not None:
             of = " or ".join(kind for kind, options in kinds.items() if option in options)
-            raise InputError(f"--{option} does not go with {given[0]}", remedy=f"Leave it out; it goes with {of}.")
+            raise InputError(
+                f"--{option.replace('_', '-')} does not go with {given[0]}", remedy=f"Leave it out; it goes with {of}."
+            )
 
 
 def _measure(arguments: argparse.Namespace, work: Path, settings: Any) -> Any:
@@ -135,9 +146,17 @@ def _measure(arguments: argparse.Namespace, work: Path, settings: Any) -> Any:
         )
     if arguments.nuscenes is not None:
         scenes = datasets.nuscenes_scenes(arguments.nuscenes, arguments.scenes)
-        return bench_datasets_output.NuScenesOutput(
-            datasets.bench_nuscenes(arguments.nuscenes, scenes, work, settings, frames=arguments.frames)
+        noise = None if arguments.no_rough_poses else datasets.ROUGH_NOISE
+        results = datasets.bench_nuscenes(
+            arguments.nuscenes,
+            scenes,
+            work,
+            settings,
+            frames=arguments.frames,
+            sweeps=bool(arguments.sweeps),
+            rough_noise=noise,
         )
+        return bench_datasets_output.NuScenesOutput(results, datasets.nuscenes_setting(bool(arguments.sweeps), noise))
     truth = arguments.truth
     if truth is None and (arguments.drive / TRUTH).is_file():
         truth = arguments.drive / TRUTH

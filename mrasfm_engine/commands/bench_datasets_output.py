@@ -61,9 +61,16 @@ class KittiOutput:
 
 @dataclass(frozen=True)
 class NuScenesOutput:
-    """Table of scenes of nuScenes, beside the published figures."""
+    """Table of scenes of nuScenes, beside the published figures.
+
+    Parameters
+    ----------
+    setting
+        A sentence on what was reconstructed.
+    """
 
     results: Sequence[SceneResult]
+    setting: str = ""
 
     def document(self) -> Document:
         """Document for JSON."""
@@ -73,7 +80,7 @@ class NuScenesOutput:
             for row, of in zip(document.get("mappers", []), _rows_of(result), strict=True):
                 row["planar_rmse_m"] = _planar(result, of)
             scenes.append(document)
-        return {"scenes": scenes, "published_rmse_m": dict(NUSCENES_RMSE_M)}
+        return {"setting": self.setting, "scenes": scenes, "published_rmse_m": dict(NUSCENES_RMSE_M)}
 
     def print(self) -> None:
         """Scenes down, mappers across; then the mean over scenes beside what is published."""
@@ -92,6 +99,8 @@ class NuScenesOutput:
             )
         table.add_row("mean", *(self._mean(mapper) for mapper in mappers), "", "", "", end_section=True)
         console.print(table)
+        if self.setting:
+            console.print(self.setting, soft_wrap=True)
         published = ", ".join(f"{name} {rmse_m:.3f}" for name, rmse_m in NUSCENES_RMSE_M.items())
         console.print(f"Published (arXiv 2510.15467), RMSE in m: {published}", soft_wrap=True)
         console.print(

@@ -11,6 +11,7 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.check import Check
+from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.io.images import read_image_rgb, read_mask
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import class_codes
@@ -79,6 +80,25 @@ class ExportSource:
         """Path of an image of the drive."""
         assert self.files is not None
         return self.files.path(*self.place_of_file(self.scene.drive.images[image].file, image))
+
+    def content(self, image: int) -> bytes:
+        """Bytes of an image's file.
+
+        Raises
+        ------
+        InputError
+            That names the file, where it is missing, damaged, or not of its camera's size.
+        """
+        path, camera = self.image_path(image), self.scene.drive.cameras[self.scene.drive.images[image].camera]
+        header = read_header(path)
+        if (header.width, header.height) != (camera.width, camera.height):
+            raise InputError(
+                f"image {path} has {header.width} x {header.height} pixels, camera {camera.name} has "
+                f"{camera.width} x {camera.height}",
+                remedy="Give the folder of the drive that the scene was made of.",
+                code="other-drive",
+            )
+        return path.read_bytes()
 
     def pixels(self, image: int) -> Bytes:
         """An image (h, w, 3) of the drive.

@@ -12,11 +12,15 @@ from mrasfm_engine.export.contract import Writer
 from mrasfm_engine.export.copc_in_crs import write_copc_in_crs
 from mrasfm_engine.export.geojson import write_geojson
 from mrasfm_engine.export.kitti_odometry import write_kitti
+from mrasfm_engine.export.mcap import write_mcap
 from mrasfm_engine.export.nerfstudio import write_nerfstudio
+from mrasfm_engine.export.nuscenes import write_nuscenes
 
 WRITERS: dict[str, Writer] = {
     "colmap": write_colmap,
     "nerfstudio": write_nerfstudio,
+    "nuscenes": write_nuscenes,
+    "mcap": write_mcap,
     "copc": write_copc_in_crs,
     "kitti": write_kitti,
     "geojson": write_geojson,

@@ -132,7 +132,7 @@ def camchain_text(cameras: Sequence[RigCamera]) -> str:
 def camera_info_text(camera: RigCamera) -> str:
     """ROS's CameraInfo as `camera_calibration_parsers` reads it."""
     fx, fy, cx, cy = camera.intrinsics
-    model, coefficients = _ros_distortion(camera)
+    model, coefficients = ros_distortion(camera)
     return "\n".join(
         [
             f"image_width: {camera.width}",
@@ -148,7 +148,7 @@ def camera_info_text(camera: RigCamera) -> str:
     )
 
 
-def _ros_distortion(camera: RigCamera) -> tuple[str, list[float]]:
+def ros_distortion(camera: RigCamera) -> tuple[str, list[float]]:
     """Name of ROS's model and its coefficients; `plumb_bob` has k3, too, as its fifth."""
     if camera.distortion == EQUIDISTANT:
         return "equidistant", camera.coefficients

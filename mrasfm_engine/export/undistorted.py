@@ -229,7 +229,7 @@ def write_images(work: ExportWork, made: UndistortedScene) -> list[Check]:
         items = [i for i, image in enumerate(made.scene.drive.images) if image.camera == view]
         if not items:
             continue
-        maker = _ImageMaker(made, view, masked=masked)
+        maker = ImageMaker(made, view, masked=masked)
         for image, mask, number in in_order(work.threads, maker.encoded, items):
             name = made.scene.drive.images[number].file
             for kind, file, data in ((IMAGES, name, image), (MASKS, f"{name}.png", mask)):
@@ -239,7 +239,7 @@ def write_images(work: ExportWork, made: UndistortedScene) -> list[Check]:
             done += 1
             work.step(done, total)
     kinds = [kind for kind in (IMAGES, MASKS) if digests[kind]]
-    return [Check(kind, folder_digests, partial(_same_digests, digests[kind])) for kind in kinds]
+    return [Check(kind, folder_digests, partial(same_digests, digests[kind])) for kind in kinds]
 
 
 def _has_masks(made: UndistortedScene) -> bool:
@@ -254,7 +254,7 @@ def _shown(made: UndistortedScene) -> Iterator[Bools]:
         yield view.lookup(scene.drive.cameras[k], scene.calibration[k].params)[1]
 
 
-class _ImageMaker:
+class ImageMaker:
     """Pinhole images of one view, with the table of where they are looked up."""
 
     def __init__(self, made: UndistortedScene, view: int, *, masked: bool) -> None:
@@ -321,7 +321,8 @@ def folder_digests(folder: Path) -> dict[str, str]:
     return {path.name: readers.sha256(path) for path in sorted(folder.iterdir())}
 
 
-def _same_digests(expected: dict[str, str], found: dict[str, str]) -> Rows:
+def same_digests(expected: dict[str, str], found: dict[str, str]) -> Rows:
+    """Every file's content, and that there is no other."""
     for name, digest in expected.items():
         yield Row(f"{name}'s content", found.get(name, "missing"), digest)
     yield Row("its list of files", sorted(found), sorted(expected))

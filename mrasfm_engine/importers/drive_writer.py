@@ -12,11 +12,12 @@ import numpy as np
 from pydantic import ValidationError
 
 from mrasfm_engine.errors import InputError, storage_error
-from mrasfm_engine.importers.recording import Recording, SourceImage
+from mrasfm_engine.importers.recording import ImageKey, Recording, SourceImage
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, write_manifest
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import DriveManifest, Frame, FrameImage, Rig, RoughPose, RoughTrajectory
+from schemas.drive import FIELDS_OF_VERSION_2
 from schemas.parsing import file_problems
 
 TRUTH_NAME = "truth.tum"
@@ -35,6 +36,7 @@ class ImportSummary:
     gnss_samples: int
     rough_poses: int
     truth: bool
+    notes: list[str]
 
 
 def write_recording(recording: Recording, out: Path, *, copy: bool = False, force: bool = False) -> ImportSummary:
@@ -107,14 +109,19 @@ def _fill(recording: Recording, folder: Path, *, drive: Path, copy: bool) -> Imp
     for camera in recording.cameras:
         (folder / "images" / camera.name).mkdir(parents=True)
     masks = 0
+    targets: dict[ImageKey, Path] = {}
     for unit, frame in zip(recording.units, manifest.frames, strict=True):
         for name, image in frame.images.items():
             source = unit.images[name]
-            _place(source.file, folder / image.file, copy=copy)
+            if source.key is None:
+                _place(source.file, folder / image.file, copy=copy)
+            else:
+                targets[source.key] = folder / image.file
             if source.mask is not None and image.mask is not None:
                 (folder / image.mask).parent.mkdir(parents=True, exist_ok=True)
                 _place(source.mask, folder / image.mask, copy=copy)
                 masks += 1
+    _write_contents(recording, targets)
     known = [unit for unit in recording.units if unit.world_from_rig is not None]
     if known:
         poses = np.stack([unit.world_from_rig for unit in known if unit.world_from_rig is not None])
@@ -131,7 +138,23 @@ def _fill(recording: Recording, folder: Path, *, drive: Path, copy: bool) -> Imp
         gnss_samples=len(manifest.gnss.samples) if manifest.gnss else 0,
         rough_poses=len(manifest.rough_poses.poses) if manifest.rough_poses else 0,
         truth=bool(known),
+        notes=recording.notes,
     )
+
+
+def _write_contents(recording: Recording, targets: dict[ImageKey, Path]) -> None:
+    """Write the images that lie in a file with others."""
+    if not targets or recording.contents is None:
+        return
+    for key, content in recording.contents(targets.keys()):
+        with targets.pop(key).open("xb") as sink:
+            sink.write(content)
+    if targets:
+        raise InputError(
+            f"recording {recording.name}: {len(targets)} images are gone, the first {next(iter(targets))}",
+            remedy="Import again while nothing writes to the recording.",
+            code="missing-file",
+        )
 
 
 def _manifest(recording: Recording) -> DriveManifest:
@@ -150,12 +173,13 @@ def _manifest(recording: Recording) -> DriveManifest:
     ]
     try:
         manifest = DriveManifest(
-            **({} if recording.vehicle is None else {"version": 2, "vehicle": recording.vehicle}),
+            version=2 if _needs_version_2(recording) else 1,
+            **({} if recording.vehicle is None else {"vehicle": recording.vehicle}),
             name=recording.name,
             rig=Rig(cameras=recording.cameras),
             frames=frames,
             gnss=recording.gnss,
-            rough_poses=RoughTrajectory(poses=rough) if rough else None,
+            rough_poses=_trajectory(recording, rough) if rough else None,
             label_map=recording.label_map,
             notes=recording.notes,
         )
@@ -167,6 +191,19 @@ def _manifest(recording: Recording) -> DriveManifest:
         what = f"the drive's file {problem.path} {problem.what}"
         raise InputError(f"recording {recording.name}: {what}", remedy="Rename its camera at its source.")
     return manifest
+
+
+def _needs_version_2(recording: Recording) -> bool:
+    fields = (FIELDS_OF_VERSION_2 & camera.model_fields_set for camera in recording.cameras)
+    return recording.vehicle is not None or any(fields)
+
+
+def _trajectory(recording: Recording, poses: list[RoughPose]) -> RoughTrajectory:
+    quality = recording.rough_quality
+    sigmas = (
+        {} if quality is None else {"sigma_translation_m": quality.sigma_m, "sigma_rotation_deg": quality.sigma_deg}
+    )
+    return RoughTrajectory(poses=poses, common_world=recording.common_world, **sigmas)
 
 
 def _frame_image(camera: str, frame: int, image: SourceImage) -> FrameImage:

@@ -21,7 +21,7 @@ from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera
 
 DESCRIPTION = "calib.txt and image_0 to image_3 (KITTI odometry)"
-HAS_SCENES = False
+OPTIONS: tuple[str, ...] = ()
 CAMERAS = ("image_0", "image_1", "image_2", "image_3")
 
 

@@ -30,7 +30,7 @@ from mrasfm_engine.types import Floats, Ints
 from schemas import Camera, Gnss
 
 DESCRIPTION = "calib_cam_to_cam.txt and DATE_drive_NNNN_sync (KITTI raw)"
-HAS_SCENES = True
+OPTIONS = ("scene",)
 CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 
 OXTS_COLUMNS = 30

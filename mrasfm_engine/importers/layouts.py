@@ -2,23 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.importers import kitti, kitti_raw, nuscenes, pandaset, rig_folder
+from mrasfm_engine.importers import (
+    argoverse2,
+    bags,
+    colmap_rig,
+    kitti,
+    kitti_raw,
+    nuscenes,
+    pandaset,
+    rig_folder,
+    waymo,
+)
 from mrasfm_engine.importers.drive_writer import ImportSummary, write_recording
-from mrasfm_engine.importers.recording import Recording, SourceUnit, select_cameras, select_units
+from mrasfm_engine.importers.recording import Recording, RoughQuality, SourceUnit, select_cameras, select_units
+from mrasfm_engine.importers.rough_poses import with_rough_poses
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
 from schemas.drive import MAX_RIG_EXTENT_M
 
-LAYOUTS: tuple[ModuleType, ...] = (rig_folder, kitti, kitti_raw, nuscenes, pandaset)
+LAYOUTS: tuple[ModuleType, ...] = (
+    rig_folder,
+    kitti,
+    kitti_raw,
+    nuscenes,
+    pandaset,
+    argoverse2,
+    waymo,
+    colmap_rig,
+    bags,
+)
 
 # GNSS samples this long before the first and after the last image are kept: they smooth the ends of the track.
 GNSS_MARGIN_US = 2_000_000
@@ -32,8 +54,10 @@ def import_recording(
     cameras: Sequence[str] | None = None,
     gnss_file: Path | None = None,
     scene: str | None = None,
+    options: Mapping[str, Any] | None = None,
     vehicle: str | None = None,
     truth: bool = False,
+    rough_noise: RoughQuality | None = None,
     copy: bool = False,
     force: bool = False,
 ) -> ImportSummary:
@@ -42,7 +66,7 @@ def import_recording(
     Parameters
     ----------
     folder
-        The recording.
+        The recording; a file, if it is a bag.
     out
         Where the drive goes.
     frames
@@ -54,10 +78,14 @@ def import_recording(
         directory.
     scene
         Name of the scene, for layouts that hold several.
+    options
+        Further ones of the layout, by the names in its `OPTIONS`.
     vehicle
         Which vehicle drove, instead of what the recording says.
     truth
         Whether the units' poses become the truth where they are outputs of the system that the GNSS is of, too.
+    rough_noise
+        Noise with which the units' poses become rough poses.
     copy, force
         See `write_recording`.
 
@@ -69,35 +97,48 @@ def import_recording(
         If the drive cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    if not folder.is_dir():
-        state = "is not a folder" if folder.exists() else "does not exist"
-        raise InputError(f"recording {folder} {state}", remedy="Check the path.", code="missing-folder")
+    if not folder.exists():
+        raise InputError(f"recording {folder} does not exist", remedy="Check the path.", code="missing-folder")
     if folder.resolve() == out.resolve() or out.resolve() in folder.resolve().parents:
         raise InputError(
             f"the drive {out} would replace the recording {folder}", remedy="Give another folder.", code="output-in-use"
         )
-    recording = select_units(select_cameras(_read(folder, scene), cameras), frames)
+    recording = select_units(select_cameras(_read(folder, {**(options or {}), "scene": scene}), cameras), frames)
     if vehicle is not None:
         recording = replace(recording, vehicle=vehicle)
+    if rough_noise is not None:
+        recording = with_rough_poses(recording, rough_noise)
     if recording.truth_is_gnss and not truth:
         recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
     return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
 
 
-def _read(folder: Path, scene: str | None) -> Recording:
-    for layout in LAYOUTS:
-        if not layout.recognises(folder):
+def _read(path: Path, options: Mapping[str, Any]) -> Recording:
+    given = {name: value for name, value in options.items() if value is not None}
+    for layout in LAYOUTS if path.is_dir() else (bags,):
+        if not layout.recognises(path):
             continue
-        if scene is not None and not layout.HAS_SCENES:
-            raise InputError(f"recording {folder} has only one scene", remedy="Leave --scene out.", code="no-scenes")
-        recording: Recording = layout.read(folder, scene) if layout.HAS_SCENES else layout.read(folder)
+        if unused := [name for name in given if name not in layout.OPTIONS]:
+            if unused == ["scene"]:
+                raise InputError(f"recording {path} has only one scene", remedy="Leave --scene out.", code="no-scenes")
+            raise InputError(
+                f"a recording with {layout.DESCRIPTION} has no use for {', '.join(map(_flag, unused))}",
+                remedy="Leave it out.",
+                code="unused-option",
+            )
+        recording: Recording = layout.read(path, **given)
         return recording
     looked_for = "; ".join(layout.DESCRIPTION for layout in LAYOUTS)
     raise InputError(
-        f"the layout of {folder} is not known. Looked for: {looked_for}",
-        remedy="Give the folder that holds these files, or write a drive.json as `mrasfm describe manifest` explains.",
+        f"the layout of {path} is not known. Looked for: {looked_for}",
+        remedy="Give a bag or the folder that holds these files, or write a drive.json: `mrasfm describe manifest`.",
         code="unknown-layout",
     )
+
+
+def _flag(option: str) -> str:
+    """The option as the command has it: names there have no unit."""
+    return "--" + option.removesuffix("_m").replace("_", "-")
 
 
 def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Recording:
@@ -107,6 +148,7 @@ def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Re
             return recording
         own = recording.gnss.model_copy(update={"samples": samples_around(recording.gnss.samples, recording.units)})
         return replace(recording, gnss=own)
+    folder = folder if folder.is_dir() else folder.parent
     antenna_file = file.parent / ANTENNA_FILE
     if not antenna_file.exists():
         antenna_file = folder / ANTENNA_FILE
@@ -122,6 +164,7 @@ def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Re
 
 
 def _find(gnss_file: Path, folder: Path) -> Path:
+    folder = folder if folder.is_dir() else folder.parent
     candidates = [folder / gnss_file, gnss_file]  # joining an absolute path gives that path
     for candidate in candidates:
         if candidate.is_file():

@@ -1,4 +1,4 @@
-"""Imports one scene of nuScenes: the keyframes of its cameras.
+"""Imports one scene of nuScenes: the keyframes of its cameras, at 2 Hz, or all their images, at 12 Hz.
 
 Source: Caesar et al., "nuScenes: A multimodal dataset for autonomous driving", CVPR 2020, and the schema of its
 development kit. The rig frame is the dataset's ego frame: x forward, y left, z up, origin below the rear axle's middle.
@@ -16,7 +16,16 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, choose_scene, pinhole_params
+from mrasfm_engine.importers.frame_grouping import units_by_time
+from mrasfm_engine.importers.recording import (
+    Recording,
+    SourceImage,
+    SourceUnit,
+    choose_scene,
+    interpolated_poses,
+    pinhole_params,
+    with_truth,
+)
 from mrasfm_engine.importers.rig_folder import checked_camera
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.types import Floats
@@ -24,9 +33,11 @@ from schemas import Camera
 from schemas.drive import MAX_VEHICLE_CHARACTERS, Finite, RelativePath, Vector3
 
 DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
-HAS_SCENES = True
+OPTIONS = ("scene", "sweeps")
 LIDAR = "LIDAR_TOP"
 FLAT_NOTE = "The truth is nuScenes' ego poses: they are plane (z = 0) and good to about 0.1 m; compare x and y apart."
+FLAT_M = 1e-6  # other data sets come in these tables, too, with heights
+SHUTTER_NOTE = "Shutter: the tables do not say whether a camera reads its rows one after the other."
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]+")
 MAX_TABLE_BYTES = 4_000_000_000  # sample_data.json of the full set has over 1 GB
 
@@ -45,6 +56,7 @@ class _Scene(_Row):
 
 class _Log(_Row):
     vehicle: Any = None
+    location: Any = None
 
 
 class _Sample(_Row):
@@ -103,13 +115,15 @@ def _versions(folder: Path) -> list[Path]:
     return [path for path in candidates if (path / "scene.json").is_file()]
 
 
-def read(folder: Path, scene: str | None = None) -> Recording:
+def read(folder: Path, scene: str | None = None, *, sweeps: bool = False) -> Recording:
     """Read one scene; images are not opened.
 
     Parameters
     ----------
     scene
         Its name, as `scene-0061`; may be left out if there is only one.
+    sweeps
+        Whether the images between the keyframes are wanted, too.
 
     Raises
     ------
@@ -123,37 +137,66 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     sensors = _by_token(_table(tables, "sensor", _Sensor))
     calibrated = _by_token(_table(tables, "calibrated_sensor", _Calibrated))
     wanted = {sample.token for sample in samples}
-    keyframes = [d for d in _table(tables, "sample_data", _SampleData) if d.is_key_frame and d.sample_token in wanted]
-    channels = {d.token: _channel(d, calibrated, sensors, tables) for d in keyframes}
-    needed = {d.ego_pose_token for d in keyframes}
+    taken = [
+        d for d in _table(tables, "sample_data", _SampleData) if (d.is_key_frame or sweeps) and d.sample_token in wanted
+    ]
+    channels = {d.token: _channel(d, calibrated, sensors, tables) for d in taken}
+    needed = {d.ego_pose_token for d in taken}
     ego = {pose.token: pose for pose in _table(tables, "ego_pose", _Posed) if pose.token in needed}
-    cameras = _cameras(keyframes, channels, calibrated, tables)
-    by_sample: dict[str, dict[str, _SampleData]] = {sample.token: {} for sample in samples}
-    for d in keyframes:
-        by_sample[d.sample_token][channels[d.token].channel] = d
+    cameras = _cameras(taken, channels, calibrated, tables)
     names = {camera.name for camera in cameras}
-    units = [
-        _unit(i, sample, by_sample[sample.token], names, ego, data)
-        for i, sample in enumerate(samples)
-    ]  # fmt: skip
+    if sweeps:
+        units = _units_of_sweeps([d for d in taken if channels[d.token].channel in names], channels, ego, data)
+    else:
+        by_sample: dict[str, dict[str, _SampleData]] = {sample.token: {} for sample in samples}
+        for d in taken:
+            by_sample[d.sample_token][channels[d.token].channel] = d
+        units = [_unit(i, sample, by_sample[sample.token], names, ego, data) for i, sample in enumerate(samples)]
+    log = _log(chosen, tables)
+    city = _name(log.location if log else None)
     return Recording(
         layout="nuScenes",
         name=f"nuscenes-{chosen.name}",
         cameras=cameras,
         units=units,
-        notes=[FLAT_NOTE],
-        vehicle=_vehicle(chosen, tables),
+        notes=[*([FLAT_NOTE] if all(abs(pose.translation[2]) < FLAT_M for pose in ego.values()) else []), SHUTTER_NOTE],
+        vehicle=_name(log.vehicle if log else None),
+        common_world=None if city is None else f"nuscenes-{city}",
     )
 
 
-def _vehicle(scene: _Scene, tables: Path) -> str | None:
-    """The vehicle that the scene's log names, where the tables have one, by a name that a manifest may have."""
+def _log(scene: _Scene, tables: Path) -> _Log | None:
+    """The log that the scene is of, where the tables have it."""
     if scene.log_token is None or not (tables / "log.json").is_file():
         return None
-    logs = _by_token(_table(tables, "log", _Log))
-    given = logs[scene.log_token].vehicle if scene.log_token in logs else None
+    return _by_token(_table(tables, "log", _Log)).get(scene.log_token)
+
+
+def _name(given: Any) -> str | None:
+    """A name from a log as a manifest may have it."""
     found = _NOT_IN_A_NAME.sub("-", given if isinstance(given, str) else "").lstrip("_.:-")[:MAX_VEHICLE_CHARACTERS]
     return found or None
+
+
+def _units_of_sweeps(
+    taken: list[_SampleData], channels: dict[str, _Sensor], ego: dict[str, _Posed], data: Path
+) -> list[SourceUnit]:
+    """All images, put together by their times; a unit's pose is interpolated between those of its and other images."""
+    by_camera: dict[str, dict[int, _SampleData]] = {}
+    for d in taken:
+        by_camera.setdefault(channels[d.token].channel, {})[d.timestamp] = d
+    units = units_by_time(
+        {
+            name: [SourceImage(file=data / rows[t].filename, timestamp_us=t) for t in sorted(rows)]
+            for name, rows in by_camera.items()
+        }
+    )
+    posed = {d.timestamp: ego[d.ego_pose_token].matrix() for d in taken if d.ego_pose_token in ego}
+    if not posed:
+        return units
+    times_us = np.array(sorted(posed), dtype=np.int64)
+    poses = np.stack([posed[int(t)] for t in times_us])
+    return with_truth(units, interpolated_poses(times_us, poses, np.array([unit.timestamp_us for unit in units])))
 
 
 def scene_names(folder: Path) -> list[str]:

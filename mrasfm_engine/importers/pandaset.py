@@ -32,7 +32,7 @@ from schemas import Camera, Gnss
 from schemas.drive import MAX_CAMERAS, Finite
 
 DESCRIPTION = "camera/*/intrinsics.json and lidar/poses.json (PandaSet)"
-HAS_SCENES = True
+OPTIONS = ("scene",)
 
 # PandaSet does not state it. Its GNSS and the vehicle's poses are two outputs of one inertial navigation system with
 # corrections, and agree to some centimetres.

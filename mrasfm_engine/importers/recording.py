@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -22,14 +22,18 @@ PIXEL_CENTER_PX = 0.5
 
 T = TypeVar("T")
 
+# An image in a file that holds many: of a bag the topic and the stamp.
+ImageKey = tuple[str, int]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SourceImage:
     """One image where the recording has it."""
 
-    file: Path
+    file: Path  # of an image with a key, only the suffix counts
     timestamp_us: int | None = None  # None: taken with its unit
     mask: Path | None = None
+    key: ImageKey | None = None  # of one that `Recording.contents` reads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +48,14 @@ class SourceUnit:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RoughQuality:
+    """Standard deviations of rough poses, along and about each axis."""
+
+    sigma_m: float
+    sigma_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Recording:
     """A recording with all rotations in the engine's axes: x forward, y left, z up."""
 
@@ -54,10 +66,14 @@ class Recording:
     body_axes: BodyAxes = BodyAxes.FLU  # of files that belong to the recording, as the antenna's position
     default_gnss: Path | None = None
     gnss: Gnss | None = None
+    rough_quality: RoughQuality | None = None  # None: the manifest's defaults
+    common_world: str | None = None  # of the units' poses, where other recordings have it, too
     truth_is_gnss: bool = False  # the units' poses are of the system that the GNSS is of: truth only where asked for
     label_map: LabelMap | None = None
     notes: list[str] = field(default_factory=list)
     vehicle: str | None = None
+    # Files of images with these keys, in any order, one at a time in memory.
+    contents: Callable[[Collection[ImageKey]], Iterator[tuple[ImageKey, bytes]]] | None = None
 
 
 def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T:
@@ -66,9 +82,11 @@ def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T
     Raises
     ------
     InputError
-        If there is none of this name, or none is named and there are several.
+        If there is none at all or none of this name, or none is named and there are several.
     """
     known = ", ".join(sorted(scenes)[:20]) or "none"
+    if not scenes:
+        raise InputError(f"{folder} holds no scenes", remedy="Unpack the recording again.", code="no-scenes")
     if wanted is None and len(scenes) > 1:
         raise InputError(
             f"{folder} holds {len(scenes)} scenes: {known}",
@@ -97,6 +115,11 @@ def interpolated_poses(times_us: Ints, world_from_any: Floats, at_us: Ints) -> l
     poses = se3.interpolate(times_us, world_from_any, at_us)
     known = (at_us >= times_us[0]) & (at_us <= times_us[-1])
     return [pose if there else None for pose, there in zip(poses, known, strict=True)]
+
+
+def with_truth(units: Sequence[SourceUnit], poses: Sequence[Floats | None]) -> list[SourceUnit]:
+    """The units with true poses (4, 4), where there are any."""
+    return [replace(unit, world_from_rig=pose) for unit, pose in zip(units, poses, strict=True)]
 
 
 def gnss_of_vehicle(

@@ -28,7 +28,7 @@ from schemas import BodyAxes, Camera, LabelMap
 from schemas.drive import MAX_CAMERAS, Finite, Name, Vehicle
 
 DESCRIPTION = "rig.json and a folder of numbered images for every camera"
-HAS_SCENES = False
+OPTIONS: tuple[str, ...] = ()
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_FRAME_INTERVAL_US = 100_000  # where times.txt is missing
 
@@ -55,7 +55,9 @@ class _RigCamera(BaseModel):
         return self
 
 
-class _RigFile(BaseModel):
+class RigFile(BaseModel):
+    """A `rig.json`."""
+
     model_config = ConfigDict(extra="ignore")
 
     body_axes: BodyAxes
@@ -76,10 +78,8 @@ def read(folder: Path) -> Recording:
     InputError
         If a file is missing or malformed.
     """
-    rig_file = folder / "rig.json"
-    rig = read_document(rig_file, _RigFile, what="calibration")
+    cameras, rig = read_rig(folder / "rig.json")
     flu_body = flu_from_body(rig.body_axes)
-    cameras = [_camera(name, camera, flu_body, rig_file) for name, camera in rig.cameras.items()]
     images = {name: numbered_images(folder / name) for name in rig.cameras}
     masks = {name: _masks(folder / "semantics" / name) for name in rig.cameras}
     frames = sorted({frame for files in images.values() for frame in files})
@@ -117,6 +117,19 @@ def read(folder: Path) -> Recording:
         default_gnss=gnss if gnss.exists() else None,
         label_map=LabelMap.cityscapes() if any(masks.values()) else None,
     )
+
+
+def read_rig(file: Path) -> tuple[list[Camera], RigFile]:
+    """Cameras of a `rig.json`, on a rig with x forward, y left and z up, and the file's content.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or malformed.
+    """
+    rig = read_document(file, RigFile, what="calibration")
+    flu_body = flu_from_body(rig.body_axes)
+    return [_camera(name, camera, flu_body, file) for name, camera in rig.cameras.items()], rig
 
 
 def _camera(name: str, camera: _RigCamera, flu_body: Floats, rig_file: Path) -> Camera:
@@ -186,8 +199,13 @@ def pinhole_camera(name: str, images: dict[int, Path], k: Floats, rig_from_cam: 
     )
 
 
-def numbered_images(folder: Path) -> dict[int, Path]:
+def numbered_images(folder: Path, *, digits: int = 12) -> dict[int, Path]:
     """Images of a folder by their frame number.
+
+    Parameters
+    ----------
+    digits
+        Of the longest number.
 
     Raises
     ------
@@ -201,7 +219,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
     for file in sorted(folder.iterdir()):
         if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
             continue
-        if not re.fullmatch(r"[0-9]{1,12}", file.stem):
+        if not re.fullmatch(rf"[0-9]{{1,{digits}}}", file.stem):
             raise InputError(
                 f"image {file} is not named by its frame number", remedy="Name images as 000000.png.", code="bad-name"
             )

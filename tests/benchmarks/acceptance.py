@@ -35,6 +35,7 @@
 | 31 | files for other programs, as readers of others read them; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
 | 33 | exports of images for splatting; the client's wheel in an environment of its own |
+| 34 | recordings of other programs in, and scenes out to the development kits of data sets |
 | 35 | the whole command on real drives beside COLMAP's extraction, matching and global mapper |
 | 36 | simulated routes whose descriptors lie on disk: memory and time of matching and mapping |
 | 37 | maps of 15 and of 60 simulated scenes: time and memory of a scene |
@@ -81,6 +82,7 @@ from tests.benchmarks.own_car import bar_with_time, real_own_car, rendered_own_c
 from tests.benchmarks.real_drives import accuracy
 from tests.benchmarks.recalibration import recalibration, straight_street
 from tests.benchmarks.receivers import receivers
+from tests.benchmarks.recordings import recordings
 from tests.benchmarks.rendered_drives import SEEDS, rendered, rendered_loop
 from tests.benchmarks.road_picture import real_pictures, rendered_markings
 from tests.benchmarks.road_shapes import road_shapes
@@ -146,6 +148,7 @@ LINES = {
     "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
     "33": Line(untimed=(exports_of_images, client_wheel)),
+    "34": Line(timed=(recordings,)),
     "35": Line(timed=(whole_command,)),
     "36": Line(timed=(from_descriptors,)),
     "37": Line(timed=(many_scenes,)),

@@ -31,7 +31,7 @@ KALIBR = 1e-9
 def foreign_readers(data: Path, work: Path) -> Iterator[Figure]:
     """Readers that are not installed and cannot be are skipped by name."""
     yield from _large_copc(work)
-    python, node = _python_readers(work), _copc_js(work)
+    python, node = python_readers(work, "requirements.lock"), _copc_js(work)
     for program, found in (("the Python readers", python), ("copc.js", node)):
         if isinstance(found, str):
             yield Figure(line=LINE, what=f"{program}: skipped, cannot be installed here", value=0, remark=found)
@@ -59,14 +59,18 @@ def _large_copc(work: Path) -> Iterator[Figure]:
     yield Figure(line=LINE, what="COPC of 5 million points: size", value=path.stat().st_size / 1e6, unit="MB")
 
 
-def _python_readers(work: Path) -> Path | str:
-    """Interpreter of an environment with the readers; why there is none."""
-    python = work / "readers" / "bin" / "python"
-    install = ["-m", "pip", "install", "--quiet", "--require-hashes", "-r", READERS / "requirements.lock"]
-    for command in ([sys.executable, "-m", "venv", work / "readers"], [python, *install]):
-        problem = _problem(command, work)
+def python_readers(work: Path, lock: str) -> Path | str:
+    """Interpreter of an environment with the readers of a lock; why there is none."""
+    folder = work / f"readers of {lock}"
+    python = folder / "bin" / "python"
+    if (folder / "complete").exists():
+        return python
+    install = ["-m", "pip", "install", "--quiet", "--require-hashes", "-r", READERS / lock]
+    for command in ([sys.executable, "-m", "venv", folder], [python, *install]):
+        problem = problem_of(command, work)
         if problem is not None:
             return problem
+    (folder / "complete").touch()
     return python
 
 
@@ -76,7 +80,7 @@ def _copc_js(work: Path) -> Path | str:
         return "there is no npm"
     folder = work / "copc_js"
     shutil.copytree(READERS / "copc_js", folder)
-    return _problem(["npm", "ci", "--silent"], folder) or folder / "read.mjs"
+    return problem_of(["npm", "ci", "--silent"], folder) or folder / "read.mjs"
 
 
 def _run(command: list[Any], folder: Path) -> subprocess.CompletedProcess[str]:
@@ -84,13 +88,13 @@ def _run(command: list[Any], folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
-def _problem(command: list[Any], folder: Path) -> str | None:
+def problem_of(command: list[Any], folder: Path) -> str | None:
     """The last line of a command that fails."""
     result = _run(command, folder)
     return None if result.returncode == 0 else (result.stderr.strip().splitlines() or ["it says nothing"])[-1]
 
 
-def _output(command: list[Any], folder: Path) -> dict[str, Any]:
+def output_of(command: list[Any], folder: Path) -> dict[str, Any]:
     result = _run(command, folder)
     if result.returncode != 0:
         raise CommandFailed(f"{Path(command[1]).name} ended with {result.returncode}: {result.stderr.strip()[-200:]}")
@@ -101,13 +105,13 @@ def _output(command: list[Any], folder: Path) -> dict[str, Any]:
 def _figures(title: str, scene: Path, python: Path | str, node: Path | str) -> Iterator[Figure]:
     points = read_report(scene)["summary"]["points"]
     if isinstance(python, Path):
-        said = _output([python, READERS / "read.py", scene], scene)
+        said = output_of([python, READERS / "read.py", scene], scene)
         for name, found in said.items():
             problem = found.get("missing") or found.get("error")
             yield exactly(LINE, f"{title}: {name} reads it" + (f": {problem}" if problem else ""), int(not problem), 1)
         yield from _of_python(title, said, points)
     if isinstance(node, Path):
-        found = _output(["node", node, scene / COPC_FILE], node.parent)
+        found = output_of(["node", node, scene / COPC_FILE], node.parent)
         yield exactly(
             LINE, f"{title}: copc.js, points inside of their nodes", found["points"] - found["outside"], points
         )

@@ -104,6 +104,7 @@ def test_nuscenes(variant: Variant, mrasfm: Run, tmp_path: Path) -> None:
     root = as_nuscenes(read_drive(drive), tmp_path / "nuscenes", scene="scene-0007")
     ran = mrasfm("bench", "--nuscenes", root, "--json")
     assert ran.code == 0, ran.err
+    assert "noise of 0.5 m and 2 deg" in json.loads(ran.out)["setting"]
     (scene,) = json.loads(ran.out)["scenes"]
     (ours,) = scene["mappers"]
     assert (scene["name"], scene["units"], ours["registered_images"]) == ("scene-0007", UNITS, 3 * UNITS)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrasfm_engine.benchmark.datasets import SceneResult
+from mrasfm_engine.benchmark.datasets import ROUGH_NOISE, SceneResult, nuscenes_setting
 from mrasfm_engine.benchmark.mapping import Prepared
 from mrasfm_engine.benchmark.scaling import Growth, GrowthRow
 from mrasfm_engine.benchmark.side_by_side import Comparison, Row, baselines_named
@@ -108,7 +108,8 @@ def test_kitti_stands_beside_what_is_published(capsys: pytest.CaptureFixture[str
 
 
 def test_nuscenes_has_plane_and_space_apart(capsys: pytest.CaptureFixture[str]) -> None:
-    output = NuScenesOutput([SceneResult(name="scene-0061", comparison=COMPARISON)])
+    setting = nuscenes_setting(True, ROUGH_NOISE)
+    output = NuScenesOutput([SceneResult(name="scene-0061", comparison=COMPARISON)], setting)
     output.print()
     printed = capsys.readouterr().out
     document = json.loads(json.dumps(output.document(), allow_nan=False))
@@ -117,6 +118,9 @@ def test_nuscenes_has_plane_and_space_apart(capsys: pytest.CaptureFixture[str]) 
     assert f"{mapper['planar_rmse_m']:.3f} / {mapper['errors']['metric_rmse_m']:.3f}" in printed
     assert "mean" in printed
     assert "MRASfM 0.124" in printed
+    assert "All images, at 12 Hz, with rough poses: the true ones with noise of 0.5 m and 2 deg" in printed
+    assert document["setting"] == setting
+    assert nuscenes_setting(False, None) == "Keyframes, at 2 Hz, without rough poses."
     assert document["published_rmse_m"]["MGSfM"] == 0.134
 
 

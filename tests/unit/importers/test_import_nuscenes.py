@@ -12,6 +12,7 @@ import pytest
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.layouts import import_recording
+from mrasfm_engine.importers.recording import RoughQuality
 from mrasfm_engine.preflight.drive_reader import check_drive, read_drive
 
 START_US = 1_532_402_927_000_000
@@ -153,6 +154,56 @@ def test_truth_is_the_laser_scanners_ego_pose(dataset: Path, tmp_path: Path) -> 
     np.testing.assert_allclose(rotation[:, :3, 0], np.tile([0.5**0.5, 0.5**0.5, 0], (4, 1)), atol=1e-8)
 
 
+def test_sweeps_are_put_together_by_their_times(dataset: Path, tmp_path: Path) -> None:
+    """Between the keyframes, 25 ms apart, and of the front camera one is missing."""
+    rng = np.random.default_rng(6)
+    rows = [row for row in make_tables()["sample_data"] if not row["is_key_frame"] and row["width"]]
+    for row in rows:
+        file = dataset / row["filename"]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), rng.integers(0, 255, (32, 48, 3), dtype=np.uint8))
+    tables = make_tables()
+    tables["sample_data"].remove(next(row for row in rows if f"sweeps/{FRONT}" in row["filename"]))
+    write_tables(dataset, tables)
+    summary = import_recording(dataset, tmp_path / "drive", scene="scene-0061", options={"sweeps": True})
+    assert (summary.units, summary.images) == (8, 15)
+    drive = read_drive(tmp_path / "drive")
+    assert check_drive(drive) == []
+    assert [sorted(frame.images) for frame in drive.manifest.frames[:3]] == [[BACK, FRONT], [BACK], [BACK, FRONT]]
+    middle_us = START_US + 24_500
+    assert drive.timestamps_us.tolist()[::2] == [middle_us + 500_000 * i for i in range(4)]
+    truth = np.loadtxt(tmp_path / "drive/truth.tum")
+    assert len(truth) == 8
+    np.testing.assert_allclose(truth[:, 1], [east_m(t) for t in drive.timestamps_us.tolist()], atol=1e-6)
+    files = {drive.root / image.file for image in drive.images}
+    assert len({file.read_bytes() for file in files}) == 15
+    assert import_recording(dataset, tmp_path / "keyframes", scene="scene-0061").images == 8
+
+
+def test_rough_poses_of_a_city(dataset: Path, tmp_path: Path) -> None:
+    """Two scenes of one city can be aggregated by them; without a log, the world is known to one scene alone."""
+    quality = RoughQuality(sigma_m=0.5, sigma_deg=2.0)
+    import_recording(dataset, tmp_path / "unknown", scene="scene-0103", rough_noise=quality)
+    rough = read_drive(tmp_path / "unknown").manifest.rough_poses
+    assert rough is not None
+    assert rough.common_world is None
+    tables = make_tables()
+    for scene in tables["scene"]:
+        scene["log_token"] = "log"
+    tables["log"] = [{"token": "log", "vehicle": "n008", "location": "boston-seaport"}]
+    write_tables(dataset, tables)
+    for name in ("scene-0061", "scene-0103"):
+        summary = import_recording(dataset, tmp_path / name, scene=name, rough_noise=quality)
+        assert (summary.rough_poses, summary.truth) == (4, True)
+        drive = read_drive(tmp_path / name)
+        rough = drive.manifest.rough_poses
+        assert rough is not None
+        assert (rough.common_world, rough.sigma_translation_m) == ("nuscenes-boston-seaport", 0.5)
+        assert [f.code for f in check_drive(drive)] == []
+        away = [p.world_from_rig.translation_m[0] - east_m(p.timestamp_us) for p in rough.poses]
+        assert 0.01 < max(map(abs, away)) < 3.0
+
+
 def test_without_laser_scanner_the_cameras_mean_counts(dataset: Path, tmp_path: Path) -> None:
     tables = make_tables()
     tables["sample_data"] = [row for row in tables["sample_data"] if "LIDAR" not in row["token"]]
@@ -216,6 +267,12 @@ def test_scene_must_be_named(dataset: Path, tmp_path: Path) -> None:
     assert "--scene" in caught.value.remedy
     with pytest.raises(InputError, match="no scene 'scene-9'"):
         import_recording(dataset, tmp_path / "drive", scene="scene-9")
+
+
+def test_tables_without_scenes(dataset: Path, tmp_path: Path) -> None:
+    (dataset / "v1.0-mini/scene.json").write_text("[]")
+    with pytest.raises(InputError, match="holds no scenes"):
+        import_recording(dataset, tmp_path / "drive")
 
 
 def test_missing_files(dataset: Path, tmp_path: Path) -> None:

@@ -1,0 +1,117 @@
+"""Images of a bag as files: compressed ones with the bytes that they have, raw ones as PNG without loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mrasfm_engine.errors import InputError
+from schemas.drive import MAX_IMAGE_SIDE_PX
+from schemas.image_header import ImageHeaderError, header_of
+
+# By ROS's encoding: type of a channel, channels, and OpenCV's conversion to gray or BGR.
+_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8UC1": ("u1", 1, None),
+    "mono16": ("u2", 1, None),
+    "bgr8": ("u1", 3, None),
+    "8UC3": ("u1", 3, None),
+    "rgb8": ("u1", 3, cv2.COLOR_RGB2BGR),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2BGR),
+    "bgr16": ("u2", 3, None),
+    "rgb16": ("u2", 3, cv2.COLOR_RGB2BGR),
+    # OpenCV names a Bayer pattern by its second row's second and third pixel, ROS by its first row's first two.
+    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
+    "bayer_rggb16": ("u2", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr16": ("u2", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg16": ("u2", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
+}
+DEPTH_ENCODINGS = frozenset({"16UC1", "32FC1"})  # ROS's images of distances
+PNG_EFFORT = 1  # of 9: more makes files a few percent smaller and takes several times as long
+
+
+def is_raw(message: Any) -> bool:
+    """Return whether the message is an Image, not a CompressedImage."""
+    return hasattr(message, "encoding")
+
+
+def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
+    """Width and height of an image, and the suffix of its file; nothing is decoded.
+
+    Raises
+    ------
+    InputError
+        If it is in a form that is not known.
+    """
+    if is_raw(message):
+        if message.encoding not in _ENCODINGS:
+            raise InputError(
+                f"{topic}: images are encoded as {message.encoding!r}, which is not known",
+                remedy=f"Record one of {', '.join(_ENCODINGS)}, or compressed images.",
+                code="unknown-encoding",
+            )
+        if not (0 < message.width <= MAX_IMAGE_SIDE_PX and 0 < message.height <= MAX_IMAGE_SIDE_PX):
+            raise InputError(
+                f"{topic}: an image of {message.width}x{message.height} pixels",
+                remedy="Record the topic again.",
+                code="bad-image",
+            )
+        return (int(message.width), int(message.height)), ".png"
+    try:
+        header = header_of(message.data.tobytes(), topic)
+    except ImageHeaderError as error:
+        raise InputError(
+            f"{topic}: compressed as {str(message.format)[:60]!r}: {error.what}",
+            remedy="Record JPEG or PNG, or raw images.",
+            code="unknown-encoding",
+        ) from None
+    return (header.width, header.height), ".jpg" if header.format == "JPEG" else ".png"
+
+
+def file_content(message: Any, *, topic: str) -> bytes:
+    """Bytes of a JPEG or PNG file of the image.
+
+    Raises
+    ------
+    InputError
+        If a raw image is shorter than its size says.
+    """
+    if not is_raw(message):
+        content: bytes = message.data.tobytes()
+        return content
+    done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, PNG_EFFORT])
+    if not done:
+        raise InputError(f"{topic}: an image could not be written as PNG", remedy="Record the topic again.")
+    return encoded.tobytes()
+
+
+def _pixels(message: Any, topic: str) -> NDArray[Any]:
+    """Gray values (h, w) or blue, green, red (h, w, 3), of 8 or 16 bits."""
+    kind, channels, conversion = _ENCODINGS[message.encoding]
+    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row_bytes = width * channels * dtype.itemsize
+    if step < row_bytes or len(message.data) < step * (height - 1) + row_bytes:
+        raise InputError(
+            f"{topic}: an image of {width}x{height} pixels as {message.encoding} has {len(message.data)} bytes in rows "
+            f"of {step}",
+            remedy="Record the topic again.",
+            code="bad-image",
+        )
+    rows = np.lib.stride_tricks.as_strided(message.data, (height, row_bytes), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
+    shaped = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
+    return shaped if conversion is None else cv2.cvtColor(shaped, conversion)

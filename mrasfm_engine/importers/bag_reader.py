@@ -1,0 +1,169 @@
+"""Reads ROS bags of all formats: ROS 1, and ROS 2 in SQLite or MCAP.
+
+The bags are opened by rosbags, which is written in Python alone and needs no ROS. It is imported where a bag is opened:
+commands that read none start without it.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mrasfm_engine.errors import InputError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+    from rosbags.typesys.store import Typestore
+
+ROS1_SUFFIX = ".bag"
+SUFFIXES = (ROS1_SUFFIX, ".mcap", ".db3")
+METADATA = "metadata.yaml"  # of a ROS 2 bag, which is a folder
+_REMEDIES = {
+    ROS1_SUFFIX: "Repair it with `rosbag reindex` and `rosbag fix`, or record it again.",
+    ".mcap": "Repair it with `mcap recover`, or record it again; its messages must be of ROS 2.",
+    ".db3": "Repair it with `ros2 bag reindex`, or record it again.",
+}
+
+
+class Entry(NamedTuple):
+    """One message of a bag with the time at which it was recorded."""
+
+    topic: str
+    received_ns: int
+    message: Any  # as its definition in the bag has it
+
+
+def bag_files(path: Path) -> list[Path]:
+    """The files of a recording, or the folder of a ROS 2 bag; empty for anything else.
+
+    Raises
+    ------
+    InputError
+        If a folder holds bags of several formats.
+    """
+    if path.is_file():
+        return [path] if path.suffix in SUFFIXES else []
+    if not path.is_dir():
+        return []
+    if (path / METADATA).is_file():
+        return [path]
+    found = {suffix: sorted(path.glob(f"*{suffix}")) for suffix in SUFFIXES}
+    kinds = [suffix for suffix, files in found.items() if files]
+    if len(kinds) > 1:
+        raise InputError(
+            f"{path} holds bags of several formats: {', '.join(found[kind][0].name for kind in kinds)}",
+            remedy="Give one of these files instead of the folder.",
+            code="several-bags",
+        )
+    return found[kinds[0]] if kinds else []
+
+
+class Bag:
+    """An open recording of one or several files.
+
+    Parameters
+    ----------
+    paths
+        As `bag_files` finds them.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = paths
+        self._readers: list[Reader1 | Reader2] = []
+        self._open = ExitStack()
+
+    def __enter__(self) -> Bag:
+        for path in self.paths:
+            with _defects_named(path):
+                reader = _reader(path)
+                self._open.enter_context(reader)
+                self._readers.append(reader)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def types(self) -> dict[str, str]:
+        """The type of each topic with messages, as `sensor_msgs/msg/Image`, in the order of their names."""
+        found = {c.topic: c.msgtype for reader in self._readers for c in reader.connections if c.msgcount}
+        return dict(sorted(found.items()))
+
+    def entries(self, topics: Collection[str]) -> Iterator[Entry]:
+        """Messages of the topics, by the time at which they were recorded; one at a time is in memory.
+
+        Raises
+        ------
+        InputError
+            If the bag is damaged, or a message is not what its definition says.
+        """
+        streams = [
+            _entries(path, reader, topics) for path, reader in zip(self.paths, self._readers, strict=True) if topics
+        ]
+        return heapq.merge(*streams, key=lambda entry: entry.received_ns)
+
+
+def _reader(path: Path) -> Reader1 | Reader2:
+    from rosbags import rosbag1, rosbag2
+
+    return rosbag1.Reader(path) if path.suffix == ROS1_SUFFIX and path.is_file() else rosbag2.Reader(path)
+
+
+def _entries(path: Path, reader: Reader1 | Reader2, topics: Collection[str]) -> Iterator[Entry]:
+    with _defects_named(path):
+        connections = [c for c in reader.connections if c.topic in topics and c.msgcount]
+        if not connections:
+            return
+        store = _typestore(connections)
+        for connection, received_ns, raw in reader.messages(connections=connections):
+            read = store.deserialize_ros1 if _is_ros1(connection) else store.deserialize_cdr
+            yield Entry(connection.topic, received_ns, read(raw, connection.msgtype))
+
+
+def _is_ros1(connection: Connection) -> bool:
+    return getattr(connection.ext, "serialization_format", "ros1") == "ros1"
+
+
+def _typestore(connections: Sequence[Connection]) -> Typestore:
+    """Types of the wanted topics alone: another topic's odd definition does no harm.
+
+    Bags of ROS 2 before Iron hold no definitions; those of the messages that are read here have not changed since.
+    """
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    types: dict[str, Any] = {}
+    if any(c.msgdef.format is MessageDefinitionFormat.NONE for c in connections):
+        types.update(get_typestore(Stores.ROS2_HUMBLE).fielddefs)
+    for connection in connections:
+        definition = connection.msgdef
+        if definition.format is MessageDefinitionFormat.MSG:
+            types.update(get_types_from_msg(definition.data, connection.msgtype))
+        elif definition.format is MessageDefinitionFormat.IDL:
+            for part in definition.data.split("=" * 80 + "\n"):
+                text = part.partition("\n")[2] if part.startswith("IDL: ") else part
+                types.update(get_types_from_idl(text) if text.strip() else {})
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
+
+
+@contextmanager
+def _defects_named(path: Path) -> Iterator[None]:
+    """Turn what a damaged bag makes rosbags raise into an error that names the file.
+
+    The bytes come from outside, and rosbags raises whatever its parsers meet: its own errors, those of struct, of the
+    decompressors and of SQLite, failed assertions, missing keys.
+    """
+    try:
+        yield
+    except (InputError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        kind = next((s for s in SUFFIXES if path.suffix == s or (path.is_dir() and any(path.glob(f"*{s}")))), ".db3")
+        said = " ".join(str(error).split())[:300] or type(error).__name__
+        raise InputError(f"bag {path} cannot be read: {said}", remedy=_REMEDIES[kind], code="bad-bag") from error

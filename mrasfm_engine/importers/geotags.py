@@ -1,0 +1,190 @@
+"""Positions and times of images: EXIF's, and OpenDroneMap's `geo.txt`.
+
+Source: EXIF 3.0 (CIPA DC-008), and OpenDroneMap's documentation of its image geolocation file: the first line names a
+coordinate reference system, the others have an image, x, y, optionally z, three angles and two accuracies.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mrasfm_engine.errors import InputError
+from mrasfm_engine.importers.tables import read_lines
+
+EXIF, GPS = 0x8769, 0x8825
+TIME, SUBSECOND, OFFSET = 0x9003, 0x9291, 0x9011  # of EXIF: DateTimeOriginal and what belongs to it
+LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, ERROR = 1, 2, 3, 4, 5, 6, 31
+HORIZONTAL, VERTICAL = 6, 7  # columns of geo.txt after the image: x, y, z, three angles, two accuracies
+BELOW = (1, 3)  # of the altitude's reference: below the sea, below the ellipsoid
+_UTM = re.compile(r"WGS84\s+UTM\s+([0-9]{1,2})\s*([NS])", re.IGNORECASE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoTag:
+    """Position of an image on WGS84."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float | None
+    sigma_horizontal_m: float | None
+    sigma_vertical_m: float | None
+
+
+def read_exif(path: Path) -> tuple[int | None, GeoTag | None]:
+    """Time in microseconds since 1970 and position of an image, where its EXIF has them.
+
+    A time without an offset is taken as UTC.
+
+    Raises
+    ------
+    InputError
+        If the file is no image.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            times, gps = exif.get_ifd(EXIF), exif.get_ifd(GPS)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"image {path}: {said}", remedy="Copy it again from its source.") from None
+    return _time_us(times), _position(gps)
+
+
+def _time_us(exif: dict[int, Any]) -> int | None:
+    text = f"{exif.get(TIME, '')}".strip("\0 ")
+    subsecond, offset = f"{exif.get(SUBSECOND, '')}".strip("\0 "), f"{exif.get(OFFSET, '')}".strip("\0 ")
+    try:
+        moment = datetime.datetime.strptime(text, "%Y:%m:%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+        if match := re.fullmatch(r"([+-])([0-9]{2}):([0-9]{2})", offset):
+            minutes = int(match[2]) * 60 + int(match[3])
+            moment -= datetime.timedelta(minutes=minutes if match[1] == "+" else -minutes)
+        fraction = float(f"0.{subsecond}") if re.fullmatch("[0-9]{1,9}", subsecond) else 0.0
+        return round(moment.timestamp()) * 1_000_000 + round(fraction * 1e6)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _position(gps: dict[int, Any]) -> GeoTag | None:
+    try:
+        latitude = _degrees(gps[LATITUDE]) * (-1 if f"{gps.get(LATITUDE_REF)}".startswith("S") else 1)
+        longitude = _degrees(gps[LONGITUDE]) * (-1 if f"{gps.get(LONGITUDE_REF)}".startswith("W") else 1)
+        height = (
+            float(gps[ALTITUDE]) * (-1 if _byte(gps.get(ALTITUDE_REF)) in BELOW else 1) if ALTITUDE in gps else None
+        )
+        error = float(gps[ERROR]) if ERROR in gps else None
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, IndexError):
+        return None
+    if not all(math.isfinite(value) for value in (latitude, longitude, height or 0.0, error or 0.0)):
+        return None
+    sigma_m = error if error is not None and error > 0 else None
+    return GeoTag(
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        sigma_horizontal_m=sigma_m,
+        sigma_vertical_m=None,
+    )
+
+
+def _degrees(value: Any) -> float:
+    degrees, minutes, seconds = (float(part) for part in value)
+    return degrees + minutes / 60 + seconds / 3600
+
+
+def _byte(value: Any) -> int:
+    return value[0] if isinstance(value, bytes) and value else int(value or 0)
+
+
+def read_geo_txt(path: Path) -> dict[str, GeoTag]:
+    """Positions by the image as the file names it.
+
+    Heights stay as they are: what they count from is up to whoever wrote the file.
+
+    Raises
+    ------
+    InputError
+        That names the line at fault.
+    """
+    lines = read_lines(path, what="image positions")
+    rows: dict[str, list[float]] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        words = line.split()
+        if not words:
+            continue
+        values = _numbers(words[1:10], f"image positions {path}, line {number}")
+        if words[0] in rows:
+            raise InputError(
+                f"image positions {path}, line {number}: {words[0]} has two lines", remedy="Keep one.", code="bad-table"
+            )
+        rows[words[0]] = values
+    if not rows:
+        raise InputError(f"image positions {path} has no rows", remedy="Remove the file, or fill it.", code="bad-table")
+    places = _geodetic(lines[0].strip(), np.array([values[:2] for values in rows.values()]), path)
+    return {
+        name: GeoTag(
+            latitude_deg=float(latitude),
+            longitude_deg=float(longitude),
+            height_m=values[2] if len(values) > 2 else None,
+            sigma_horizontal_m=_accuracy(values, HORIZONTAL),
+            sigma_vertical_m=_accuracy(values, VERTICAL),
+        )
+        for (name, values), (longitude, latitude) in zip(rows.items(), places, strict=True)
+    }
+
+
+def _accuracy(values: list[float], column: int) -> float | None:
+    return values[column] if len(values) > column and values[column] > 0 else None
+
+
+def _numbers(words: list[str], where: str) -> list[float]:
+    values: list[float] = []
+    for word in words[:8]:
+        try:
+            value = float(word)
+        except ValueError:
+            break  # labels may follow
+        if not math.isfinite(value):
+            break
+        values.append(value)
+    if len(values) < 2:
+        raise InputError(
+            f"{where}: has no two coordinates after the image's name",
+            remedy="Give lines as IMAGE X Y Z.",
+            code="bad-table",
+        )
+    return values
+
+
+def _geodetic(system: str, points: Any, path: Path) -> Any:
+    """Longitudes and latitudes (n, 2) on WGS84 of coordinates x, y in a system."""
+    import pyproj
+    from pyproj.exceptions import CRSError, ProjError
+
+    remedy = "Give EPSG:4326, another EPSG code, a PROJ string or WGS84 UTM 32N in the first line."
+    if match := _UTM.fullmatch(system):
+        system = f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
+    try:
+        crs = pyproj.CRS.from_user_input(system)
+        to_wgs84 = pyproj.Transformer.from_crs(crs.to_2d(), "EPSG:4326", always_xy=True)
+        found = np.stack(to_wgs84.transform(points[:, 0], points[:, 1], errcheck=True), -1)
+    except (CRSError, ProjError) as error:
+        said = " ".join(str(error).split())[:150]
+        raise InputError(
+            f"image positions {path}, line 1: {system[:80]!r}: {said}", remedy=remedy, code="bad-table"
+        ) from None
+    if not np.isfinite(found).all() or np.abs(found[:, 1]).max() > 90 or np.abs(found[:, 0]).max() > 180:
+        raise InputError(
+            f"image positions {path}: coordinates are outside of {system[:80]!r}: are x and y swapped?",
+            remedy="Give x (east, longitude) before y.",
+            code="bad-table",
+        )
+    return found
