@@ -27,7 +27,20 @@ from service.api.middleware.request_log import RequestLog
 from service.api.middleware.security_headers import SecurityHeaders
 from service.api.openapi import allowed_methods, openapi_page
 from service.api.readiness import Readiness
-from service.api.routes import aggregations, drives, files, jobs, maps, operations, reconstructions, scenes, uploads
+from service.api.routes import (
+    aggregations,
+    drive_downloads,
+    drives,
+    events,
+    files,
+    jobs,
+    maps,
+    operations,
+    reconstructions,
+    scenes,
+    session,
+    uploads,
+)
 from service.api.routes.documentation import add_documentation
 from service.database.tables import now_us
 from service.domain import uploads as upload_records
@@ -93,7 +106,20 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.state.readiness = Readiness(context)
-    modules = (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, operations)
+    modules = (
+        drives,
+        files,
+        drive_downloads,
+        uploads,
+        reconstructions,
+        aggregations,
+        jobs,
+        events,
+        scenes,
+        maps,
+        session,
+        operations,
+    )
     routers = [*(module.router for module in modules), operations.metrics_route(metrics, settings.metrics_token)]
     for router in (*routers, heads_of(routers)):
         app.include_router(router)

@@ -30,6 +30,7 @@ _TAGS = [
     {"name": "jobs", "description": "How far it is and what became of it; cancel and repeat."},
     {"name": "scenes", "description": "What reconstructions made, to download."},
     {"name": "maps", "description": "Several drives or scenes in one, version by version."},
+    {"name": "session", "description": "The web console's: a cookie in place of the key."},
     {"name": "operation", "description": "How the service itself is."},
 ]
 _IDS = {
@@ -62,6 +63,8 @@ def openapi_page(app: FastAPI) -> dict[str, Any]:
             _correct_invalid(operation)
             if path.startswith("/v1/"):
                 _add_problems(operation, 503)
+                if method in _WRITING:
+                    _add_problems(operation, 403)
             if "requestBody" in operation:
                 _add_problems(operation, 408, 415)
             if "application/json" in operation.get("requestBody", {}).get("content", ()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import AsyncIterator, Callable
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
@@ -143,7 +143,7 @@ async def send_file(
     context: Context,
     request: Request,
     path: str,
-    find: Callable[[Session], tuple[str, SceneFile | MapFile, Blob]],
+    find: Callable[[Session], tuple[str, HasMediaType, Blob]],
 ) -> Response:
     """The bytes of a file, or the part that is asked for.
 
@@ -184,6 +184,14 @@ async def send_file(
         return Response(headers=headers, media_type=media_type)
     pieces = await _begun(context.artifacts.stream(blob.key, start=part.start, stop=part.stop))
     return StreamingResponse(pieces, status_code=200 if asked is None else 206, headers=headers, media_type=media_type)
+
+
+class HasMediaType(Protocol):
+    """File whose kind is known."""
+
+    @property
+    def media_type(self) -> str:
+        """What the download says as Content-Type."""
 
 
 def _found(context: Context, find: Callable[[Session], Found]) -> Found:

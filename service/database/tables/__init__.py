@@ -12,6 +12,7 @@ from service.database.tables._jobs import TERMINAL, Job, JobAttempt, JobEvent, J
 from service.database.tables._projects import ApiKey, Blob, Project
 from service.database.tables._results import Map, MapCheckpoint, MapFile, MapScene, MapVersion, Scene, SceneFile
 from service.database.tables._service import IdempotencyKey, Pass, WorkerSeen
+from service.database.tables._sessions import ConsoleSession
 
 __all__ = [
     "TERMINAL",
@@ -19,6 +20,7 @@ __all__ = [
     "Base",
     "Blob",
     "Checkpoint",
+    "ConsoleSession",
     "Drive",
     "DriveFile",
     "IdempotencyKey",
