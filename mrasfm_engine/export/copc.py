@@ -93,15 +93,28 @@ def write_copc(scene: Scene, path: Path) -> None:
 
 def coordinates(scene: Scene) -> tuple[Floats, Ints32]:
     """Offset (3,) in metres, and the points (n, 3) in steps from it, in the file's coordinate reference system."""
-    place = scene.georeference
-    offset_m = np.zeros(3) if place is None else np.floor(_projected(np.zeros((1, 3)), place)[0])
+    offset_m = offset_of(scene)
     steps = np.empty(scene.points_m.shape, dtype=np.int32)
     for first in range(0, len(steps), BLOCK):
         block = slice(first, first + BLOCK)
-        points_m = scene.points_m[block]
-        points_m = points_m if place is None else _projected(points_m, place)
-        steps[block] = np.rint((points_m - offset_m) / STEP_M)
+        steps[block] = np.rint((in_reference_system(scene, scene.points_m[block]) - offset_m) / STEP_M)
     return offset_m, steps
+
+
+def offset_of(scene: Scene) -> Floats:
+    """Offset (3,) of the file's coordinates in metres: zero in the local frame."""
+    return np.floor(in_reference_system(scene, np.zeros((1, 3)))[0])
+
+
+def in_reference_system(scene: Scene, points_m: Floats) -> Floats:
+    """Local points (n, 3) in the file's coordinate reference system: UTM and ellipsoidal height, or the local frame."""
+    place = scene.georeference
+    return points_m if place is None else _projected(points_m, place)
+
+
+def epsg_code_of(scene: Scene) -> int | None:
+    """EPSG code of the file's horizontal coordinate reference system; None in the local frame."""
+    return None if scene.georeference is None else _zone(scene.georeference)
 
 
 def _projected(points_m: Floats, place: Georeference) -> Floats:

@@ -82,7 +82,9 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
     scene, read_back = content.scene, ReadBack(work)
     figures = write_common(scene, work, content.pictures, read_back)
     rigs = {f"{RIGS_FOLDER}/{name}": f"{name}/" for name in content.calibrations}
-    others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs)
+    others = Interchange(
+        scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs, map_document=content.document
+    )
     figures["notes"] += others.write(work, read_back)
     (work / "poses.tum").write_text(_poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", _poses_document(content))

@@ -25,17 +25,19 @@ class SessionResource(Resource):
                     "max_bytes": 1_000_000_000_000,
                     "max_active_jobs": 1000,
                     "max_drives": 100_000,
+                    "console_tiles": None,
                 }
             ]
         }
     )
 
     project: str = Field(description="name of the project that the key opens")
-    key_id: str
+    key_id: str = Field(description="names the key to `mrasfm keys revoke`")
     key_name: str = Field(description="as it was given to `mrasfm keys create`")
-    key_created_at: datetime
+    key_created_at: datetime = Field(description="when the key was made")
     session_expires_at: datetime | None = Field(None, description="null where the request carries the key itself")
     used_bytes: int = Field(description="stored bytes of the project")
     max_bytes: int = Field(description="quota of the project")
     max_active_jobs: int = Field(description="quota of queued and running jobs")
     max_drives: int = Field(description="quota of drives")
+    console_tiles: str | None = Field(None, description="URL of map tiles for the web console")

@@ -41,6 +41,7 @@ from service.api.routes import (
     session,
     uploads,
 )
+from service.api.routes.console import add_console
 from service.api.routes.documentation import add_documentation
 from service.database.tables import now_us
 from service.domain import uploads as upload_records
@@ -124,6 +125,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in (*routers, heads_of(routers)):
         app.include_router(router)
     add_documentation(app)
+    add_console(app, tile_origin=settings.tile_origin)
     _answer_errors(app)
     app.add_middleware(BodyRules, idle_s=settings.upload_idle_seconds)
     app.add_middleware(RequestLog, metrics=metrics, failed=_failed)

@@ -25,6 +25,7 @@ FILES = {
     "points.ply",
     "points.copc.laz",
     "trajectory.gpkg",
+    "view.json",
     "rig",
     "autoware",
     "poses.tum",

@@ -61,15 +61,15 @@ def _asked(name: str, description: str, example: str) -> dict[str, Any]:
 
 
 _IF_MATCH = _asked("If-Match", "`ETag` of what you want: 412 where the file is another by now", _ETAG)
-_IF_NONE_MATCH = _asked("If-None-Match", "`ETag` of what you have: 304 where the file is still that", _ETAG)
+IF_NONE_MATCH = _asked("If-None-Match", "`ETag` of what you have: 304 where the file is still that", _ETAG)
 # `send_file` reads these headers itself.
-_HEAD_PARAMETERS = {"parameters": [_IF_MATCH, _IF_NONE_MATCH]}
+_HEAD_PARAMETERS = {"parameters": [_IF_MATCH, IF_NONE_MATCH]}
 _DOWNLOAD_PARAMETERS = {
     "parameters": [
         _asked("Range", "one part: `bytes=FIRST-LAST`, `bytes=FIRST-` or `bytes=-COUNT`", "bytes=0-1023"),
         _asked("If-Range", "`ETag` of what you have: the whole file where it is another by now", _ETAG),
         _IF_MATCH,
-        _IF_NONE_MATCH,
+        IF_NONE_MATCH,
     ]
 }
 
@@ -191,7 +191,7 @@ class HasMediaType(Protocol):
 
     @property
     def media_type(self) -> str:
-        """What the download says as Content-Type."""
+        """Content-Type of the download."""
 
 
 def _found(context: Context, find: Callable[[Session], Found]) -> Found:

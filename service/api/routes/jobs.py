@@ -22,6 +22,7 @@ from service.api.http.paging import newest
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
 from service.api.routes.aggregations import ACCEPTED, accepted
+from service.api.routes.downloads import IF_NONE_MATCH
 from service.api.routes.job_views import RETRY_AFTER_S, etag_of, view_of, views_of
 from service.database.tables import TERMINAL, Job, JobEvent, JobState, now_us
 from service.domain import aggregations, job_trees, jobs
@@ -48,16 +49,15 @@ _EVENTS = {
         **gives(304, "Nothing has changed since If-None-Match", "ETag", "Cache-Control"),
         **problems(401, 422),
     },
+    openapi_extra={"parameters": [IF_NONE_MATCH]},
 )
 def list_jobs(
     caller: CallerDep,
     context: ContextDep,
+    request: Request,
     limit: Limit = 50,
     cursor: Cursor = None,
     drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
-    if_none_match: Annotated[
-        list[str] | None, Header(alias="If-None-Match", description="`ETag` of an answer before")
-    ] = None,
 ) -> Response:
     """Jobs of the project, newest first."""
     with context.database.read() as session:
@@ -66,7 +66,7 @@ def list_jobs(
     body = page.model_dump_json().encode()
     etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     headers = {"ETag": etag, "Cache-Control": "no-cache"}
-    if none_match(if_none_match, etag):
+    if none_match(request.headers.getlist("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     return Response(body, headers=headers, media_type="application/json")
 

@@ -36,7 +36,7 @@ def begin_session(caller: CallerDep, context: ContextDep, request: Request, resp
         if opened is None:
             raise _no_key()
         cookie, expires_us = sessions.begin(session, opened.key.id)
-        shown = _shown(Opened(key=opened.key, project=opened.project, expires_us=expires_us))
+        shown = _shown(context, Opened(key=opened.key, project=opened.project, expires_us=expires_us))
     _set_cookie(response, request, cookie, max_age_s=sessions.KEPT_S)
     return shown
 
@@ -44,7 +44,7 @@ def begin_session(caller: CallerDep, context: ContextDep, request: Request, resp
 @router.get("", summary="Show the session", responses={**gives(200, "The caller"), **problems(401)})
 def get_session(caller: CallerDep, context: ContextDep, request: Request) -> SessionResource:
     """The project and the key that the request's cookie or key stands for."""
-    return _shown(_opened(context, request))
+    return _shown(context, _opened(context, request))
 
 
 @router.delete(
@@ -83,7 +83,7 @@ def _set_cookie(response: Response, request: Request, value: str, *, max_age_s: 
     )
 
 
-def _shown(opened: Opened) -> SessionResource:
+def _shown(context: Context, opened: Opened) -> SessionResource:
     project, key = opened.project, opened.key
     return SessionResource.model_validate(
         {
@@ -96,5 +96,6 @@ def _shown(opened: Opened) -> SessionResource:
             "max_bytes": project.max_bytes,
             "max_active_jobs": project.max_active_jobs,
             "max_drives": project.max_drives,
+            "console_tiles": context.settings.console_tiles,
         }
     )
