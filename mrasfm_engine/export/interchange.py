@@ -107,11 +107,12 @@ class Interchange:
         compare = partial(geopackage_readback.geopackage, self.scene, self.scene_of_unit)
         yield Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, compare)
 
-
     def _write_view(self, path: Path) -> Sequence[str]:
         places = view.read_image_places(path.parent)
         document = view.view_document(self.scene, self.scene_of_unit, places, self.map_document)
-        path.write_text(json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8")
+        path.write_text(
+            json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8"
+        )
         return ()
 
     def _view_checks(self) -> Iterator[Check]:

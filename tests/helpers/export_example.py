@@ -26,6 +26,7 @@ FILES = {
     "points.copc.laz",
     "trajectory.gpkg",
     "view.json",
+    "report.html",
     "rig",
     "autoware",
     "poses.tum",

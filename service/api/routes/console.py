@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import service
 from fastapi import FastAPI, Request
 from starlette.datastructures import MutableHeaders
 from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 from starlette.types import Message, Receive, Scope, Send
 
+import service
 from service.api.middleware.security_headers import CONTENT_SECURITY_POLICY
 
 FILES = "/console/files"
@@ -65,7 +65,9 @@ class _ConsoleFiles:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers.setdefault(CONTENT_SECURITY_POLICY, self._policy)
-                headers.setdefault("Cache-Control", "no-cache")  # asked again with their ETag: a new version is seen at once
+                headers.setdefault(
+                    "Cache-Control", "no-cache"
+                )  # asked again with their ETag: a new version is seen at once
             await send(message)
 
         await self._files(scope, receive, send_with_policy)

@@ -31,7 +31,9 @@ _OVERLAP_US = 10_000_000
 _LIMIT = 5000
 _EXAMPLE = JobResource.model_validate(example_of(JobResource)).model_dump_json()
 _EVENTS = {
-    "text/event-stream": {"example": f"event: ready\ndata: null\nid: 16\n\nevent: job\ndata: {_EXAMPLE}\nid: 17\n\n"}
+    "text/event-stream": {
+        "example": f'event: ready\ndata: {{"after":16}}\nid: 16\n\nevent: job\ndata: {_EXAMPLE}\nid: 17\n\n'
+    }
 }
 
 
@@ -74,7 +76,7 @@ async def stream_events(
     newest = await run_in_threadpool(_newest_id, context)
     begun = newest if last_event_id is None else min(last_event_id, newest)
     position = _Position(begun, begun)
-    yield ServerSentEvent(event=READY, id=str(begun), data=None)
+    yield ServerSentEvent(event=READY, id=str(begun), data={"after": begun})  # browsers drop events without data
     while True:
         jobs = await run_in_threadpool(_news, context, secret, caller.project_id, position)
         if jobs is None:

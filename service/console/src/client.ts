@@ -22,6 +22,18 @@ export interface Page<Item> {
 /** undefined: not asked yet; null: nobody is logged in. */
 export const session = signal<Session | null | undefined>(undefined);
 
+const MAY_BE_THERE = "mrasfm-session"; // remembers that a cookie may be there, which scripts cannot see
+
+export function remembersSession(): boolean {
+  return localStorage.getItem(MAY_BE_THERE) === "1";
+}
+
+export function setSession(value: Session | null): void {
+  if (value) localStorage.setItem(MAY_BE_THERE, "1");
+  else localStorage.removeItem(MAY_BE_THERE);
+  session.value = value;
+}
+
 export class ProblemError extends Error {
   constructor(
     readonly problem: Problem,
@@ -72,7 +84,7 @@ export async function send(method: string, path: string, options: Options = {}):
 }
 
 async function problemOf(answer: Response): Promise<ProblemError> {
-  if (answer.status === 401) session.value = null;
+  if (answer.status === 401) setSession(null);
   const isProblem = answer.headers.get("content-type")?.startsWith("application/problem+json");
   const problem = isProblem
     ? ((await answer.json()) as Problem)

@@ -112,6 +112,7 @@ export const KINDS: Record<Job["kind"], string> = {
 export function eta(job: Job): string {
   const { eta_low_s: low, eta_high_s: high } = job.progress;
   if (low === null || low === undefined || high === null || high === undefined) return "not known yet";
+  if (high < 10) return "some seconds";
   return duration(low) === duration(high) ? duration(low) : `${duration(low)} to ${duration(high)}`;
 }
 

@@ -1,6 +1,6 @@
 // Jobs as the stream tells of them, for all parts of the page.
 import { signal } from "@preact/signals";
-import { getAll, session, type Job } from "./client";
+import { getAll, session, setSession, type Job } from "./client";
 import type { Connection, FromPage, FromWorker } from "./messages";
 import { ProjectStream } from "./stream";
 
@@ -47,7 +47,7 @@ function hear(message: FromWorker): void {
     connection.value = "live";
     void readJobs();
   }
-  if (message.type === "end") session.value = null;
+  if (message.type === "end") setSession(null);
 }
 
 /** Follow the project until `unfollow`. */

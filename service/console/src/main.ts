@@ -1,7 +1,7 @@
 // The console: the shell of all pages, and the page that the address names.
 import { render } from "preact";
 import { useEffect } from "preact/hooks";
-import { get, session, type Session } from "./client";
+import { get, remembersSession, session, setSession, type Session } from "./client";
 import { html, type Children, type Shown } from "./html";
 import { Lazy } from "./lazy";
 import { connection, follow, unfollow } from "./live";
@@ -70,9 +70,9 @@ function App(): Shown {
 
 async function begin(): Promise<void> {
   try {
-    session.value = await get<Session>("v1/session");
+    setSession(remembersSession() ? await get<Session>("v1/session") : null);
   } catch {
-    session.value = null;
+    setSession(null);
   }
 }
 

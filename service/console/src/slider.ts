@@ -9,10 +9,9 @@ export function Slider({ before, after, label }: { before: string; after: string
       <img src=${before} alt=${`${label}, before`} loading="lazy" />
       <img src=${after} alt=${`${label}, after`} loading="lazy" style=${{ clipPath: `inset(0 0 0 ${share}%)` }} />
       <div class="edge" style=${{ left: `${share}%` }}></div>
-      <span class="tag left">before</span><span class="tag right">after</span>
     </div>
-    <input type="range" min="0" max="100" value=${share} aria-label=${`${label}: edge between before and after, in percent of the width`}
-      onInput=${(event: Event) => setShare(Number((event.target as HTMLInputElement).value))} />
-    <figcaption>${label}: before left of the edge, after right of it</figcaption>
+    <div class="edge-control"><span aria-hidden="true">before</span><input type="range" min="0" max="100" value=${share} aria-label=${`${label}: edge between before and after, in percent of the width`}
+      onInput=${(event: Event) => setShare(Number((event.target as HTMLInputElement).value))} /><span aria-hidden="true">after</span></div>
+    <figcaption>${label}</figcaption>
   </figure>`;
 }

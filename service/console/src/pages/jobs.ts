@@ -153,7 +153,7 @@ function Attempts({ job }: { job: Job }): Shown {
   if (job.attempts.length === 0) return null;
   return html`<h2>Attempts</h2>
     <div class="scroll" tabindex="0" role="region" aria-label="Attempts"><table>
-      <thead><tr><th scope="col">Attempt</th><th scope="col">Worker</th><th scope="col">Started</th><th scope="col">Finished</th><th scope="col">Outcome</th></tr></thead>
+      <thead><tr><th scope="col" class="number">Attempt</th><th scope="col">Worker</th><th scope="col">Started</th><th scope="col">Finished</th><th scope="col">Outcome</th></tr></thead>
       <tbody>
         ${job.attempts.map(
           (attempt) => html`<tr>

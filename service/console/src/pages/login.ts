@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { send, session, type Problem, type Session } from "../client";
+import { send, setSession, type Problem, type Session } from "../client";
 import { problemOf, ProblemBox } from "../components";
 import { html, type Shown } from "../html";
 
@@ -15,7 +15,7 @@ export function Login(): Shown {
     try {
       const answer = await send("POST", "v1/session", { headers: { Authorization: `Bearer ${key}` } });
       field.value = "";
-      session.value = (await answer.json()) as Session;
+      setSession((await answer.json()) as Session);
     } catch (error) {
       setProblem(problemOf(error));
     }

@@ -61,6 +61,7 @@ function versionTab(version: MapVersion, base: string, tab: string): Children {
     return html`<${Lazy} load=${() => import("../viewer/page")} name="Viewer" of=${{ base, driveOf }} />`;
   }
   if (tab === "place") {
+    if (!hasFile(version, "view.json")) return html`<${Empty}>This version has no view.json: it was made by an older version of the engine. Make the map again.<//>`;
     if (!version.summary.georeferenced) return html`<${Empty}>This map has no place on the earth: none of its drives has GNSS that could be used.<//>`;
     return html`<${Lazy} load=${() => import("../place/page")} name="Place" of=${{ base }} />`;
   }

@@ -1,4 +1,4 @@
-import { get, session, type Session, type Status } from "../client";
+import { get, setSession, type Session, type Status } from "../client";
 import { Badge, Content, Empty, Heading, Tile, Time, useLoad } from "../components";
 import { bytes, count } from "../format";
 import { html, type Shown } from "../html";
@@ -64,5 +64,5 @@ mrasfm keys revoke ${shown.key_id}</pre>`}<//>
 
 export async function logOut(): Promise<void> {
   await fetch("v1/session", { method: "DELETE" });
-  session.value = null;
+  setSession(null);
 }

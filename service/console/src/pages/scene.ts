@@ -57,6 +57,7 @@ function sceneTab(scene: Scene, tab: string): Children {
       : html`<${Empty}>This scene has no view.json: it was made by an older version, or its points could not be written. Reconstruct it again.<//>`;
   }
   if (tab === "place") {
+    if (!hasFile(scene, "view.json")) return html`<${Empty}>This scene has no view.json: it was made by an older version. Reconstruct it again.<//>`;
     if (!scene.summary.georeferenced) return html`<${Empty}>This scene has no place on the earth: its drive has no GNSS that could be used.<//>`;
     return html`<${Lazy} load=${() => import("../place/page")} name="Place" of=${{ base }} />`;
   }
@@ -81,8 +82,8 @@ function Overview({ scene }: { scene: Scene }): Shown {
     <${Content} of=${loaded}>${(report: Report) => html`<${ReportParts} report=${report} />`}<//>
     ${(summary.components ?? []).length > 1 && html`<h2>Components</h2><p>Nothing links some parts of this drive with the rest: each is a scene of its own.</p>
       <ul>${(summary.components ?? []).map((part) => html`<li>Component ${part.component} in <code>${part.folder}</code>: ${count(part.registered_units)} units, ${count(part.points)} points</li>`)}</ul>`}
-    ${hasFile(scene, "pictures/road_before.png") && html`<h2>The road from above</h2>
-      <${Slider} before=${fileUrl(base, "pictures/road_before.png")} after=${fileUrl(base, "pictures/road_after.png")} label="Calibration as given and as refined" />`}`;
+    ${hasFile(scene, "pictures/road_before.png") && html`<h2>Points of the road</h2>
+      <${Slider} before=${fileUrl(base, "pictures/road_before.png")} after=${fileUrl(base, "pictures/road_after.png")} label="Before and after points off its surface were dropped" />`}`;
 }
 
 export function ReportParts({ report }: { report: Report }): Shown {
