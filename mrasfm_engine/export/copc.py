@@ -103,7 +103,8 @@ def coordinates(scene: Scene) -> tuple[Floats, Ints32]:
 
 def offset_of(scene: Scene) -> Floats:
     """Offset (3,) of the file's coordinates in metres: zero in the local frame."""
-    return np.floor(in_reference_system(scene, np.zeros((1, 3)))[0])
+    offset_m: Floats = np.floor(in_reference_system(scene, np.zeros((1, 3)))[0])
+    return offset_m
 
 
 def in_reference_system(scene: Scene, points_m: Floats) -> Floats:

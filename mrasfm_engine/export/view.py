@@ -148,7 +148,7 @@ def _seams(scene: Scene, scene_of_unit: Sequence[str], document: Mapping[str, An
         shown: dict[str, Any] = {"a": seam["a"], "b": seam["b"], "accepted": bool(seam["accepted"])}
         if all(len(track) for track in tracks):
             a, b = (scene.world_from_rig[track][:, :3, 3] for track in tracks)
-            distance_m, nearest = cKDTree(b).query(a)
+            distance_m, nearest = map(np.asarray, cKDTree(b).query(a))
             closest = int(np.argmin(distance_m))
             shown["line_m"] = _relative(scene, np.stack([a[closest], b[nearest[closest]]]))
         yield shown

@@ -78,7 +78,8 @@ def _keypoints(scene: Scene, image: int, mine: Ints, keypoints: np.ndarray[Any, 
 
 
 def _places(positions: list[list[float]], document: dict[str, Any]) -> Floats:
-    return np.array(positions, dtype=np.float64).reshape(-1, 3) + document["offset_m"]
+    places: Floats = np.array(positions, dtype=np.float64).reshape(-1, 3) + np.array(document["offset_m"])
+    return places
 
 
 def _expected(scene: Scene, points_m: Floats, document: dict[str, Any]) -> Floats:

@@ -1,7 +1,7 @@
 // The scene in 3D: points by their size on the screen, trajectories, frusta and seams.
 import {
   BufferAttribute, BufferGeometry, Color, Line, LineBasicMaterial, LineSegments, MathUtils, PerspectiveCamera, Points,
-  PointsMaterial, Raycaster, Scene, Vector2, Vector3, WebGLRenderer,
+  PointsMaterial, Scene, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Point, ViewDocument, ViewImage, ViewScene } from "./document";
@@ -10,6 +10,7 @@ import type { FromPoints, NodeInfo, ToWorker } from "./points.worker";
 const MOST_POINTS = 6_000_000;
 const AT_ONE_TIME = 2; // nodes that are being loaded
 const SPACING_PX = 2.2; // a node is loaded while its points are farther apart than this on the screen
+const PICKED_PX = 6;
 const EDGES: [number, number][] = [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]];
 const SELECTED = new Color("#ffffff");
 
@@ -55,7 +56,7 @@ export class Scene3D {
     urls: { points: string; worker: string; wasm: string },
     private readonly say: { figures: (figures: Figures) => void; failed: (detail: string) => void; picked: (picked: Picked) => void },
   ) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer = new WebGLRenderer({ canvas, antialias: true });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.scene.background = new Color("#14181d");
     this.camera = new PerspectiveCamera(50, 1, 0.2, 20000);
@@ -233,17 +234,27 @@ export class Scene3D {
     return -inView.z > -reach && Math.abs(inView.y) < Math.max(-inView.z, 0) * half + reach && Math.abs(inView.x) < Math.max(-inView.z, 0) * half * this.camera.aspect + reach;
   }
 
+  /** The image whose frustum is drawn nearest to a place on the screen. */
   private pick(clientX: number, clientY: number): void {
+    if (!this.frusta[0]?.lines.visible) return;
     const box = this.canvas.getBoundingClientRect();
-    const at = new Vector2(((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2);
-    const ray = new Raycaster();
-    ray.params.Line = { threshold: 0.08 };
-    ray.setFromCamera(at, this.camera);
-    const [hit] = ray.intersectObjects(this.frusta.map(({ lines }) => lines).filter((lines) => lines.visible));
-    if (!hit || hit.index === undefined) return;
-    const { of } = this.frusta.find(({ lines }) => lines === hit.object)!;
-    const image = of.images[Math.floor(hit.index / (2 * EDGES.length))];
-    if (image) this.say.picked({ scene: of, image });
+    const [x, y] = [clientX - box.left, clientY - box.top];
+    let nearest: { picked: Picked; px: number } | null = null;
+    for (const { of } of this.frusta) {
+      for (const image of of.images) {
+        const corners = image.frustum_m.map((point) => this.onScreen(point));
+        for (const [a, b] of EDGES) {
+          const px = distanceToSegment(x, y, corners[a]!, corners[b]!);
+          if (px < (nearest?.px ?? PICKED_PX)) nearest = { picked: { scene: of, image }, px };
+        }
+      }
+    }
+    if (nearest) this.say.picked(nearest.picked);
+  }
+
+  private onScreen(point: Point): [number, number] | null {
+    const place = new Vector3(...point).applyMatrix4(this.camera.matrixWorldInverse);
+    return place.z > -this.camera.near ? null : this.project(point);
   }
 
   private fit(): void {
@@ -263,6 +274,13 @@ export class Scene3D {
       this.request();
     });
   }
+}
+
+function distanceToSegment(x: number, y: number, a: [number, number] | null, b: [number, number] | null): number {
+  if (!a || !b) return Infinity;
+  const [dx, dy] = [b[0] - a[0], b[1] - a[1]];
+  const along = Math.min(1, Math.max(0, ((x - a[0]) * dx + (y - a[1]) * dy) / (dx * dx + dy * dy || 1)));
+  return Math.hypot(x - a[0] - along * dx, y - a[1] - along * dy);
 }
 
 function frustumPoints(image: ViewImage): Point[] {
