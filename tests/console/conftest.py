@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route, sync_playwright
+from sqlalchemy import select
 
 from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.export.scene import write_scene
 from schemas.api.problems import Problem
 from schemas.drive import DriveManifest
+from service.database.tables import MapVersion, Scene
 from service.domain import jobs
 from tests.helpers.export_example import make_scene
 from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, api_in_thread, settings_of
@@ -168,6 +170,9 @@ def _filled(api: Api, client: Client, folder: Path) -> World:
     child = again["members"][-1]["job_id"]
     client.publish(client.claim(child), files)
     client.publish_map(client.claim(again["id"]), map_files, unconnected=("third",))
+    with api.database.write() as session:  # the helpers' summary is of a scene without a place on the earth
+        for row in (*session.scalars(select(Scene)), *session.scalars(select(MapVersion))):
+            row.summary = {**row.summary, "georeferenced": True}
     return World(
         api=api,
         client=client,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 from playwright.sync_api import Page, expect
 
 from schemas.api.problems import Problem
 from service.domain import jobs
 from service.domain.jobs import Claim, ProgressNote
+from service.storage.artifacts import ArtifactStore
 from tests.console.conftest import Open, World, go, log_in, wait_for
 from tests.helpers.live_api import Api, Client, api_process, settings_of
 from tests.helpers.tiny_drive import tiny_drive
@@ -87,8 +89,9 @@ def test_a_page_outlives_the_service(open_console: Open, tmp_path: Path) -> None
     """The service is killed and started again: the page reaches the job's end by itself."""
     settings = settings_of(tmp_path / "data")
     with api_process(settings, tmp_path) as api:
+        api.context = SimpleNamespace(artifacts=ArtifactStore(settings))
         client: Client = api.client()
-        job = client.reconstruct(client.committed(tiny_drive("restart", seed="restart")))
+        job = client.reconstruct(client.frozen(tiny_drive("restart", seed="restart")))
         held = client.claim(job["id"])
         watched = open_console(api.url)
         watched.expected = (

@@ -170,23 +170,22 @@ def _scale(refinement: Mapping[str, Any]) -> str:
 
 def _rejected(scene: Scene, stages: Sequence[Mapping[str, Any]]) -> str:
     mapping, refinement = stage_of(stages, Stage.MAPPING), stage_of(stages, Stage.REFINEMENT)
-    matches, rejected = stage_of(stages, Stage.MATCHES), refinement.get("rejected", {})
-    lines = [
-        f"{number(count)} pairs of images: {text(why)}" for why, count in matches.get("rejected_pairs", {}).items()
-    ]
+    pairs = stage_of(stages, Stage.MATCHES).get("rejected_pairs", {})
+    tracks = refinement.get("moving_objects", {}).get("tracks_dropped_because", {})
+    adjusted, off_road = refinement.get("rejected", {}), refinement.get("road", {}).get("dropped")
+    lines = [f"{number(count)} pairs of images: {text(why)}" for why, count in pairs.items() if count]
     lines += [
-        f"{number(rejected[what])} {what} in the last adjustment"
+        f"{number(adjusted[what])} {what} in the last adjustment"
         for what in ("observations", "points")
-        if what in rejected
+        if adjusted.get(what)
     ]
-    moving = refinement.get("moving_objects", {})
-    lines += [f"{number(count)} tracks: {text(why)}" for why, count in moving.get("tracks_dropped_because", {}).items()]
-    if "dropped" in refinement.get("road", {}):
-        lines.append(f"{number(refinement['road']['dropped'])} points off the surface of the road")
+    lines += [f"{number(count)} tracks: {text(why)}" for why, count in tracks.items() if count]
+    if off_road:
+        lines.append(f"{number(off_road)} points off the surface of the road")
     lines += [f"{_named(mapping[name])}: {what}" for name, what in _LISTS.items() if mapping.get(name)]
     missing = np.flatnonzero(~scene.unit_registered).tolist()
     if missing:
-        lines.append(f"{number(len(missing))} units without a pose: {text(_named(missing))}")
+        lines.append(f"{number(len(missing))} units without a pose: {_named(missing)}")
     return section("Rejected, and why", items(lines) if lines else "<p>Nothing.</p>\n")
 
 

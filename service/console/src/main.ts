@@ -44,10 +44,10 @@ function Shell(): Shown {
   return html`<a class="skip" href="#main" onClick=${skip}>Skip to the content</a>
     <header>
       <a class="brand" href=${link("drives")}>MRASfM</a>
-      <nav aria-label="Pages">${PAGES.map(([name, label]) => html`<a href=${link(name)} aria-current=${here === name ? "page" : undefined}>${label}</a>`)}</nav>
+      <nav aria-label="Pages">${PAGES.filter(([name]) => !isOpen() || name === "scenes" || name === "maps").map(([name, label]) => html`<a href=${link(name)} aria-current=${here === name ? "page" : undefined}>${label}</a>`)}</nav>
       <div class="session"><span class=${`connection ${connection.value}`} role="status" data-connection=${connection.value}>${CONNECTIONS[connection.value]}</span>
         <span class="muted project">${session.value?.project}</span>
-        <button type="button" onClick=${() => void logOut()}>Log out</button></div>
+        ${!isOpen() && html`<button type="button" onClick=${() => void logOut()}>Log out</button>`}</div>
     </header>
     <main id="main">${page(parts)}</main>`;
 }
@@ -68,9 +68,14 @@ function App(): Shown {
   return who === null ? html`<${Login} />` : html`<${Shell} />`;
 }
 
+/** `mrasfm view` asks for no key. */
+function isOpen(): boolean {
+  return document.querySelector("meta[name=mrasfm-session]")?.getAttribute("content") === "open";
+}
+
 async function begin(): Promise<void> {
   try {
-    setSession(remembersSession() ? await get<Session>("v1/session") : null);
+    setSession(isOpen() || remembersSession() ? await get<Session>("v1/session") : null);
   } catch {
     setSession(null);
   }

@@ -1,4 +1,4 @@
-import { fileUrl, get, getAll, send, type Finding, type Scene } from "../client";
+import { fileUrl, get, getAll, send, session, type Finding, type Scene } from "../client";
 import { Confirm, Content, Empty, Findings, Heading, Tabs, Tile, Time, useLoad } from "../components";
 import { count, duration, significant } from "../format";
 import { html, type Children, type Shown } from "../html";
@@ -39,7 +39,7 @@ export function ScenePage({ id, tab }: { id: string; tab: string }): Shown {
   };
   return html`<${Heading} title=${scene?.name ?? "Scene"} kind="Scene">
       ${scene && hasFile(scene, "report.html") && html`<a class="button" href=${fileUrl(`v1/scenes/${id}`, "report.html")} download>Download the report</a>`}
-      <${Confirm} label="Delete" ask="Delete this scene and its files?" run=${remove} danger />
+      ${session.value?.session_expires_at && html`<${Confirm} label="Delete" ask="Delete this scene and its files?" run=${remove} danger />`}
     <//>
     <${Tabs} base=${["scenes", id]} tabs=${TABS} current=${tab} />
     <${Content} of=${loaded}>${(shown: Scene) => sceneTab(shown, tab)}<//>`;

@@ -55,7 +55,7 @@ export function Photo({ base, view, picked, drive, choose }: Props): Shown {
   return html`<aside class="box" aria-label="Image of the camera"><h2>${image.camera}</h2>
     <p class="small"><code>${image.file}</code><br />unit ${image.unit} of ${scene.name}</p>
     ${isMissing
-      ? html`<${Empty}>The image is not in the service any more: its drive was deleted.<//>`
+      ? html`<${Empty}>The image is not here: its drive was deleted, or was not given to mrasfm view with --drive.<//>`
       : html`<div class="photo"><img src=${fileUrl(`v1/drives/${drive}`, image.file)} alt=${`Image ${image.file}`} onError=${() => setMissing(true)} /><canvas ref=${overlay}></canvas></div>`}
     <p data-observations=${points ? points.length / 2 : ""}>${points ? `${count(points.length / 2)} observations` : "reading the observations …"}, ${image.size_px[0]} × ${image.size_px[1]} px</p>
     <div class="inline"><label><input type="checkbox" checked=${isShown} onChange=${(event: Event) => setShown((event.target as HTMLInputElement).checked)} /> Observations</label>
