@@ -134,7 +134,7 @@ def _add_scene(app: FastAPI, folder: Path, drives: Sequence[DriveFolder]) -> Non
     scene = SceneResource(
         id=SCENE_ID,
         name=name,
-        drive_id=_drive_id(drives, name),
+        drive_id="drive-0" if len(drives) == 1 else _drive_id(drives, name),
         job_id="none",
         summary=summary,
         files=_resources(files, url),
@@ -265,7 +265,7 @@ def _figures(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _drive_id(drives: Sequence[DriveFolder], name: str) -> str:
-    """Id of the drive of this name; of a single drive that was given without a choice."""
+    """Id of the drive of this name."""
     numbers = [number for number, drive in enumerate(drives) if drive.name == name]
     return f"drive-{numbers[0]}" if numbers else "none"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 
 EXIT_REFUSED = 2
@@ -56,5 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"mrasfm: {arguments.folder} is at {address}; Ctrl-C ends this", flush=True)
         if not arguments.no_browser:
             webbrowser.open(address)
-        server_of(app, host=HOST, port=arguments.port, timeout_graceful_shutdown=1).run(sockets=[listener])
+        with suppress(KeyboardInterrupt):  # uvicorn raises it anew once it has stopped
+            server_of(app, host=HOST, port=arguments.port, timeout_graceful_shutdown=1).run(sockets=[listener])
     return 0

@@ -1,5 +1,5 @@
 // The calibration of a scene: what changed, how well it is known, and which cameras are not what they were given as.
-import { fileUrl, get, getAll, type Drive, type Scene } from "../client";
+import { fileUrl, get, getAll, session, type Drive, type Scene } from "../client";
 import { Content, Empty, useLoad } from "../components";
 import { significant } from "../format";
 import { html, type Shown } from "../html";
@@ -17,7 +17,7 @@ export function CalibrationPage({ base, driveId, hasPictures }: Props): Shown {
   const loaded = useLoad((abort) => get<Calibration>(fileUrl(base, "calibration.json"), abort), `calibration ${base}`, false);
   return html`<${Content} of=${loaded}>${(document: Calibration) => html`<${Cameras} document=${document} />`}<//>
     ${hasPictures && html`<h2>The ground from above</h2><${Slider} before=${fileUrl(base, "pictures/birds_eye_before.png")} after=${fileUrl(base, "pictures/birds_eye_after.png")} label="All cameras projected onto the road, calibration as given and as refined" />`}
-    <${History} driveId=${driveId} />`;
+    ${session.value?.session_expires_at && html`<${History} driveId=${driveId} />`}`;
 }
 
 export function Cameras({ document }: { document: Calibration }): Shown {
