@@ -37,7 +37,7 @@ def viewing(*arguments: str | Path) -> Iterator[str]:
         assert process.wait(20) == 0
     finally:
         process.kill()
-        process.wait()
+        process.communicate()
 
 
 @pytest.fixture(scope="module")
