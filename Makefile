@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 ACCEPTANCE ?=
 
-.PHONY: help setup demo test check docs acceptance lock wheels schema clean
+.PHONY: help setup demo test check docs console acceptance lock wheels schema clean
 
 help: ## what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -34,6 +34,11 @@ check: setup ## lint, types, import contracts, links and generated pages of the 
 
 docs: setup ## rewrite the generated pages of docs/
 	$(BIN)/python -m tests.documentation
+
+console: setup ## build the web console and the report's script from service/console/src (needs node 18 or newer and npm)
+	mkdir -p service/console/build
+	$(BIN)/python -m service.api.openapi_export service/console/build/openapi.json
+	cd service/console && npm ci --ignore-scripts && npm run build
 
 acceptance: setup ## every figure of README.md and docs/, as a table (real drives needed; ACCEPTANCE="--only 1,2", ACCEPTANCE=--thorough)
 	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)

@@ -34,9 +34,11 @@ CHECKPOINT_FOLDER = ".stages"
 CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING})  # seams are too, each by itself
 
 REPORT_FILE = "report.json"
+REPORT_PAGE = "report.html"  # the same for people
 MAP_FILE = "map.json"
 COPC_FILE = "points.copc.laz"
 TRAJECTORY_FILE = "trajectory.gpkg"
+VIEW_FILE = "view.json"
 RIG_FOLDER = "rig"  # a scene's cameras in other people's formats; of a map: RIGS_FOLDER/SCENE
 RIGS_FOLDER = "rigs"
 AUTOWARE_FOLDER = "autoware"
@@ -99,7 +101,9 @@ def is_read_by_aggregation(path: str) -> bool:
     """Return whether an aggregation reads this file of a scene."""
     unread = (PICTURES_FOLDER, OWN_CAR_FOLDER, TEXT_MODEL_FOLDER, RIG_FOLDER, AUTOWARE_FOLDER)
     path = re.sub(rf"^{COMPONENTS_FOLDER}/\d+/", "", path)
-    return path not in (COPC_FILE, TRAJECTORY_FILE) and not path.startswith(tuple(f"{folder}/" for folder in unread))
+    return path not in (COPC_FILE, TRAJECTORY_FILE, VIEW_FILE, REPORT_PAGE) and not path.startswith(
+        tuple(f"{folder}/" for folder in unread)
+    )
 
 
 def is_read_by_next_version(path: str) -> bool:

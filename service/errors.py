@@ -91,6 +91,10 @@ class Unauthorized(ServiceError, status=401):
     """No valid API key."""
 
 
+class ForeignOrigin(ServiceError, status=403):
+    """Another site's page asked for this."""
+
+
 class NotFound(ServiceError, status=404):
     """Not found."""
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from pydantic import AfterValidator, Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -33,7 +33,16 @@ def _sendable(token: SecretStr) -> SecretStr:
     return token
 
 
+def _tile_url(url: str) -> str:
+    parts = urlsplit(url)
+    named = all(f"{{{name}}}" in url for name in "zxy")
+    if parts.scheme not in ("http", "https") or not re.fullmatch(r"[A-Za-z0-9.:\[\]-]+", parts.netloc) or not named:
+        raise ValueError("must be http(s)://HOST/... with {z}, {x} and {y} in its path")
+    return url
+
+
 Token = Annotated[SecretStr, AfterValidator(_sendable)]
+TileUrl = Annotated[str, AfterValidator(_tile_url)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
 _FITS: Mapping[str, Callable[[float, float], bool]] = {
@@ -95,6 +104,11 @@ class Settings(BaseSettings):
     upload_idle_seconds: Seconds = Field(
         60.0,
         description="a request whose body sends nothing for this long ends; resumable uploads keep what was received",
+    )
+    console_tiles: TileUrl | None = Field(
+        None,
+        description="URL of map tiles for the web console, with `{z}`, `{x}` and `{y}`; without it the console asks "
+        "this host only",
     )
     metrics_token: Token | None = Field(
         None, description="bearer token that Prometheus sends to read `/metrics`; by default anybody may read it"
@@ -166,7 +180,7 @@ class Settings(BaseSettings):
     )
     idempotency_hours: Hours = Field(24.0, description="answers to an `Idempotency-Key` are kept for this time")
 
-    @field_validator("metrics_token", "submap_workers", mode="before")
+    @field_validator("metrics_token", "submap_workers", "console_tiles", mode="before")
     @classmethod
     def _is_given(cls, value: object) -> object:
         """Compose passes what nobody has set as an empty text."""
@@ -192,6 +206,11 @@ class Settings(BaseSettings):
             return self.database_url.get_secret_value()
         path = str(self.data_dir.resolve() / "mrasfm.sqlite3")
         return URL.create("sqlite", database=path).render_as_string()  # quoted: a folder may be named `a?b`
+
+    @property
+    def tile_origin(self) -> str | None:
+        """Scheme and host of the map tiles; None where there are none."""
+        return None if self.console_tiles is None else "{0.scheme}://{0.netloc}".format(urlsplit(self.console_tiles))
 
     @property
     def resolved_artifacts_url(self) -> str:

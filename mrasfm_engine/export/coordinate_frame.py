@@ -29,6 +29,7 @@ FILES = {
     "points.copc.laz": "its own coordinate reference system: UTM with ellipsoidal heights; without one: local",
     "poses.tum": "local_from_rig, quaternions x y z w",
     "poses.json": "world_from_rig and world_from_cam with world = local, and geodetic positions where georeferenced",
+    "view.json": "as points.copc.laz, relative to its offset_m",
     "trajectory.gpkg": "longitude, latitude and ellipsoidal height where georeferenced, else local",
     "calibration.json": "rig_from_cam",
     "rig": "rig_from_cam, relative poses of cameras; pixels count from the centre of the top left one",

@@ -100,20 +100,42 @@ def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> N
 
 def coordinates(scene: Scene, system: EarthSystem | None) -> tuple[Floats, Ints32]:
     """Offset (3,) in metres, and the points (n, 3) in steps from it, in the file's coordinate reference system."""
-    offset_m = np.zeros(3) if system is None else np.floor(_projected(scene, np.zeros((1, 3)), system)[0])
+    offset_m = _offset(scene, system)
     steps = np.empty(scene.points_m.shape, dtype=np.int32)
     for first in range(0, len(steps), BLOCK):
         block = slice(first, first + BLOCK)
-        points_m = scene.points_m[block]
-        points_m = points_m if system is None else _projected(scene, points_m, system)
-        counted = np.rint((points_m - offset_m) / STEP_M)
+        counted = np.rint((_projected(scene, scene.points_m[block], system) - offset_m) / STEP_M)
         if np.abs(counted).max() > np.iinfo(np.int32).max:
             raise ValueError("a point is too far from the origin for its 32 bits")
         steps[block] = counted
     return offset_m, steps
 
 
-def _projected(scene: Scene, points_m: Floats, system: EarthSystem) -> Floats:
+def offset_of(scene: Scene) -> Floats:
+    """Offset (3,) of the scene's own file in metres: zero in the local frame."""
+    return _offset(scene, _system_of(scene))
+
+
+def in_reference_system(scene: Scene, points_m: Floats) -> Floats:
+    """Local points (n, 3) in the coordinate reference system of the scene's own file: UTM and ellipsoidal height, or the
+    local frame."""
+    return _projected(scene, points_m, _system_of(scene))
+
+
+def epsg_code_of(scene: Scene) -> int | None:
+    """EPSG code of the horizontal coordinate reference system of the scene's own file; None in the local frame."""
+    system = _system_of(scene)
+    return None if system is None else system.code
+
+
+def _offset(scene: Scene, system: EarthSystem | None) -> Floats:
+    offset_m: Floats = np.floor(_projected(scene, np.zeros((1, 3)), system)[0])
+    return offset_m
+
+
+def _projected(scene: Scene, points_m: Floats, system: EarthSystem | None) -> Floats:
+    if system is None:
+        return points_m
     assert scene.georeference is not None
     return system.projected(points_m, scene.georeference.ecef_from_local)
 

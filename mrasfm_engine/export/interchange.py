@@ -5,11 +5,13 @@ Nothing of the scene rests on them. One that cannot be written, or does not read
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from mrasfm_engine.errors import StorageError
 from mrasfm_engine.export import (
@@ -21,12 +23,14 @@ from mrasfm_engine.export import (
     geopackage_readback,
     rig_files,
     rig_files_readback,
+    view,
+    view_readback,
 )
 from mrasfm_engine.export.check import Check, ReadBack
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE
+from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE, VIEW_FILE
 
-OPTIONAL = (COPC_FILE, AUTOWARE_FOLDER, TRAJECTORY_FILE, RIG_FOLDER, RIGS_FOLDER)  # not of every scene
+OPTIONAL = (COPC_FILE, AUTOWARE_FOLDER, TRAJECTORY_FILE, VIEW_FILE, RIG_FOLDER, RIGS_FOLDER)  # not of every scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +60,7 @@ class Interchange:
     scene: Scene
     scene_of_unit: Sequence[str]  # name of the scene that each unit is of
     rigs: Mapping[str, str]  # folders, and what the names of their cameras begin with
+    map_document: Mapping[str, Any] | None = None  # `map.json` of a map
 
     def write(self, folder: Path, read_back: ReadBack) -> list[str]:
         """Write the files into a scene's or map's folder and read them back; which are withheld, and why.
@@ -83,6 +88,7 @@ class Interchange:
         """Files and folders that this scene has."""
         scene = self.scene
         yield _Part(path=TRAJECTORY_FILE, write=self._write_trajectory, checks=self._trajectory_checks)
+        yield _Part(path=VIEW_FILE, write=self._write_view, checks=self._view_checks)
         for rig, prefix in self.rigs.items():
             write = partial(_write_rig, scene, prefix)
             yield _Part(path=rig, write=write, checks=partial(_rig_checks, scene, rig, prefix), is_whole=False)
@@ -100,6 +106,17 @@ class Interchange:
     def _trajectory_checks(self) -> Iterator[Check]:
         compare = partial(geopackage_readback.geopackage, self.scene, self.scene_of_unit)
         yield Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, compare)
+
+    def _write_view(self, path: Path) -> Sequence[str]:
+        places = view.read_image_places(path.parent)
+        document = view.view_document(self.scene, self.scene_of_unit, places, self.map_document)
+        path.write_text(
+            json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8"
+        )
+        return ()
+
+    def _view_checks(self) -> Iterator[Check]:
+        yield Check(VIEW_FILE, view_readback.read_view, partial(view_readback.view, self.scene))
 
 
 def _withheld(part: _Part, folder: Path, read_back: ReadBack) -> Iterator[str]:

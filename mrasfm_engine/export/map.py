@@ -22,6 +22,7 @@ from mrasfm_engine.export.check import Check, ReadBack, common_checks
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
+from mrasfm_engine.export.report_page import map_page, write_page
 from mrasfm_engine.export.scene import check_scene, write_common, write_json
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.io.trajectory_file import format_tum
@@ -30,6 +31,7 @@ from mrasfm_engine.types import Ints
 from schemas.artifacts import (
     MAP_FILE,
     PICTURES_FOLDER,
+    REPORT_PAGE,
     RIG_FOLDER,
     RIGS_FOLDER,
     SCENES_FOLDER,
@@ -41,7 +43,7 @@ Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  
 
 
 CALIBRATION_FOLDER = "calibration"
-REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, *interchange.OPTIONAL)
+REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +84,7 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
     scene, read_back = content.scene, ReadBack(work)
     figures = write_common(scene, work, content.pictures, read_back)
     rigs = {f"{RIGS_FOLDER}/{name}": f"{name}/" for name in content.calibrations}
-    others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs)
+    others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs, map_document=content.document)
     figures["notes"] += others.write(work, read_back)
     (work / "poses.tum").write_text(_poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", _poses_document(content))
@@ -96,6 +98,7 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
         for name, (key, arrays, documents) in kept.items():
             store.save(name, key, arrays, documents)
     written = {**report, "summary": figures}
+    figures["notes"] += write_page(work, partial(map_page, content.document, work, written), read_back)
     write_json(work / COMPLETE_MARK, written)
     read_back.check(_checks(content))
     read_back.require_all()

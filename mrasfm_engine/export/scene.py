@@ -4,8 +4,8 @@ A scene's folder holds `model/` (COLMAP, binary; `model/text/` the same as text)
 `poses.json`, `calibration.json`, `frame.json`, `features.db`, `manifest.json` (the drive's, in the engine's axes: the
 scene can be aggregated without the drive), `pictures/` where any were drawn, `own_car/` where a camera shows the
 vehicle itself, `road.json` where the road was found, `components/N/` with a scene for each part of the drive that
-nothing links to this one, what other programs read (`export.interchange`), and `report.json`. One with a `report.json`
-is complete.
+nothing links to this one, what other programs read (`export.interchange`), `report.html`, and `report.json`. One
+with a `report.json` is complete.
 """
 
 from __future__ import annotations
@@ -37,15 +37,23 @@ from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, com
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
+from mrasfm_engine.export.report_page import scene_page, write_page
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats, Ints
-from schemas.artifacts import COMPONENTS_FOLDER, OWN_CAR_FOLDER, PICTURES_FOLDER, RIG_FOLDER, component_folder
+from schemas.artifacts import (
+    COMPONENTS_FOLDER,
+    OWN_CAR_FOLDER,
+    PICTURES_FOLDER,
+    REPORT_PAGE,
+    RIG_FOLDER,
+    component_folder,
+)
 
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
-REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, *interchange.OPTIONAL)
+REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 
 def write_scene(
@@ -150,11 +158,14 @@ def _write(
         write_json(work / ROAD_FILE, road.road_document(scene))
     (work / "poses.tum").write_text(pose_files.poses_text(scene), encoding="utf-8")
     write_json(work / "poses.json", pose_files.poses_document(scene, components))
-    write_json(work / "calibration.json", calibration.calibration_document(scene, report.get("component", 0)))
+    calibrated = calibration.calibration_document(scene, report.get("component", 0))
+    write_json(work / "calibration.json", calibrated)
     write_json(work / "frame.json", coordinate_frame.frame_document(scene))
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
-    write_json(work / COMPLETE_MARK, {**report, "summary": figures})
+    document = {**report, "summary": figures}
+    figures["notes"] += write_page(work, partial(scene_page, scene, work, document, calibrated), read_back, calibrated)
+    write_json(work / COMPLETE_MARK, document)
     read_back.check(_checks(scene, pictures))
     read_back.require_all()
 

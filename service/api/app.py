@@ -29,7 +29,9 @@ from service.api.openapi import allowed_methods, openapi_page
 from service.api.readiness import Readiness
 from service.api.routes import (
     aggregations,
+    drive_downloads,
     drives,
+    events,
     exports,
     files,
     jobs,
@@ -37,9 +39,11 @@ from service.api.routes import (
     operations,
     reconstructions,
     scenes,
+    session,
     uploads,
     webhooks,
 )
+from service.api.routes.console import add_console
 from service.api.routes.documentation import add_documentation
 from service.database.tables import now_us
 from service.domain import uploads as upload_records
@@ -105,11 +109,27 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.state.readiness = Readiness(context)
-    modules = (drives, files, uploads, reconstructions, aggregations, jobs, scenes, maps, exports, webhooks, operations)
+    modules = (
+        drives,
+        files,
+        drive_downloads,
+        uploads,
+        reconstructions,
+        aggregations,
+        jobs,
+        events,
+        scenes,
+        maps,
+        exports,
+        webhooks,
+        session,
+        operations,
+    )
     routers = [*(module.router for module in modules), operations.metrics_route(metrics, settings.metrics_token)]
     for router in (*routers, heads_of(routers)):
         app.include_router(router)
     add_documentation(app)
+    add_console(app, tile_origin=settings.tile_origin)
     _answer_errors(app)
     app.add_middleware(BodyRules, idle_s=settings.upload_idle_seconds)
     app.add_middleware(RequestLog, metrics=metrics, failed=_failed)

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from service.api.context import Context
+from service.api.credentials import secret_of
 from service.api.http.paging import MAX_CURSOR_CHARACTERS, MAX_LIMIT
 from service.api.http.request_bodies import request_sha256
 from service.database.tables import Job
@@ -46,7 +47,10 @@ class Caller:
 
 
 class _ApiKey(HTTPBearer):
-    """FastAPI's, so that the OpenAPI page says which key a route needs; what it gives is the key's owner."""
+    """FastAPI's, so that the OpenAPI page says which key a route needs; what it gives is the key's owner.
+
+    The console's cookie stands for the key that it was made with.
+    """
 
     async def __call__(self, request: Request) -> Caller:  # type: ignore[override]
         """Identify the caller.
@@ -54,16 +58,14 @@ class _ApiKey(HTTPBearer):
         Raises
         ------
         ServiceError
-            401 without a valid key.
+            401 without a valid key or session, 403 for a write that another site's page made with the cookie.
         """
         context = await get_context(request)
-        credentials = await super().__call__(request)
-        project_id = None
-        if credentials is not None:
-            secret = credentials.credentials
+        secret, project_id = secret_of(request), None
+        if secret is not None:
             project_id = context.keys.remembered(secret) or await run_in_threadpool(context.keys.look_up, secret)
         if project_id is None:
-            given = "the API key is not valid" if credentials is not None else "the request carries no API key"
+            given = "the API key is not valid" if secret is not None else "the request carries no API key"
             raise Unauthorized(
                 given,
                 remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",

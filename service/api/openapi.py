@@ -32,6 +32,7 @@ _TAGS = [
     {"name": "maps", "description": "Several drives or scenes in one, version by version."},
     {"name": "exports", "description": "Scenes and maps in formats of other programs, as jobs."},
     {"name": "webhooks", "description": "Addresses that are told when jobs end."},
+    {"name": "session", "description": "The web console's: a cookie in place of the key."},
     {"name": "operation", "description": "How the service itself is."},
 ]
 _IDS = {
@@ -67,6 +68,8 @@ def openapi_page(app: FastAPI) -> dict[str, Any]:
             _correct_invalid(operation)
             if path.startswith("/v1/"):
                 _add_problems(operation, 503)
+                if method in _WRITING:
+                    _add_problems(operation, 403)
             if "requestBody" in operation:
                 _add_problems(operation, 408, 415)
             if "application/json" in operation.get("requestBody", {}).get("content", ()):

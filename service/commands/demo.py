@@ -235,7 +235,10 @@ class _Demo:
         print("In each: points.ply for a viewer, model/ for COLMAP, report.json for the figures, pictures/ to look at.")
         print("To look at the service itself, start it again with what it has:")
         print(f"  mrasfm standalone --data {self._out / 'service'}")
-        print(f"  then http://127.0.0.1:8000/docs, with the key in {self._out / 'api-key'}")
+        print(f"  then http://127.0.0.1:8000/, with the key in {self._out / 'api-key'}")
+        images = " ".join(f"--drive {self._drive(number)}" for number in self._numbers)
+        print("To open the map in the browser:")
+        print(f"  mrasfm view {self._map} {images}")
 
 
 def _output_of(argv: Sequence[str]) -> str:

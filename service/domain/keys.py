@@ -10,11 +10,12 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.database.connections import Database
-from service.database.tables import ApiKey, Project, now_us
+from service.database.tables import ApiKey, ConsoleSession, Project, now_us
 from service.settings import Settings
 
 FIRST_PROJECT = "default"
 _MAX_KNOWN = 10_000
+SESSION_PREFIX = "session_"  # of the secrets of the console's sessions
 _PREFIX = "mrasfm_"  # lets secret scanners recognise a key that was pushed somewhere
 
 
@@ -59,14 +60,22 @@ def revoke_key(session: Session, key_id: str) -> bool:
     return True
 
 
+def is_session(secret: str) -> bool:
+    """Return whether a secret is a session's of the console, and not a key."""
+    return secret.startswith(SESSION_PREFIX)
+
+
 def project_of(session: Session, secret: str) -> str | None:
-    """The id of the project that a key opens; None where it opens none."""
-    valid = (ApiKey.secret_sha256 == secret_sha256(secret)) & ApiKey.revoked_us.is_(None)
-    return session.scalar(select(ApiKey.project_id).where(valid))
+    """The id of the project that a key, or a session of the console, opens; None where it opens none."""
+    keys = select(ApiKey.project_id).where(ApiKey.revoked_us.is_(None))
+    if not is_session(secret):
+        return session.scalar(keys.where(ApiKey.secret_sha256 == secret_sha256(secret)))
+    mine = (ConsoleSession.secret_sha256 == secret_sha256(secret)) & (ConsoleSession.expires_us > now_us())
+    return session.scalar(keys.join(ConsoleSession, ConsoleSession.key_id == ApiKey.id).where(mine))
 
 
 class KeyRing:
-    """Remembers for some seconds which project a key opens: a client that sends files sends many with one key.
+    """Remembers for some seconds which project a key or session opens: who sends files sends many with one key.
 
     A key that is revoked ends within `KEPT_S`, and an answer that goes on for long where it asks `find` again.
     """
@@ -85,6 +94,10 @@ class KeyRing:
     def find(self, secret: str) -> str | None:
         """The project's id, remembered or looked up."""
         return self.remembered(secret) or self.look_up(secret)
+
+    def forget(self, secret: str) -> None:
+        """Look the secret up when it comes next."""
+        self._known.pop(secret_sha256(secret), None)
 
     def look_up(self, secret: str) -> str | None:
         """The project's id from the database; None where the key opens none."""

@@ -25,6 +25,8 @@ FILES = {
     "points.ply",
     "points.copc.laz",
     "trajectory.gpkg",
+    "view.json",
+    "report.html",
     "rig",
     "autoware",
     "poses.tum",

@@ -28,14 +28,17 @@ class Fuzzed:
 
 
 def fuzz(url: str, key: str, folder: Path, *, max_examples: int, phases: str) -> Fuzzed:
-    """Send requests with a valid key, and check every answer against the page."""
+    """Send requests with a valid key, and check every answer against the page.
+
+    The stream of a project is left out: it does not end by itself.
+    """
     command = [
         *(sys.executable, "-c", "from schemathesis.cli import schemathesis; schemathesis()"),
         *("--config-file", str(HERE / "schemathesis.toml")),
         *("run", f"{url}/openapi.json", "--header", f"Authorization: Bearer {key}"),
         *("--seed", str(SEED), "--max-examples", str(max_examples), "--phases", phases, "--continue-on-failure"),
         *("--generation-database", "none", "--suppress-health-check", "all", "--no-color", "--warnings", "off"),
-        *("--request-timeout", "60", "--report", "ndjson", "--report-dir", str(folder)),
+        *("--request-timeout", "60", "--exclude-path", "/v1/events", "--report", "ndjson", "--report-dir", str(folder)),
     ]
     environment = {**os.environ, "SCHEMATHESIS_HOOKS": "tests.helpers.fuzz_hooks", "PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)

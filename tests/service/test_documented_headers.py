@@ -61,6 +61,7 @@ def heard(api: Api) -> dict[tuple[str, str], list[set[str]]]:
     _export(said, f"/v1/maps/{map_id}/versions/1/exports", "map")
     said.ask("delete_export", "DELETE", f"/v1/exports/{export_id}", 204)
     _download(said, "map", f"/v1/maps/{map_id}/versions/current/files/points.ply")
+    _follow(said)
     _delete(said, map_id, scene_id)
     _webhook(said, drive_id)
     for name, url in (
@@ -94,6 +95,7 @@ def _fill(said: Conversation) -> str:
     said.ask("put_archive", "PUT", f"{url}/archive", 200, content=drive.zipped())
     said.ask("put_archive", "PUT", f"{url}/archive", 415, content=b"no archive")
     said.ask("list_files", "GET", f"{url}/files", 200)
+    _download(said, "drive", f"{url}/files/{path}")
     return str(drive_id)
 
 
@@ -122,7 +124,8 @@ def _reconstruct(said: Conversation, drive_id: str) -> str:
     said.ask("create_reconstruction", "POST", "/v1/reconstructions", 422, json={})
     job_id = said.post("create_reconstruction", "/v1/reconstructions", 202, **asked)["id"]
     url = f"/v1/jobs/{job_id}"
-    said.ask("list_jobs", "GET", "/v1/jobs", 200)
+    etag = said.ask("list_jobs", "GET", "/v1/jobs", 200).headers["etag"]
+    said.ask("list_jobs", "GET", "/v1/jobs", 304, headers={"If-None-Match": etag})
     _poll(said, url)
     said.post("cancel_job", f"{url}:cancel", 202)
     job_id = said.post("retry_job", f"{url}:retry", 202)["id"]
@@ -148,7 +151,7 @@ def _download(said: Conversation, of: str, url: str) -> None:
         said.ask(name, method, url, 412, headers={"If-Match": '"another"'})
         said.ask(name, method, f"{url}x", 404)
     said.ask(f"download_{of}_file", "GET", url, 206, headers={"Range": "bytes=0-1", "If-Range": etag})
-    said.ask(f"download_{of}_file", "GET", url, 416, headers={"Range": "bytes=99-"})
+    said.ask(f"download_{of}_file", "GET", url, 416, headers={"Range": "bytes=99999-"})
 
 
 def _aggregate(said: Conversation, scene_id: str) -> str:
@@ -207,6 +210,17 @@ def _webhook(said: Conversation, drive_id: str) -> None:
 def _scene(client: Client, name: str) -> str:
     job = client.reconstruct(client.frozen(tiny_drive(name, seed=f"headers {name}")))
     return client.publish(client.claim(job["id"]), FILES)
+
+
+def _follow(said: Conversation) -> None:
+    """The stream and the session, which the console has."""
+    client = said.client
+    with client.stream("GET", "/v1/events") as answer:
+        assert said.note("stream_events", answer).status_code == 200
+    said.ask("begin_session", "POST", "/v1/session", 201)
+    said.ask("get_session", "GET", "/v1/session", 200)
+    said.ask("end_session", "DELETE", "/v1/session", 204)
+    client.cookies.clear()
 
 
 def _delete(said: Conversation, map_id: str, scene_id: str) -> None:

@@ -172,7 +172,7 @@ def test_operations_have_short_names(page: dict[str, Any]) -> None:
         ("/v1/drives/x", "GET, HEAD, DELETE"),
         ("/v1/drives/x:commit", "POST"),
         ("/v1/jobs/x:cancel", "POST"),
-        ("/v1/drives/x/files/a/b", "PUT, DELETE"),
+        ("/v1/drives/x/files/a/b", "GET, HEAD, PUT, DELETE"),
         ("/v1/scenes/x/files/a/b", "GET, HEAD"),
         ("/v1/maps/x/versions/1/files/a/b", "GET, HEAD"),
         ("/v1/maps/x/current-version", "PUT"),

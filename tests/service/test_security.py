@@ -130,6 +130,8 @@ def test_head_is_get_without_a_body(api: Api, client: Client) -> None:
     assert len(readable) >= 20
     for path in readable:
         target = path.format(**ids)
+        if path == "/v1/drives/{drive_id}/files/{path}":
+            target = target.replace("points.ply", next(iter(tiny_drive().files)))
         if path.endswith("/events"):
             assert client.head(target).status_code == 405
             continue

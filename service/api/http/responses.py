@@ -37,6 +37,10 @@ _HEADERS: dict[str, dict[str, Any]] = {
     "Location": _text("where it is, relative to the server", f"/v1/jobs/{EXAMPLE_JOB}"),
     "Repr-Digest": _text("SHA-256 of the whole file, in base64 (RFC 9530)", f"sha-256=:{_DIGEST}:"),
     "Retry-After": _number("seconds to wait until asking again", 2),
+    "Set-Cookie": _text(
+        "the session's cookie, or its end",
+        "mrasfm_session=...; HttpOnly; Max-Age=43200; Path=/; SameSite=strict",
+    ),
     "Tus-Checksum-Algorithm": _text("what `Upload-Checksum` may name", "sha1,sha256"),
     "Tus-Extension": _text("what of tus there is", "creation,checksum,expiration,termination"),
     "Tus-Max-Size": _number("bytes that an upload may have", 1_000_000_000_000),
@@ -58,6 +62,7 @@ COMPONENTS = {"headers": {name: {**_HEADERS[name], "required": True} for name in
 _PROBLEMS = {
     400: "The request is malformed",
     401: "No valid API key",
+    403: "A page of another site asked for it with the console's cookie",
     404: "There is no such thing in this project",
     408: "The body came too slowly",
     409: "The resource is not in the right state; the problem says what to do",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import AsyncIterator, Callable
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
@@ -62,15 +62,15 @@ def _asked(name: str, description: str, example: str) -> dict[str, Any]:
 
 
 _IF_MATCH = _asked("If-Match", "`ETag` of what you want: 412 where the file is another by now", _ETAG)
-_IF_NONE_MATCH = _asked("If-None-Match", "`ETag` of what you have: 304 where the file is still that", _ETAG)
+IF_NONE_MATCH = _asked("If-None-Match", "`ETag` of what you have: 304 where the file is still that", _ETAG)
 # `send_file` reads these headers itself.
-_HEAD_PARAMETERS = {"parameters": [_IF_MATCH, _IF_NONE_MATCH]}
+_HEAD_PARAMETERS = {"parameters": [_IF_MATCH, IF_NONE_MATCH]}
 _DOWNLOAD_PARAMETERS = {
     "parameters": [
         _asked("Range", "one part: `bytes=FIRST-LAST`, `bytes=FIRST-` or `bytes=-COUNT`", "bytes=0-1023"),
         _asked("If-Range", "`ETag` of what you have: the whole file where it is another by now", _ETAG),
         _IF_MATCH,
-        _IF_NONE_MATCH,
+        IF_NONE_MATCH,
     ]
 }
 
@@ -144,7 +144,7 @@ async def send_file(
     context: Context,
     request: Request,
     path: str,
-    find: Callable[[Session], tuple[str, SceneFile | MapFile | ExportFile, Blob]],
+    find: Callable[[Session], tuple[str, HasMediaType, Blob]],
 ) -> Response:
     """The bytes of a file, or the part that is asked for.
 
@@ -185,6 +185,14 @@ async def send_file(
         return Response(headers=headers, media_type=media_type)
     pieces = await _begun(context.artifacts.stream(blob.key, start=part.start, stop=part.stop))
     return StreamingResponse(pieces, status_code=200 if asked is None else 206, headers=headers, media_type=media_type)
+
+
+class HasMediaType(Protocol):
+    """File whose kind is known."""
+
+    @property
+    def media_type(self) -> str:
+        """Content-Type of the download."""
 
 
 def _found(context: Context, find: Callable[[Session], Found]) -> Found:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Request, Response
-from fastapi.security.utils import get_authorization_scheme_param
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -16,11 +16,13 @@ from starlette.concurrency import run_in_threadpool
 from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
 from service.api.context import Context
+from service.api.credentials import secret_of
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us
 from service.api.http.paging import newest
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
 from service.api.routes.aggregations import ACCEPTED, accepted
+from service.api.routes.downloads import IF_NONE_MATCH
 from service.api.routes.job_views import RETRY_AFTER_S, etag_of, view_of, views_of
 from service.database.tables import TERMINAL, Job, JobEvent, JobState, now_us
 from service.domain import aggregations, exports, job_trees, jobs
@@ -38,18 +40,35 @@ _EVENTS = {
 }
 
 
-@router.get("", summary="List jobs", responses={**gives(200, "A page of jobs"), **problems(401, 422)})
+@router.get(
+    "",
+    response_model=Page[JobResource],
+    summary="List jobs",
+    responses={
+        **gives(200, "A page of jobs", "ETag", "Cache-Control"),
+        **gives(304, "Nothing has changed since If-None-Match", "ETag", "Cache-Control"),
+        **problems(401, 422),
+    },
+    openapi_extra={"parameters": [IF_NONE_MATCH]},
+)
 def list_jobs(
     caller: CallerDep,
     context: ContextDep,
+    request: Request,
     limit: Limit = 50,
     cursor: Cursor = None,
     drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
-) -> Page[JobResource]:
+) -> Response:
     """Jobs of the project, newest first."""
     with context.database.read() as session:
         found, following = newest(session, Job, caller.project_id, cursor=cursor, limit=limit, drive_id=drive_id)
-        return Page(items=views_of(session, found, context.settings), next=following)
+        page = Page[JobResource](items=views_of(session, found, context.settings), next=following)
+    body = page.model_dump_json().encode()
+    etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+    headers = {"ETag": etag, "Cache-Control": "no-cache"}
+    if none_match(request.headers.getlist("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    return Response(body, headers=headers, media_type="application/json")
 
 
 @router.get(
@@ -165,7 +184,7 @@ async def stream_job_events(
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """The job's changes of state, from the beginning, and its newest progress, until it or the key has ended."""
-    last, secret = last_event_id or 0, get_authorization_scheme_param(request.headers.get("authorization"))[1]
+    last, secret = last_event_id or 0, secret_of(request) or ""
     while True:
         ended, events = await run_in_threadpool(_news, context, secret, job_id, last)
         for event in events:

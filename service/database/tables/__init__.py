@@ -22,6 +22,7 @@ from service.database.tables._results import (
     SceneFile,
 )
 from service.database.tables._service import IdempotencyKey, Pass, WorkerSeen
+from service.database.tables._sessions import ConsoleSession
 from service.database.tables._webhooks import Webhook, WebhookDelivery
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Base",
     "Blob",
     "Checkpoint",
+    "ConsoleSession",
     "Drive",
     "DriveFile",
     "Export",

@@ -52,7 +52,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def written(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("export") / "deep" / "scene"
-    write_scene(scene, out, {"stages": {"seconds": np.float64(1.5)}, "path": Path("a")})
+    write_scene(scene, out, {"stages": [{"stage": "mapping", "seconds": np.float64(1.5)}], "path": Path("a")})
     return out
 
 
@@ -326,7 +326,7 @@ def test_what_all_cameras_share_is_never_called_observed(scene: Scene) -> None:
 
 def test_report(written: Path) -> None:
     report = load(written / "report.json")
-    assert report["stages"] == {"seconds": 1.5}
+    assert report["stages"] == [{"stage": "mapping", "seconds": 1.5}]
     assert report["summary"]["registered_images"] == 7
     assert report["summary"]["mean_track_length"] == 7
     assert report["summary"]["notes"] == ["an example"]

@@ -1,0 +1,42 @@
+"""Writing of a page. A result is worth more than its page: one that fails is withheld and named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mrasfm_engine.errors import StorageError
+from mrasfm_engine.export import comparisons
+from mrasfm_engine.export.check import Check, ReadBack
+from mrasfm_engine.export.report_page._read_back import faults_of
+from schemas.artifacts import REPORT_PAGE
+
+
+def write_page(
+    folder: Path, make: Callable[[], str], read_back: ReadBack, calibration: Mapping[str, Any] | None = None
+) -> list[str]:
+    """Write `report.html` and read it back; why it is withheld, or nothing.
+
+    Raises
+    ------
+    StorageError
+        Where the disk is full or cannot be written.
+    """
+    path = folder / REPORT_PAGE
+    try:
+        path.write_text(make(), encoding="utf-8")
+    except (OSError, StorageError):
+        raise
+    except Exception as error:
+        return [f"{REPORT_PAGE} is withheld: it cannot be written: {type(error).__name__}: {error}"]
+
+    def read(written: Path) -> list[str]:
+        return list(faults_of(written, calibration))
+
+    fault = read_back.fault(Check(REPORT_PAGE, read, partial(comparisons.content, [])))
+    if fault is None:
+        return []
+    path.unlink()
+    return [f"{REPORT_PAGE} is withheld: it was written but does not read back: {fault}"]

@@ -1,0 +1,1 @@
+"use strict";(()=>{for(let t of document.querySelectorAll("figure.pair")){let e=document.createElement("input");e.type="range",e.min="0",e.max="100",e.value="50",e.setAttribute("aria-label","edge between before and after, in percent of the width");let n=()=>t.style.setProperty("--edge",`${e.value}%`);e.addEventListener("input",n),t.classList.add("stacked"),t.append(e),n()}})();

@@ -1,0 +1,44 @@
+import { useState } from "preact/hooks";
+import type { FileResource } from "../client";
+import { Empty } from "../components";
+import { bytes, plural } from "../format";
+import { html, type Shown } from "../html";
+
+const MEANINGS: [RegExp, string][] = [
+  [/^report\.html$/, "the report, for people: opens without the internet"],
+  [/^report\.json$/, "findings, time and counts of every stage, uncertainty"],
+  [/^points\.copc\.laz$/, "the points for GIS programs, cloud-optimised"],
+  [/^points\.ply$/, "the points with colours, for any viewer"],
+  [/^poses\.json$/, "poses of units and images with sigmas"],
+  [/^poses\.tum$/, "poses of the vehicle"],
+  [/^trajectory\.gpkg$/, "positions as a GeoPackage"],
+  [/^calibration(\.json|\/)/, "every camera as given and as refined"],
+  [/^frame\.json$/, "the coordinate frame and its place on the earth"],
+  [/^view\.json$/, "trajectory and frusta for this console"],
+  [/^features\.db$/, "keypoints and matches as a COLMAP database"],
+  [/^model\//, "cameras, rig, images and points in COLMAP's format"],
+  [/^rigs?\//, "the calibration for Kalibr, ROS and URDF"],
+  [/^autoware\//, "the points for Autoware"],
+  [/^pictures\//, "a picture"],
+  [/^road\.json$/, "the surface of the road"],
+  [/^map\.json$/, "scenes, seams and verdicts"],
+  [/^manifest\.json$/, "the drive's manifest, in the engine's axes"],
+  [/^(scenes|seams)\//, "data for the map's next version"],
+];
+
+export function Files({ files }: { files: readonly FileResource[] }): Shown {
+  const [wanted, setWanted] = useState("");
+  const shown = files.filter((file) => file.path.toLowerCase().includes(wanted.toLowerCase()));
+  const total = files.reduce((sum, file) => sum + file.size_bytes, 0);
+  return html`<h2>Files</h2>
+    <p class="muted">${plural(files.length, "file")}, ${bytes(total)} together.</p>
+    <label class="filter">Find a file <input type="search" value=${wanted} onInput=${(event: Event) => setWanted((event.target as HTMLInputElement).value)} /></label>
+    ${shown.length === 0
+      ? html`<${Empty}>No file of this name.<//>`
+      : html`<div class="scroll" tabindex="0" role="region" aria-label="Files"><table>
+          <thead><tr><th scope="col">File</th><th scope="col" class="number">Size</th><th scope="col">Content</th></tr></thead>
+          <tbody>${shown.map(
+            (file) => html`<tr key=${file.path}><td><a href=${file.url.replace(/^\//, "")} download>${file.path}</a></td>
+              <td class="number">${bytes(file.size_bytes)}</td><td>${MEANINGS.find(([name]) => name.test(file.path))?.[1] ?? ""}</td></tr>`,
+          )}</tbody></table></div>`}`;
+}

@@ -1,0 +1,215 @@
+"""All pages, as somebody without the internet, a mouse or much width sees them."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from pathlib import Path
+
+import axe_playwright_python
+import pytest
+from playwright.sync_api import Page, expect
+
+from service.domain.keys import revoke_key
+from tests.console.conftest import Open, World, go, log_in, wait_for
+
+AXE = next(Path(axe_playwright_python.__file__).parent.rglob("axe.min.js"))
+
+
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 400)])
+def test_every_page_is_whole(open_console: Open, world: World, scheme: str, width: int) -> None:
+    """No request to another host, no error, nothing beyond the width, no serious finding of axe."""
+    watched = open_console(world.api.url, color_scheme=scheme, viewport={"width": width, "height": 800})
+    page = watched.new_page()
+    page.goto(world.api.url)
+    page.get_by_label("API key").wait_for()
+    findings = {"login": serious(page)}
+    log_in(page, world.api.url, world.client.key)
+    for name, address in world.pages.items():
+        go(page, world.api.url, address)
+        expect(page.locator("main h1")).not_to_be_empty()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+        assert page.locator(".box.bad[role=alert]").count() == (1 if name in ("failed job", "calibration") else 0), name
+        findings[name] = serious(page)
+    assert {name: found for name, found in findings.items() if found} == {}
+
+
+def serious(page: Page) -> list[str]:
+    page.evaluate(AXE.read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run({resultTypes: ['violations']})")["violations"]
+    return [
+        f"{one['id']}: {one['nodes'][0]['html'][:120]}" for one in found if one["impact"] in ("serious", "critical")
+    ]
+
+
+def test_the_key_is_kept_nowhere(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    kept = page.evaluate(
+        "JSON.stringify([document.cookie, {...localStorage}, {...sessionStorage}, location.href,"
+        " document.documentElement.outerHTML])"
+    )
+    assert world.client.key not in kept
+    assert json.loads(kept)[0] == ""
+    assert world.client.key[:20] not in page.evaluate(
+        "Array.from(document.querySelectorAll('input'), i => i.value).join()"
+    )
+    (cookie,) = page.context.cookies()
+    assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
+
+
+def test_a_form_of_another_host_changes_nothing(open_console: Open, world: World) -> None:
+    watched = open_console(world.api.url)
+    watched.expected = ("Failed to load resource",)
+    page = watched.new_page()
+    log_in(page, world.api.url, world.client.key)
+    before = len(world.client.get("/v1/jobs?limit=200").json()["items"])
+    other = world.api.url.replace("127.0.0.1", "localhost")
+    watched.url = "http://"  # this test's other site is another name of this machine
+    page.goto(f"{other}/livez")
+    target = f"{world.api.url}/v1/jobs/{world.failed_job}:retry"
+    page.set_content(f'<form method="post" action="{target}"><button>Win</button></form>')
+    with page.expect_navigation():
+        page.get_by_role("button").click()
+    assert "unauthorized" in page.content()
+    assert len(world.client.get("/v1/jobs?limit=200").json()["items"]) == before
+
+
+def test_by_keyboard_alone_from_login_to_download(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    page.goto(world.api.url)
+    page.get_by_label("API key").wait_for()
+    page.keyboard.type(world.client.key)  # the field has the focus
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Drives").wait_for()
+    tab_to(page, "Scenes")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Scenes").wait_for()
+    tab_to(page, "example")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="example", exact=True).wait_for()
+    tab_to(page, "Files")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Files").wait_for()
+    tab_to(page, "points.ply")
+    with page.expect_download() as download:
+        page.keyboard.press("Enter")
+    assert Path(download.value.path()).read_bytes() == (world.folder / "points.ply").read_bytes()
+
+
+def tab_to(page: Page, text: str) -> None:
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        focus = page.evaluate(
+            "[document.activeElement.textContent, getComputedStyle(document.activeElement).outlineStyle]"
+        )
+        if focus[0] == text:
+            assert focus[1] != "none", "the focus is seen"
+            return
+    raise AssertionError(f"{text} is not reached")
+
+
+def test_a_revoked_key_ends_the_page_in_time(open_console: Open, world: World) -> None:
+    watched = open_console(world.api.url)
+    watched.expected = ("401",)
+    page = watched.new_page()
+    project_id, key = world.api.new_key()
+    log_in(page, world.api.url, key)
+    page.locator("[data-connection=live]").wait_for()
+    key_id = world.api.client_of(project_id, key).get("/v1/session").json()["key_id"]
+    with world.api.database.write() as session:
+        revoke_key(session, key_id)
+    revoked_s = time.monotonic()
+    page.get_by_label("API key").wait_for()
+    assert time.monotonic() - revoked_s < 5.0
+
+
+def test_calibration_shows_what_the_file_says(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, world.pages["calibration"])
+    page.locator("[data-corrections=rotation]").wait_for()
+    document = json.loads((world.folder / "calibration.json").read_text())
+    for name, camera in document["cameras"].items():
+        for kind, field, of_sigma in (
+            ("rotation", "rotation_vector_deg", "rotation_deg"),
+            ("translation", "translation_m", "translation_m"),
+        ):
+            row = page.locator(f"[data-corrections={kind}] tr[data-camera={name}]")
+            assert row.get_attribute("data-wrong") == str(camera["wrong"]).lower()
+            for axis, value, sigma in zip(
+                "xyz", camera["difference"][field], camera["sigma"].get(of_sigma, [None] * 3), strict=True
+            ):
+                shown = row.locator(f"[data-axis={axis}]")
+                assert float(shown.get_attribute("data-value") or "nan") == value
+                first, *more = shown.inner_text().split(" ± ")
+                if sigma is not None:
+                    assert float(shown.get_attribute("data-sigma") or "nan") == sigma
+                    decimals = len(more[0].partition(".")[2])
+                    assert len(re.sub(r"^[0.]+", "", more[0].replace(".", ""))) >= 3
+                    assert (first, more[0]) == (f"{value:.{decimals}f}", f"{sigma:.{decimals}f}")
+                else:
+                    assert float(first) == pytest.approx(value, rel=6e-3)
+        for param, given in zip(camera["param_names"], camera["refined"]["params"], strict=True):
+            cell = page.locator(f"[data-intrinsics] tr[data-camera={name}][data-param={param}] td[data-value]").last
+            assert float(cell.get_attribute("data-value") or "nan") == given
+
+
+def test_versions_are_compared_and_rolled_back(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, world.pages["versions"])
+    expect(page.get_by_text("Scenes added: third")).to_be_visible()
+    page.get_by_role("button", name="Make it current").click()
+    page.get_by_role("button", name="Yes").click()
+    page.locator("tbody tr:nth-child(2) .badge", has_text="current").wait_for()
+    assert world.client.get(f"/v1/maps/{world.map_id}").json()["current_version"] == 1
+    world.client.put(f"/v1/maps/{world.map_id}/current-version", json={"version": 2})
+
+
+def test_a_seam_shows_its_pictures_and_a_missing_one_its_reason(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, world.pages["seams"])
+    pictures = page.locator(".slider img")
+    assert pictures.count() == 2
+    for index in range(2):
+        pictures.nth(index).scroll_into_view_if_needed()
+    wait_for(page, "Array.from(document.querySelectorAll('.slider img')).every(i => i.naturalWidth === 300)")
+    expect(page.get_by_text("two hypotheses have a similar number of inliers")).to_be_visible()
+    expect(page.locator("[data-exact='0.7316933881054083']")).to_have_text("0.732 px")
+    slider = page.get_by_role("slider")
+    slider.focus()
+    page.keyboard.press("End")
+    assert "100%" in page.locator(".stack img + img").evaluate("e => e.style.clipPath")
+
+
+def test_first_page_is_small(world: World) -> None:
+    import gzip
+
+    page = world.client.get("/")
+    names = set(re.findall(r'(?:src|href)="(console/files/[^"]+)"', page.text))
+    script = world.client.get("/console/files/console.js").text
+    names |= {f"console/files/{name}" for name in re.findall(r'from"\./([^"]+)"', script)} | {"console/files/events.js"}
+    assert len(names) >= 5
+    sizes = [len(gzip.compress(world.client.get(f"/{name}").content)) for name in names]
+    assert 10_000 < sum(sizes) + len(gzip.compress(page.content)) <= 80_000
+
+
+def test_a_tile_url_adds_its_origin_and_no_other(tmp_path: Path) -> None:
+    from service.api.routes.console import console_policy
+    from tests.helpers.live_api import settings_of
+
+    settings = settings_of(tmp_path, console_tiles="https://tiles.example:8443/a/{z}/{x}/{y}.png")
+    assert settings.tile_origin == "https://tiles.example:8443"
+    own, more = (set(console_policy(origin).replace(";", " ").split()) for origin in (None, settings.tile_origin))
+    assert more - own == {"https://tiles.example:8443"}
+    for wrong in (
+        "ftp://a/{z}/{x}/{y}",
+        "https://a/{z}/{x}",
+        "https://a b/{z}/{x}/{y}",
+        "https://a;script-src/{z}/{x}/{y}",
+    ):
+        with pytest.raises(ValueError, match="console_tiles"):
+            settings_of(tmp_path, console_tiles=wrong)

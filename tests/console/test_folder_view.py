@@ -1,0 +1,85 @@
+"""`mrasfm view`: the console over a folder, to read and for this machine only."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import expect
+
+from service.api.folder_view import FolderViewError, create_view
+from tests.console.conftest import Open, World, example_drive, wait_for
+from tests.helpers.live_api import REPOSITORY
+
+VIEW = "import sys; from mrasfm_engine.cli import main; sys.exit(main())"
+
+
+@contextmanager
+def viewing(*arguments: str | Path) -> Iterator[str]:
+    """The address that the command prints; Ctrl-C ends it well."""
+    command = [sys.executable, "-P", "-c", VIEW, "view", *map(str, arguments), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert process.stdout is not None
+        found = re.search(r"http://\S+", process.stdout.readline())
+        assert found is not None
+        yield found[0].rstrip(";")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    drive, folder = example_drive("example"), tmp_path_factory.mktemp("drive")
+    for path, data in {**drive.files, "drive.json": drive.raw, "secret.txt": b"secret"}.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(data)
+    return folder
+
+
+def test_a_scene_is_shown_with_its_images(open_console: Open, world: World, drive_folder: Path) -> None:
+    with viewing(world.folder, "--drive", drive_folder) as address:
+        host = address.partition("#")[0]
+        watched = open_console(host.rstrip("/"))
+        page = watched.new_page()
+        page.goto(address)
+        page.locator("[data-idle=true]").wait_for()
+        assert int(page.locator(".figures").get_attribute("data-shown") or 0) == 50
+        page.get_by_text("Choose an image without the mouse").click()
+        page.get_by_role("button", name="Show", exact=True).click()
+        wait_for(page, "document.querySelector('.photo img')?.naturalWidth === 960")
+        for tab in ("Overview", "Calibration", "Files"):
+            page.get_by_label("Parts of this page").get_by_role("link", name=tab).click()
+            page.get_by_role("heading", level=2).first.wait_for()
+        expect(page.get_by_role("button", name="Delete")).to_have_count(0)
+        expect(page.get_by_role("button", name="Log out")).to_have_count(0)
+        refused = httpx.get(f"{host}v1/scenes", headers={"Host": "evil.example"})
+        assert refused.status_code == 400, "another site's name leads nowhere"
+        for path in (
+            "drives/drive-0/files/secret.txt",
+            "drives/drive-0/files/../secret.txt",
+            "scenes/local/files/../../x",
+        ):
+            assert httpx.get(f"{host}v1/{path}").status_code == 404
+        part = httpx.get(f"{host}v1/scenes/local/files/points.ply", headers={"Range": "bytes=0-2"})
+        assert (part.status_code, part.content) == (206, b"ply")
+
+
+def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FolderViewError, match=r"has no report\.json: give the folder of a complete scene or map"):
+        create_view(tmp_path)
+    (tmp_path / "report.json").write_text("[")
+    with pytest.raises(FolderViewError, match=r"report\.json cannot be read"):
+        create_view(tmp_path)

@@ -1,0 +1,150 @@
+"""The stream of a project: all its jobs, each as it is, and the end with the key."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+import pytest
+
+from service.database.tables import Job, JobEvent, now_us
+from service.domain.keys import revoke_key
+from tests.helpers.live_api import Api, Client
+from tests.helpers.tiny_drive import tiny_drive
+
+Event = tuple[str, str, Any]  # its name, its id, its data
+
+
+@contextmanager
+def stream(client: httpx.Client, **headers: str) -> Iterator[Iterator[Event]]:
+    with client.stream("GET", "/v1/events", headers=headers) as answer:
+        assert answer.status_code == 200, answer.read()
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        yield _events(answer)
+
+
+def _events(answer: httpx.Response) -> Iterator[Event]:
+    fields: dict[str, str] = {}
+    for line in answer.iter_lines():
+        if line and not line.startswith(":"):
+            name, _, value = line.partition(": ")
+            fields[name] = value
+        elif not line and fields:
+            yield fields["event"], fields.get("id", ""), json.loads(fields.get("data", "null"))
+            fields = {}
+
+
+def test_changes_of_every_job_come_as_the_jobs_are_shown(api: Api, client: Client) -> None:
+    with stream(client) as events:
+        assert next(events)[0] == "ready"
+        job = client.reconstruct(client.frozen(tiny_drive("a", seed="a")))
+        name, first_id, data = next(events)
+        while data["id"] != job["id"]:  # the check of the drive's images
+            name, first_id, data = next(events)
+        assert (name, data["state"]) == ("job", "QUEUED")
+        client.claim(job["id"])
+        name, second_id, data = next(events)
+        assert (data["id"], data["state"]) == (job["id"], "RUNNING")
+        assert data == client.get(f"/v1/jobs/{job['id']}").json()
+        assert int(second_id) > int(first_id)
+    with stream(client, **{"Last-Event-ID": first_id}) as again:
+        assert next(again)[0] == "ready"
+        name, again_id, data = next(again)
+        assert (data["id"], data["state"], again_id) == (job["id"], "RUNNING", second_id)
+
+
+def test_foreign_jobs_do_not_come(api: Api, client: Client) -> None:
+    other = api.client()
+    with stream(client) as events:
+        next(events)
+        theirs = other.reconstruct(other.frozen(tiny_drive("b", seed="b")))
+        mine = client.reconstruct(client.frozen(tiny_drive("c", seed="c")))
+        seen = set()
+        while mine["id"] not in seen:
+            seen.add(next(events)[2]["id"])
+        assert theirs["id"] not in seen
+
+
+def test_what_is_new_of_a_child_is_new_of_its_tree(api: Api, client: Client) -> None:
+    drives = [client.frozen(tiny_drive(f"tree-{i}", seed=f"tree-{i}")) for i in range(2)]
+    tree = client.aggregate(drives=drives)
+    child = tree["members"][0]["job_id"]
+    with stream(client) as events:
+        next(events)
+        client.claim(child)
+        changed: dict[str, Any] = {}
+        while not {child, tree["id"]} <= changed.keys():
+            data = next(events)[2]
+            changed[data["id"]] = data
+    states = {member["job_id"]: member["state"] for member in changed[tree["id"]]["members"]}
+    assert states[child] == "RUNNING"
+
+
+def test_an_event_of_a_transaction_that_ended_late_is_not_missed(api: Api, client: Client) -> None:
+    """Ids are given before a transaction ends: a smaller one may appear after a greater one."""
+    early, late = (client.reconstruct(client.frozen(tiny_drive(n, seed=n)))["id"] for n in ("early", "late"))
+    with api.database.write() as session:
+        newest = max(session.query(JobEvent.id).all())[0]
+        session.add(JobEvent(id=newest + 10, job_id=early, kind="state", data={}))
+    with stream(client, **{"Last-Event-ID": str(newest)}) as events:
+        next(events)
+        assert next(events)[2]["id"] == early
+        with api.database.write() as session:
+            session.add(JobEvent(id=newest + 5, job_id=late, kind="state", data={}))
+        assert next(events)[2]["id"] == late
+
+
+def test_a_job_that_stalls_is_told_although_nobody_writes_it(api: Api, client: Client) -> None:
+    job = client.reconstruct(client.frozen(tiny_drive("stalls", seed="stalls")))
+    client.claim(job["id"])
+    with stream(client) as events:
+        next(events)
+        with api.database.write() as session:
+            session.get_one(Job, job["id"]).heartbeat_us = now_us() - 3600 * 1_000_000
+        assert next(events)[2]["state"] == "STALLED"
+
+
+def test_a_revoked_key_ends_the_stream_in_time(api: Api, client: Client) -> None:
+    key_id = client.get("/v1/session").json()["key_id"]
+    client.post("/v1/session")
+    browser = api.anonymous()
+    browser.cookies.update(client.cookies)
+    client.cookies.clear()
+    with stream(browser) as events:
+        assert next(events)[0] == "ready"
+        with api.database.write() as session:
+            revoke_key(session, key_id)
+        revoked_s = time.monotonic()
+        name, _, data = next(events)
+        assert name == "end"
+        assert "ended" in data["reason"]
+        assert time.monotonic() - revoked_s < 5.0
+        with pytest.raises(StopIteration):
+            next(events)
+    assert browser.get("/v1/events").status_code == 401
+
+
+def test_polling_a_list_that_has_not_changed_costs_no_body(api: Api, client: Client) -> None:
+    job = client.reconstruct(client.frozen(tiny_drive("poll", seed="poll")))
+    answer = client.get("/v1/jobs")
+    unchanged = client.get("/v1/jobs", headers={"If-None-Match": answer.headers["etag"]})
+    assert (unchanged.status_code, unchanged.content) == (304, b"")
+    client.claim(job["id"])
+    assert client.get("/v1/jobs", headers={"If-None-Match": answer.headers["etag"]}).status_code == 200
+
+
+def test_a_drives_image_is_downloaded_with_the_cookie(api: Api, client: Client) -> None:
+    drive = tiny_drive("images", seed="images")
+    drive_id = client.filled(drive)
+    path, data = next(iter(drive.files.items()))
+    answer = client.get(f"/v1/drives/{drive_id}/files/{path}")
+    assert (answer.status_code, answer.content) == (200, data)
+    assert answer.headers["content-type"] == "image/png"
+    part = client.get(f"/v1/drives/{drive_id}/files/{path}", headers={"Range": "bytes=0-3"})
+    assert (part.status_code, part.content) == (206, data[:4])
+    assert client.get(f"/v1/drives/{drive_id}/files/none.png").status_code == 404
+    assert api.client().get(f"/v1/drives/{drive_id}/files/{path}").status_code == 404

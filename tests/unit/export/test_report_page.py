@@ -1,0 +1,195 @@
+"""`report.html`: one file that loads nothing, with the exact numbers, and withheld where it cannot be made."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mrasfm_engine.export.picture_files import png_of
+from mrasfm_engine.export.report_page._figures import camera_residuals, gnss_residuals
+from mrasfm_engine.export.report_page._html import preview
+from mrasfm_engine.export.report_page._maps import map_page
+from mrasfm_engine.export.report_page._read_back import MOST_BYTES, faults_of
+from mrasfm_engine.export.scene import write_scene
+from schemas.artifacts import REPORT_PAGE
+from tests.helpers.export_example import make_scene
+
+REPORT = {
+    "engine_version": "1.2.3",
+    "drive": "ring <road>",
+    "findings": [{"severity": "warning", "code": "gnss-jump", "what": "GNSS jumps & returns", "remedy": "Nothing."}],
+    "stages": [
+        {"stage": "matches", "seconds": 1.25, "reused": True, "rejected_pairs": {"few matches": 3}},
+        {"stage": "mapping", "seconds": 2.5, "images_occluded": ["left/001.png"]},
+        {"stage": "refinement", "seconds": 4.0, "scale": {"sigma_relative": 0.0123, "from": "the rig"}},
+    ],
+}
+
+
+def pictures() -> dict[str, bytes]:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (300, 2000, 3), dtype=np.uint8)
+    return {"birds_eye_before.png": png_of(noise), "birds_eye_after.png": png_of(noise[::-1])}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report") / "scene"
+    write_scene(make_scene(), out, REPORT, pictures())
+    return out
+
+
+@pytest.fixture(scope="module")
+def page(written: Path) -> str:
+    return (written / REPORT_PAGE).read_text()
+
+
+class Tags(HTMLParser):
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+def test_it_loads_nothing_and_is_small(written: Path, page: str) -> None:
+    targets = [v for _, attrs in Tags(page).found for k, v in attrs.items() if k in ("src", "href")]
+    assert len(targets) >= 3
+    assert all(target is not None and target.startswith("data:") for target in targets)
+    assert "url(" not in page
+    assert (written / REPORT_PAGE).stat().st_size < MOST_BYTES
+
+
+def test_text_from_outside_is_escaped(page: str) -> None:
+    assert "ring &lt;road&gt;" in page
+    assert "ring <road>" not in page
+    assert "jumps &amp; returns" in page
+
+
+def test_every_correction_is_there_exactly_and_rounded_as_its_sigma(written: Path, page: str) -> None:
+    calibration = json.loads((written / "calibration.json").read_text())
+    with_sigma = 0
+    for camera in calibration["cameras"].values():
+        for field, of_sigma in (("rotation_vector_deg", "rotation_deg"), ("translation_m", "translation_m")):
+            sigmas = camera["sigma"].get(of_sigma)
+            for value, sigma in zip(camera["difference"][field], sigmas or [None] * 3, strict=True):
+                exact = f'data-value="{value!r}"' + ("" if sigma is None else f' data-sigma="{sigma!r}"')
+                assert exact in page
+                if sigma is not None:
+                    found = re.search(re.escape(exact) + r">([^<]+) <small>± ([^<]+)", page)
+                    assert found is not None
+                    decimals = len(found[2].partition(".")[2])
+                    assert len(found[2].replace(".", "").lstrip("0")) >= 3
+                    assert (found[1], found[2]) == (f"{value:.{decimals}f}", f"{sigma:.{decimals}f}")
+                    with_sigma += 1
+    assert with_sigma >= 6
+
+
+def test_what_was_rejected_is_named_with_its_reason(page: str) -> None:
+    for words in (
+        "few matches",
+        "left/001.png",
+        "images that something covers",
+        "units without a pose",
+        "1.25",
+        "(reused)",
+    ):
+        assert words in page
+    assert 'data-value="1.23"' in page  # the scale's sigma in per cent
+
+
+def test_a_wrong_camera_is_flagged_and_no_other(tmp_path: Path) -> None:
+    scene = make_scene()
+    scene.calibration[1].__dict__["is_wrong"] = True
+    write_scene(scene, tmp_path / "scene", REPORT)
+    rows = [a for t, a in Tags((tmp_path / "scene" / REPORT_PAGE).read_text()).found if t == "tr" and "data-wrong" in a]
+    assert len(rows) == 4
+    assert {(row["data-camera"], row["data-wrong"]) for row in rows} == {("left", "false"), ("right", "true")}
+    assert {row["data-camera"] for row in rows if row.get("class") == "wrong"} == {"right"}
+
+
+def test_residuals_are_those_of_the_scene() -> None:
+    scene = make_scene()
+    scene.point_error_px[:] = 0.0  # points are projected exactly
+    found = camera_residuals(scene)
+    assert found is not None
+    assert [camera.name for camera in found] == ["left", "right"]
+    assert sum(camera.observations for camera in found) == len(scene.observation_point)
+    assert all(0 <= camera.rms_px < 1e-4 for camera in found)
+    for features in scene.features:
+        features.xy_px[:, 0] += 0.5
+    scene.point_error_px[:] = 0.5
+    shifted = camera_residuals(scene)
+    assert shifted is not None
+    assert [round(camera.rms_px, 3) for camera in shifted] == [0.5, 0.5]
+    scene.point_error_px[:] = 3.0
+    assert camera_residuals(scene) is None, "the scene says something else: poses by row, for example"
+
+
+def test_without_gnss_there_is_no_chart_of_it(page: str) -> None:
+    assert gnss_residuals(make_scene()) is None
+    assert "GNSS residuals" not in page
+
+
+def test_previews_are_bounded(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    cv2.imwrite(str(tmp_path / "a.png"), rng.integers(0, 256, (3000, 5000, 3), dtype=np.uint8))
+    found = preview(tmp_path / "a.png")
+    assert found is not None
+    assert 10_000 < len(found) < 1_000_000
+    assert preview(tmp_path / "none.png") is None
+
+
+def test_a_page_that_says_something_else_is_noticed(written: Path, tmp_path: Path, page: str) -> None:
+    calibration = json.loads((written / "calibration.json").read_text())
+    assert list(faults_of(written / REPORT_PAGE, calibration)) == []
+    calibration["cameras"]["left"]["difference"]["rotation_vector_deg"][1] += 1e-9
+    assert list(faults_of(written / REPORT_PAGE, calibration)) == ["the rotation of left about y is another"]
+    other = tmp_path / "other.html"
+    other.write_text(page.replace("</main>", '<img src="https://example.org/a.png"></main>'))
+    assert list(faults_of(other)) == ["it would load something"]
+
+
+def test_what_cannot_be_made_is_withheld(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> str:
+        raise ValueError("no page")
+
+    monkeypatch.setattr("mrasfm_engine.export.report_page._scenes.page", fail)
+    write_scene(make_scene(), tmp_path / "scene", REPORT)
+    assert not (tmp_path / "scene" / REPORT_PAGE).exists()
+    notes = json.loads((tmp_path / "scene" / "report.json").read_text())["summary"]["notes"]
+    assert "report.html is withheld: it cannot be written: ValueError: no page" in notes
+
+
+def test_a_map_names_its_seams(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for name, data in pictures().items():
+        (folder / name).write_bytes(data)
+    seam = {"a": "one", "b": "two", "accepted": True, "inliers": 12, "residual_after_px": 0.7316933881054083}
+    document = {
+        "scenes": [
+            {"name": name, "verdict": "connected", "registered_units": 2, "total_units": 2, "points": 5}
+            for name in ("one", "two")
+        ],
+        "seams": [
+            seam | {"pictures": {"before": "pictures/birds_eye_before.png", "after": "pictures/birds_eye_after.png"}},
+            {"a": "one", "b": "three", "accepted": False, "reason": "two hypotheses"},
+        ],
+        "unconnected": [], "left_out": [], "loops": [],
+    }  # fmt: skip
+    summary = {"registered_images": 4, "total_images": 4, "georeferenced": True}
+    found = map_page(document, tmp_path, REPORT | {"summary": summary})
+    assert "Seam of one and two" in found
+    assert 'data-value="0.7316933881054083">0.732</span> px' in found
+    assert found.count("data:image/jpeg;base64,") == 2
+    assert "rejected: two hypotheses" in found
