@@ -18,8 +18,8 @@ _shtab_mrasfm_commands() {
     demo:'Render two drives of one street, send them to a service of their own, get scenes and a map, compare with the truth.'
     describe:'Print the drive manifest'"'"'s format as Markdown (manifest) or as JSON Schema (schema), the engine'"'"'s settings with their defaults as a TOML file for --config (settings), or the environment variables of the service (service).'
     evaluate:'Compare the trajectory of a scene or a map with true poses: errors before and after alignment, and the errors of a map'"'"'s seams.'
-    export:'Write a scene or map in formats of other programs. Every file is read back before it is put in place. Formats: colmap: COLMAP workspace with undistorted pinhole images and masks, for 3DGS, nerfstudio and MVS; nerfstudio: transforms.json with undistorted pinhole images, masks and points, for nerfstudio; copc: points as a cloud-optimised point cloud in a coordinate reference system of your choice; kitti: poses, times and calibration as KITTI odometry has them; geojson: path and positions of units and cameras as GeoJSON.'
-    import:'Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of KITTI odometry, a drive of KITTI raw, nuScenes, or PandaSet.'
+    export:'Write a scene or map in formats of other programs. Every file is read back before it is put in place. Formats: colmap: COLMAP workspace with undistorted pinhole images and masks, for 3DGS, nerfstudio and MVS; nerfstudio: transforms.json with undistorted pinhole images, masks and points, for nerfstudio; nuscenes: tables of nuScenes with pinhole images as keyframes, for its development kit and converters; mcap: one MCAP file with Foxglove'"'"'s schemas, for Foxglove, Lichtblick and rerun; copc: points as a cloud-optimised point cloud in a coordinate reference system of your choice; kitti: poses, times and calibration as KITTI odometry has them; geojson: path and positions of units and cameras as GeoJSON.'
+    import:'Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, Waymo (version 2), COLMAP'"'"'s rig_config.json, or a ROS bag (ROS 1, or ROS 2 in MCAP or SQLite).'
     keys:'Create, list and revoke API keys.'
     map:'Send drives to a service, reconstruct those without a scene there, and download one map of all.'
     migrate:'Migrate the service'"'"'s database to this version. Settings are environment variables, see mrasfm describe service.'
@@ -32,6 +32,7 @@ _shtab_mrasfm_commands() {
     standalone:'Run API, broker, workers and reconciler on this machine, with all state in one folder. Settings are environment variables, see mrasfm describe service.'
     synth:'Render drives of a synthetic world.'
     upload:'Send a drive to a service and reconstruct it; --wait waits for the scene, --out downloads it.'
+    view:'Serve the web console over the folder of a scene or map, for this machine only, until Ctrl-C.'
     worker:'Run a worker of the service. Settings are environment variables, see mrasfm describe service.'
   )
   _describe 'mrasfm commands' _commands
@@ -115,10 +116,13 @@ _shtab_mrasfm_bench_options=(
   "--simulate[long paths without images\: stereo or surround]:RIG:"
   "--units[number of units of each path, one per metre (default\: 100)]:N[,N]:"
   "--seed[everything random about the paths follows from it (default\: 0)]:seed:"
+  "--descriptors[begin each path with descriptors on disk, and match them\; else with matches]"
   "--kitti[KITTI odometry\: sequences\/ and poses\/]:FOLDER:"
   "--sequences[as 00-10 or 00,05 (default\: all that have true poses)]:LIST:"
   "--nuscenes[nuScenes\: v1.0-\*\/ and samples\/]:FOLDER:"
   "--scenes[names of scenes, separated by commas (default\: all)]:LIST:"
+  "--sweeps[all images of nuScenes, at 12 Hz, not the keyframes alone]"
+  "--no-rough-poses[of nuScenes nothing but images\; else the true poses with noise of 0.5 m and 2 deg are rough poses]"
   "--frames[slice of the frames of every sequence or scene]:START:STOP:STEP:"
   "--baselines[baseline mappers, separated by commas\: colmap-incremental, colmap-global, and both with -fixed, which hold the calibration]:LIST:"
   "--repeat[mappings\; the one of median time counts]:N:"
@@ -170,7 +174,7 @@ _shtab_mrasfm_evaluate_defaults_added=0
 
 _shtab_mrasfm_export_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "*--format[format, may be repeated\: colmap, nerfstudio, copc, kitti, geojson]:FORMAT:(colmap nerfstudio copc kitti geojson)"
+  "*--format[format, may be repeated\: colmap, nerfstudio, nuscenes, mcap, copc, kitti, geojson]:FORMAT:(colmap nerfstudio nuscenes mcap copc kitti geojson)"
   "--out[folder for the export]:OUT:"
   "*--drive[folder of the drive, for formats with images\; of a map NAME\=DRIVE for each scene]:DRIVE:"
   "--image-size[scale images down to this longest side\; by default they are not]:PX:"
@@ -186,15 +190,26 @@ _shtab_mrasfm_import_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--out[folder of the drive]:DRIVE:"
   "--frames[slice of the frames, STOP not included\; where START is negative, write --frames\=-10\:]:START:STOP:STEP:"
-  "--gnss[GNSS table, in FOLDER or the working directory]:FILE:"
+  "--gnss[GNSS table, in RECORDING or the working directory]:FILE:"
+  "--cameras[cameras that are wanted (default\: all)]:NAME,...:"
   "--scene[name of the scene, if the recording holds several]:NAME:"
   "--vehicle[which vehicle drove, where the recording does not say or is wrong]:NAME:"
   "--truth[write truth.tum also where the true poses and the GNSS come from one system (KITTI raw)]"
+  "--rough-noise[the recording\'s poses (nuScenes, Argoverse 2, ...) with this noise become rough poses\: a trial of drives without GNSS]:METRES,DEGREES:"
+  "--sweeps[of nuScenes all images, at 12 Hz, not the keyframes alone]"
+  "--antenna[of a bag or a COLMAP rig\: the receiver\'s antenna in the rig frame, metres forward, left and up\; with a minus\: --antenna\=-1,0,2]:X,Y,Z:"
+  "--gnss-sigma[of a bag or a COLMAP rig\: standard deviation of horizontal positions, where the receiver states none\; heights have twice that]:METRES:"
+  "--forward-camera[camera that looks level and straight ahead (default\: the reference camera)]:NAME:"
+  "--rate-hz[frames a second, where EXIF has no times]:HZ:"
+  "--topics[topics of images and of the receiver\; by default all, where each camera has one]:TOPIC,...:"
+  "--rig-frame[the vehicle\'s frame in tf, by default base_link]:FRAME:"
+  "--world-frame[frame of tf, as odom or map\: the vehicle\'s poses in it are rough poses]:FRAME:"
+  "--calibration[Kalibr\'s camchain.yaml instead of CameraInfo, or a rig.json instead of CameraInfo and tf]:FILE:"
   "--link[hard-link images where possible (the default)]"
   "--copy[copy images]"
   "--force[replace a drive that is already at DRIVE]"
   "--json[print one JSON object instead of a summary]"
-  ":the recording:"
+  ":the recording\: a folder, or a bag\'s file:"
 )
 
 # guard to ensure default positional specs are added only once per session
@@ -446,6 +461,17 @@ _shtab_mrasfm_upload_options=(
 # guard to ensure default positional specs are added only once per session
 _shtab_mrasfm_upload_defaults_added=0
 
+_shtab_mrasfm_view_options=(
+  "(- : *)"{-h,--help}"[show this help message and exit]"
+  "*--drive[folder with drive.json, whose images are shown\; may be repeated]:DRIVE:"
+  "--port[port to listen on (default\: a free one)]:port:"
+  "--no-browser[print the address only]"
+  ":folder with report.json:"
+)
+
+# guard to ensure default positional specs are added only once per session
+_shtab_mrasfm_view_defaults_added=0
+
 _shtab_mrasfm_worker_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--queues[checks (of drives, and exports), reconstructions, or both separated by a comma (default\: both)]:queues:"
@@ -497,6 +523,7 @@ _shtab_mrasfm() {
         standalone) _arguments -C -s $_shtab_mrasfm_standalone_options ;;
         synth) _arguments -C -s $_shtab_mrasfm_synth_options ;;
         upload) _arguments -C -s $_shtab_mrasfm_upload_options ;;
+        view) _arguments -C -s $_shtab_mrasfm_view_options ;;
         worker) _arguments -C -s $_shtab_mrasfm_worker_options ;;
       esac
   esac

@@ -117,8 +117,7 @@ def offset_of(scene: Scene) -> Floats:
 
 
 def in_reference_system(scene: Scene, points_m: Floats) -> Floats:
-    """Local points (n, 3) in the coordinate reference system of the scene's own file: UTM and ellipsoidal height, or the
-    local frame."""
+    """Local points (n, 3) in the reference system of the scene's own file: UTM and ellipsoidal height, or local."""
     return _projected(scene, points_m, _system_of(scene))
 
 

@@ -202,8 +202,10 @@ def hidden_by_car(
     rig_from_plan: Any, own_car: Any, x: float, y: float, z: float, dx: float, dy: float, above: float
 ) -> bool:
     """Return whether a place, or what is over it on the line of sight, lies in the car's rectangle."""
-    return inside_car(rig_from_plan, own_car, x, y, z) or inside_car(
-        rig_from_plan, own_car, x - OWN_CAR_LEVEL * dx, y - OWN_CAR_LEVEL * dy, z + OWN_CAR_LEVEL * above
+    over = OWN_CAR_LEVEL
+    return bool(
+        inside_car(rig_from_plan, own_car, x, y, z)
+        or inside_car(rig_from_plan, own_car, x - over * dx, y - over * dy, z + over * above)
     )
 
 
