@@ -30,7 +30,7 @@ def test_accuracy(surround_drive: Path, surround_scene: Path, mrasfm: Run) -> No
 
 def test_every_file_is_there_and_readable(surround_scene: Path) -> None:
     expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration.json", "frame.json", "features.db"}
-    expected |= {"points.copc.laz", "trajectory.gpkg", "rig", "autoware"}
+    expected |= {"points.copc.laz", "trajectory.gpkg", "rig", "autoware", "view.json", "report.html"}
     expected |= {"manifest.json", "road.json", "pictures"}  # the drive has masks, and its cameras see the road
     assert {path.name for path in surround_scene.iterdir()} == {*expected, "report.json", ".stages"}
     assert leftovers(surround_scene.parent) == []

@@ -44,6 +44,22 @@ export interface components {
             stored: string[];
             to_send: string[];
         };
+        DeliveryResource: {
+            id: string;
+            webhook_id: string;
+            event: components["schemas"]["WebhookEvent"];
+            job_id: string;
+            state: components["schemas"]["DeliveryState"];
+            attempts: number;
+            next_attempt_at?: string | null;
+            status?: number | null;
+            error?: string | null;
+            /** Format: date-time */
+            created_at: string;
+            delivered_at?: string | null;
+        };
+        /** @enum {string} */
+        DeliveryState: "PENDING" | "DELIVERED" | "FAILED";
         DiskStatus: {
             free_bytes: number;
             total_bytes: number;
@@ -88,6 +104,42 @@ export interface components {
         };
         /** @enum {string} */
         DriveState: "OPEN" | "COMMITTED";
+        ExportFileResource: {
+            path: string;
+            size_bytes: number;
+            sha256: string;
+            media_type: string;
+            url: string;
+        };
+        ExportRequest: {
+            formats: ("colmap" | "nerfstudio" | "nuscenes" | "mcap" | "copc" | "kitti" | "geojson")[];
+            image_size_px?: number | null;
+            crs?: string | null;
+        };
+        ExportResource: {
+            /** Format: date-time */
+            created_at: string;
+            expires_at?: string | null;
+            id: string;
+            scene_id?: string | null;
+            map_id?: string | null;
+            map_version?: number | null;
+            formats: string[];
+            image_size_px?: number | null;
+            crs?: string | null;
+            job_id: string;
+            state: components["schemas"]["JobState"];
+            problem?: components["schemas"]["Problem"] | null;
+            results: components["schemas"]["ExportResult"][];
+            files: components["schemas"]["ExportFileResource"][];
+        };
+        ExportResult: {
+            format: string;
+            files: number;
+            size_bytes: number;
+            withheld?: string | null;
+            notes?: string[];
+        };
         FailedDrive: {
             name: string;
             drive_id: string;
@@ -145,7 +197,7 @@ export interface components {
             problem?: components["schemas"]["Problem"] | null;
         };
         /** @enum {string} */
-        JobKind: "PREFLIGHT" | "RECONSTRUCTION" | "AGGREGATION" | "SUBMAP";
+        JobKind: "PREFLIGHT" | "RECONSTRUCTION" | "AGGREGATION" | "SUBMAP" | "EXPORT";
         JobMember: {
             name: string;
             drive_id: string;
@@ -184,6 +236,7 @@ export interface components {
             scene_id?: string | null;
             map_id?: string | null;
             map_version?: number | null;
+            export_id?: string | null;
             members?: components["schemas"]["JobMember"][];
             parent_id?: string | null;
             submap?: number | null;
@@ -258,12 +311,20 @@ export interface components {
             /** Format: date-time */
             created_at: string;
         };
+        Page_DeliveryResource_: {
+            items: components["schemas"]["DeliveryResource"][];
+            next?: string | null;
+        };
         Page_DriveFileResource_: {
             items: components["schemas"]["DriveFileResource"][];
             next?: string | null;
         };
         Page_DriveResource_: {
             items: components["schemas"]["DriveResource"][];
+            next?: string | null;
+        };
+        Page_ExportResource_: {
+            items: components["schemas"]["ExportResource"][];
             next?: string | null;
         };
         Page_JobResource_: {
@@ -280,6 +341,10 @@ export interface components {
         };
         Page_SceneResource_: {
             items: components["schemas"]["SceneResource"][];
+            next?: string | null;
+        };
+        Page_WebhookResource_: {
+            items: components["schemas"]["WebhookResource"][];
             next?: string | null;
         };
         Pose: {
@@ -431,6 +496,34 @@ export interface components {
             created_at: string;
             /** Format: date-time */
             expires_at: string;
+        };
+        /** @enum {string} */
+        WebhookEvent: "job.succeeded" | "job.failed" | "job.cancelled";
+        WebhookRequest: {
+            url: string;
+            events?: components["schemas"]["WebhookEvent"][];
+            description?: string;
+        };
+        WebhookResource: {
+            id: string;
+            url: string;
+            events: components["schemas"]["WebhookEvent"][];
+            description: string;
+            disabled: boolean;
+            previous_secret_until?: string | null;
+            /** Format: date-time */
+            created_at: string;
+        };
+        WebhookWithSecret: {
+            id: string;
+            url: string;
+            events: components["schemas"]["WebhookEvent"][];
+            description: string;
+            disabled: boolean;
+            previous_secret_until?: string | null;
+            /** Format: date-time */
+            created_at: string;
+            secret: string;
         };
         WorkerStatus: {
             name: string;

@@ -107,6 +107,7 @@ export function Bar({ percent, label }: { percent: number; label: string }): Sho
 
 export const KINDS: Record<Job["kind"], string> = {
   PREFLIGHT: "check of the images", RECONSTRUCTION: "reconstruction", AGGREGATION: "aggregation", SUBMAP: "sub-map",
+  EXPORT: "export",
 };
 
 export function eta(job: Job): string {

@@ -21,7 +21,7 @@ from mrasfm_engine.errors import InputError
 
 HELP_CPU_S = 0.2
 # Commands that run until they are stopped, print a text, or change one thing.
-WITHOUT_JSON = {"api", "worker", "reconciler", "standalone", "migrate", "describe", "completion", "demo"}
+WITHOUT_JSON = {"api", "worker", "reconciler", "standalone", "migrate", "describe", "completion", "demo", "view"}
 MRASFM = (sys.executable, "-P", "-c", "import sys; from mrasfm_engine.cli import main; sys.exit(main())")
 
 
