@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((HOST, arguments.port))
+            listener.listen()  # a browser that comes before the server is ready waits for it
         except (OSError, OverflowError) as error:
             print(f"mrasfm: error: port {arguments.port} cannot be used: {error}. Give another one.", file=sys.stderr)
             return EXIT_REFUSED
