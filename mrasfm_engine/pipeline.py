@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
-from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.submaps import Span, Submap
 from mrasfm_engine.types import StageProgress
 from schemas.artifacts import Stage
@@ -74,13 +73,7 @@ def reconstruct(
     run.report["settings"] = config.model_dump(mode="json")
     with watched_compilation() as compiled:
         prior, spans = _begun(run)
-        features: Sequence[ImageFeatures]
-        if spans:
-            features, matches, (model, *others) = stages.join_submaps(run, stages.run_submaps(run, spans), prior)
-        else:
-            features = stages.features(run)
-            matches = stages.matches(run, features, prior)
-            model, *others = stages.mapping(run, features, matches, prior)
+        features, matches, (model, *others) = stages.mapped(run, spans, prior)
         scene = stages.scene(run, model, features, matches, prior)
         components = stages.components(run, model, scene, others, prior)
         with scratch_folder(out) as scratch:

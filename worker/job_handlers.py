@@ -22,7 +22,7 @@ from service.database.tables import now_us
 from service.domain import checkpoints, exports, jobs, maps, scenes, workers
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.domain.drive_checkout import materialise
-from service.domain.map_inputs import MapInputs, inputs_of
+from service.domain.map_inputs import MapInputs, StoredArtifact, inputs_of
 from service.job_queue import QUEUES
 from service.settings import Settings
 from service.storage.artifacts import Fetch
@@ -200,10 +200,7 @@ class AggregationHandler:
         into = root / "base" if inputs.base else None
         wanted = [(root / "scenes" / name / file.path, file) for name, files in inputs.scenes.items() for file in files]
         wanted += [(root / "base" / file.path, file) for file in inputs.base]
-        for i, (target, file) in enumerate(wanted):
-            target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            fetch(file.key, target)
-            progress(i + 1, len(wanted))
+        _fetch_all(wanted, fetch, lambda done: progress(done, len(wanted)))
         return Attempt(
             work=Work.AGGREGATION,
             settings=self._held.settings,
@@ -257,11 +254,8 @@ class ExportHandler:
             inputs = exports.inputs_of(session, self._held)
         source, drives = folder.root / "source", folder.root / "drives"
         total = len(inputs.files) + len(inputs.drives)  # a drive counts as one until its files are known
-        for i, file in enumerate(inputs.files):
-            target = source / file.path
-            target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            fetch(file.key, target)
-            progress(i + 1, total)
+        wanted = [(source / file.path, file) for file in inputs.files]
+        _fetch_all(wanted, fetch, lambda done: progress(done, total))
         folders: dict[str, Path] = {}
         for drive_id in sorted(set(inputs.drives.values())):
             folders[drive_id] = drives / drive_id
@@ -287,6 +281,14 @@ class ExportHandler:
             expires_us=_expires_us(settings.export_retention_days),
         )
         return {"export_id": export_id}
+
+
+def _fetch_all(wanted: Sequence[tuple[Path, StoredArtifact]], fetch: Fetch, progress: Callable[[int], None]) -> None:
+    """Bring files to their places; `progress` is called with how many are there."""
+    for done, (target, file) in enumerate(wanted, start=1):
+        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        fetch(file.key, target)
+        progress(done)
 
 
 JobHandler = PreflightHandler | ReconstructionHandler | SubmapHandler | AggregationHandler | ExportHandler

@@ -21,7 +21,7 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.subprocess_run import memory_bytes
 from mrasfm_engine.synthetic.long_route import simulate_long_route
-from mrasfm_engine.types import Floats, StageProgress
+from mrasfm_engine.types import Bools, Floats, StageProgress
 from schemas.artifacts import Stage
 
 
@@ -104,7 +104,7 @@ def map_drive(progress: StageProgress, drive_folder: Path, config: EngineConfig,
 def map_simulated(progress: StageProgress, folder: Path, config: EngineConfig) -> Mapped:
     """Map from simulated features and matches, and refine."""
     simulated = simulated_drive.load(folder)
-    run = _simulated_run(progress, simulated.drive, config, _MappedAnew(folder))
+    run = simulated_run(progress, simulated.drive, config, _MappedAnew(folder))
     return _map(run, simulated.features, simulated.pairs, stages.prior(run))
 
 
@@ -142,7 +142,7 @@ def simulate_descriptors(
     drive = simulated_drive.drive_of_route(rig, route, folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_manifest(drive.manifest, folder)
-    run = _simulated_run(progress, drive, config, StageStore(folder))
+    run = simulated_run(progress, drive, config, StageStore(folder))
     return Simulated(
         images=len(drive.images),
         keypoints=store_descriptors(run, route, seed=seed),
@@ -154,17 +154,11 @@ def simulate_descriptors(
 def map_descriptors(progress: StageProgress, folder: Path, config: EngineConfig) -> Mapped:
     """Match the descriptors that `simulate_descriptors` left and map, in sub-maps where the drive is cut, and
     refine."""
-    run = _simulated_run(progress, read_drive(folder), config, StageStore(folder))
+    run = simulated_run(progress, read_drive(folder), config, StageStore(folder))
     run.report["findings"] = []
     start_memory_bytes = memory_bytes()
     prior, spans = stages.prior(run), stages.cut_drive(run)
-    features: Sequence[ImageFeatures]
-    if spans:
-        features, matches, (model, *_) = stages.join_submaps(run, stages.run_submaps(run, spans), prior)
-    else:
-        features, _ = stages.extract(run)
-        matches = stages.matches(run, features, prior)
-        model, *_ = stages.mapping(run, features, matches, prior)
+    features, matches, (model, *_) = stages.mapped(run, spans, prior)
     scene = stages.scene(run, model, features, matches, prior)
     every = [*run.report["stages"], *(stage for part in run.report.get("submaps", []) for stage in part["stages"])]
     matched = next(stage for stage in run.report["stages"] if stage["stage"] == Stage.MATCHES)
@@ -189,9 +183,11 @@ def _run(progress: StageProgress, drive_folder: Path, config: EngineConfig, stor
     return stages.Run(read_drive(drive_folder), config, store, progress, lambda: False)
 
 
-def _simulated_run(progress: StageProgress, drive: Drive, config: EngineConfig, store: StageStore) -> stages.Run:
+def simulated_run(progress: StageProgress, drive: Drive, config: EngineConfig, store: StageStore) -> stages.Run:
+    """A run of a drive without images, which has no own car."""
     key = fingerprint(drive.manifest.name)  # there are no files whose fingerprint it could be
-    return stages.Run(drive, config, store, progress, lambda: False, key=key)
+    own_cars: list[Bools | None] = [None for _ in drive.cameras]
+    return stages.Run(drive, config, store, progress, lambda: False, own_cars=own_cars, key=key)
 
 
 def _map(

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
 from mrasfm_engine.stages._extraction_size import extraction_sizes
-from mrasfm_engine.stages._features import extract, features, store_features
+from mrasfm_engine.stages._features import features, store_features
 from mrasfm_engine.stages._mapping import mapping
 from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
 from mrasfm_engine.stages._own_car import own_cars
 from mrasfm_engine.stages._run import VERSIONS, Run, store_of
 from mrasfm_engine.stages._scene import components, numbered_components, pictures, scene
 from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
-from mrasfm_engine.stages._submaps import SubmapRun, count_of_submaps, cut_drive, is_cut, join_submaps, run_submaps
+from mrasfm_engine.stages._submaps import SubmapRun, count_of_submaps, cut_drive, is_cut, mapped
 
 __all__ = [
     "VERSIONS",
@@ -24,14 +24,13 @@ __all__ = [
     "components",
     "count_of_submaps",
     "cut_drive",
-    "extract",
     "extraction_sizes",
     "features",
     "in_units",
     "is_cut",
-    "join_submaps",
     "leave_out_standing",
     "load_models",
+    "mapped",
     "mapping",
     "matches",
     "numbered_components",
@@ -41,7 +40,6 @@ __all__ = [
     "preflight",
     "prior",
     "probe",
-    "run_submaps",
     "scene",
     "store_features",
     "store_of",

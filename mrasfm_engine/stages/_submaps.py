@@ -22,15 +22,16 @@ from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.drive import Incomplete
-from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.submaps import Span, count_for_memory, count_for_workers, cut, share_a_submap, spans_between
 from mrasfm_engine.stages._begin import prior
-from mrasfm_engine.stages._features import describe_features, extract, left_out_of, require_features
+from mrasfm_engine.stages._features import describe_features, extract, features, left_out_of, require_features
 from mrasfm_engine.stages._mapping import (
     described,
     keypoints_of,
     mappers,
+    mapping,
     mapping_of,
     mapping_settings,
     numbered,
@@ -40,6 +41,7 @@ from mrasfm_engine.stages._matches import (
     describe_matches,
     match,
     match_settings,
+    matches,
     read_pairs,
     require_matches,
     write_pairs,
@@ -103,6 +105,23 @@ def count_of_submaps(run: Run, workers: int) -> int:
         memory_bytes=settings.memory_mb * BYTES_PER_MB,
     )
     return settings.count or max(for_memory, count_for_workers(run.drive, workers, settings.overlap_units))
+
+
+def mapped(
+    run: Run, spans: Sequence[Span], known: PriorTrajectory
+) -> tuple[Sequence[ImageFeatures], list[PairMatches], list[Mapper]]:
+    """Features, matches and mapped components of a drive: of its sub-maps where it is cut, else in one piece.
+
+    Raises
+    ------
+    InputError, ReconstructionError
+        Where no image can be read, none has a keypoint, nothing matches or nothing can be mapped.
+    """
+    if spans:
+        return join_submaps(run, run_submaps(run, spans), known)
+    found = features(run)
+    pairs = matches(run, found, known)
+    return found, pairs, mapping(run, found, pairs, known)
 
 
 class SubmapRun:
@@ -366,8 +385,8 @@ def _joined_features(run: Run, submaps: Sequence[SubmapRun]) -> JoinedFeatures:
     for report in reports:
         left_out |= left_out_of(report)
     by_class: Counter[str] = Counter()
-    for features in found:
-        by_class.update(count_classes([features.classes]))
+    for image in found:
+        by_class.update(count_classes([image.classes]))
     made = int((found.mask_bytes > 0).sum())
     described = describe_features(run.drive, found.counts, by_class, made, left_out)
     run.report["stages"].append({"stage": Stage.FEATURES, **_times(reports), **described})

@@ -204,6 +204,7 @@ def _add(
             y = y_first - row * cell
             for column in range(columns[j], columns[j + 1]):
                 x = x_first + column * cell
+                # Written out in both kernels: behind functions of their own, these branches take twice the time.
                 if square == LINEAR:
                     u, v, z = between_nodes(nodes, rows, columns, i, j, row, column)
                 else:

@@ -80,6 +80,10 @@ _api_key = _ApiKey(
 CallerDep = Annotated[Caller, Depends(_api_key)]
 
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items a page")]
+LastEventId = Annotated[
+    int | None,
+    Header(alias="Last-Event-ID", ge=0, lt=2**62, description="go on after this event, as a browser does by itself"),
+]
 Cursor = Annotated[str | None, Query(max_length=MAX_CURSOR_CHARACTERS, description="`next` of the page before")]
 _IDEMPOTENCY = (
     "Names this request: repeated under the same key it has its effect once, and the first answer is replayed for a day"

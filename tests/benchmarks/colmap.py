@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
+import pycolmap
+
 from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
 from mrasfm_engine.io.trajectory_file import read_tum
 from tests.benchmarks.table import Figure
@@ -37,3 +39,12 @@ def beside_colmap(
     figures.append(figure(what=f"{title}: metric RMSE", value=errors.metric_rmse_m, unit="m"))
     figures.append(figure(what=f"{title}: similarity RMSE", value=errors.similarity_rmse_m, unit="m"))
     return figures, errors.similarity_rmse_m
+
+
+def verified_pairs(database: Path) -> list[tuple[str, str]]:
+    """Names of the images of each pair that a database has verified."""
+    opened = pycolmap.Database.open(str(database))
+    names = {image.image_id: image.name for image in opened.read_all_images()}
+    ids, _ = opened.read_two_view_geometry_num_inliers()
+    opened.close()
+    return [(names[a], names[b]) for a, b in map(pycolmap.pair_id_to_image_pair, ids)]

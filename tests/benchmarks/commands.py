@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -41,3 +42,9 @@ def read_report(scene: Path) -> dict[str, Any]:
     report: dict[str, Any] = json.loads((scene / "report.json").read_text(encoding="utf-8"))
     report["by_stage"] = {stage["stage"]: stage for stage in report["stages"]}
     return report
+
+
+def cpu_time_s() -> float:
+    """CPU time of all commands so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime

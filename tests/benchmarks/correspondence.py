@@ -15,6 +15,7 @@ import pycolmap
 
 from mrasfm_engine.features.extraction_size import LARGEST_SIDE_PX
 from mrasfm_engine.preflight.drive_reader import read_drive
+from tests.benchmarks.colmap import verified_pairs
 from tests.benchmarks.commands import mrasfm, read_report
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure
@@ -40,7 +41,7 @@ def correspondence(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
         stages = read_report(scene)["by_stage"]
         ours.append(stages["features"]["seconds"] + stages["matches"]["seconds"])
         database, pairs = scene / "features.db", scene / "pairs.txt"
-        pairs.write_text("".join(f"{a} {b}\n" for a, b in _pairs(database)), encoding="utf-8")
+        pairs.write_text("".join(f"{a} {b}\n" for a, b in verified_pairs(database)), encoding="utf-8")
         theirs.append(_colmap(drive, out / f"colmap {repetition}.db", pairs))
     figure = partial(Figure, line="16")
     count = len(pairs.read_text(encoding="utf-8").splitlines())
@@ -133,11 +134,3 @@ def _inliers(database: Path, pairs: Path) -> int:
     _, counts = opened.read_two_view_geometry_num_inliers()
     opened.close()
     return int(sum(counts))
-
-
-def _pairs(database: Path) -> list[tuple[str, str]]:
-    opened = pycolmap.Database.open(str(database))
-    names = {image.image_id: image.name for image in opened.read_all_images()}
-    ids, _ = opened.read_two_view_geometry_num_inliers()
-    opened.close()
-    return [(names[a], names[b]) for a, b in map(pycolmap.pair_id_to_image_pair, ids)]

@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from mrasfm_engine import stages
+from mrasfm_engine.benchmark.mapping import simulated_run
 from mrasfm_engine.benchmark.simulated_descriptors import store_descriptors
 from mrasfm_engine.benchmark.simulated_drive import drive_of_route
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.export.scene import write_scene
-from mrasfm_engine.io.stage_store import fingerprint
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.synthetic.gnss import receive
 from mrasfm_engine.synthetic.long_route import LongRoute, simulate_long_route
 from mrasfm_engine.synthetic.options import SynthOptions
-from tests.benchmarks.commands import mrasfm
+from tests.benchmarks.commands import cpu_time_s, mrasfm
 from tests.benchmarks.table import Figure, exactly
 
 FEW, MANY, UNITS = 15, 60, 30
@@ -44,9 +44,9 @@ def many_scenes(data: Path, work: Path) -> Iterator[Figure]:
         scenes, out = every[:count], work / f"map of {count} scenes"
         settings = out.with_suffix(".toml")
         settings.write_text("[output]\npictures = false\n", encoding="utf-8")
-        before_s, started = _cpu_s(), time.perf_counter()
+        before_s, started = cpu_time_s(), time.perf_counter()
         mrasfm("aggregate", *scenes, "--config", settings, "--out", out)
-        taken_s, cpu_s = time.perf_counter() - started, _cpu_s() - before_s
+        taken_s, cpu_s = time.perf_counter() - started, cpu_time_s() - before_s
         # Of the largest command so far: the map of few scenes comes first.
         memory_bytes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * (
             1 if sys.platform == "darwin" else 1024
@@ -93,32 +93,15 @@ def _scene(route: LongRoute, number: int, work: Path) -> Path:
     out.mkdir(parents=True)
     (out / "truth.tum").write_text(format_tum(drive.timestamps_us.tolist(), part.world_from_rig), encoding="utf-8")
     config = EngineConfig.model_validate({"features": {"max_keypoints": KEYPOINTS}})
-    store_descriptors(_run(drive, config, out), part, seed=SEED, number=number)
-    run = _run(drive, config, out)
+    store_descriptors(simulated_run(_no_progress, drive, config, stages.store_of(out)), part, seed=SEED, number=number)
+    run = simulated_run(_no_progress, drive, config, stages.store_of(out))
     run.report["drive"], run.report["settings"] = drive.manifest.name, config.model_dump(mode="json")
     stages.load_models(run)
     prior = stages.prior(run)
-    features, _ = stages.extract(run)
-    matches = stages.matches(run, features, prior)
-    model, *_ = stages.mapping(run, features, matches, prior)
+    features, matches, (model, *_) = stages.mapped(run, [], prior)
     write_scene(stages.scene(run, model, features, matches, prior), scene, run.report)
     return scene
 
 
-def _run(drive: Drive, config: EngineConfig, out: Path) -> stages.Run:
-    key = fingerprint(drive.manifest.name)  # there are no files whose fingerprint it could be
-    return stages.Run(
-        drive,
-        config,
-        stages.store_of(out),
-        lambda stage, done, total: None,
-        lambda: False,
-        own_cars=[None] * len(drive.cameras),
-        key=key,
-    )
-
-
-def _cpu_s() -> float:
-    """CPU time of all commands so far."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+def _no_progress(stage: str, done: int, total: int) -> None:
+    """Progress of what takes some seconds."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.commands import cpu_time_s, evaluate, mrasfm, read_report
 from tests.benchmarks.table import Figure, exactly
 
 SEED, CAMERAS, UNITS, SIZE = 1, 6, 28, ("--width", 640, "--height", 360)
@@ -30,9 +29,9 @@ def stops(data: Path, work: Path) -> Iterator[Figure]:
     mrasfm("reconstruct", drive, "--no-gnss", "--out", work / "warm-up")  # compiles what no run before has
     cpu_s = {}
     for one in (drive, stopped):
-        before_s = _cpu_s()
+        before_s = cpu_time_s()
         mrasfm("reconstruct", one, "--no-gnss", "--out", work / f"{one.name}, scene")
-        cpu_s[one] = _cpu_s() - before_s
+        cpu_s[one] = cpu_time_s() - before_s
     scene = work / f"{stopped.name}, scene"
     title = f"a stop of 60 s in a drive of {UNITS} units"
     yield Figure(line="29", what=f"{title}: CPU time without it", value=cpu_s[drive], unit="s")
@@ -48,12 +47,6 @@ def stops(data: Path, work: Path) -> Iterator[Figure]:
     yield Figure(line="29", what=f"{title}: units left out", value=left_out, above=STOP_UNITS - 3, most=STOP_UNITS)
     error_m = evaluate(scene, stopped)["metric"]["rmse_m"]
     yield Figure(line="29", what=f"{title}: metric RMSE", value=error_m, unit="m", most=ERROR_M)
-
-
-def _cpu_s() -> float:
-    """CPU time of all commands so far."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _with_stop(original: Path, out: Path) -> Path:

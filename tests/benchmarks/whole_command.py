@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from mrasfm_engine.benchmark.baselines import Baseline, run_baseline
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.preflight.drive_reader import read_drive
+from tests.benchmarks.colmap import verified_pairs
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import DRIVES, imported
 from tests.benchmarks.table import Figure
@@ -106,14 +106,12 @@ def _colmap(drive: Path, scene: Path, database: Path, *, max_side_px: int, keypo
 
 def _prepare(database: Path, pairs: Path) -> list[str]:
     """Write the pairs, leave the cameras, rigs and images only, and return the images' names."""
+    pairs.write_text("".join(f"{a} {b}\n" for a, b in verified_pairs(database)), encoding="utf-8")
     opened = pycolmap.Database.open(str(database))
-    names = {image.image_id: image.name for image in opened.read_all_images()}
-    ids, _ = opened.read_two_view_geometry_num_inliers()
-    ends = np.array([pycolmap.pair_id_to_image_pair(pair) for pair in ids])
-    pairs.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in ends), encoding="utf-8")
+    names = [image.name for image in opened.read_all_images()]
     opened.clear_keypoints()
     opened.clear_descriptors()
     opened.clear_matches()
     opened.clear_two_view_geometries()
     opened.close()
-    return list(names.values())
+    return names

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
-from typing import Annotated
 
-from fastapi import APIRouter, Header, Request
+from fastapi import APIRouter, Request
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -17,7 +16,7 @@ from schemas.api.jobs import JobResource
 from schemas.api.resource import example_of
 from service.api.context import Context
 from service.api.credentials import secret_of
-from service.api.dependencies import CallerDep, ContextDep
+from service.api.dependencies import CallerDep, ContextDep, LastEventId
 from service.api.http.responses import gives, problems
 from service.api.routes.job_views import views_of
 from service.database.tables import Job, JobEvent, JobMember, JobState, now_us
@@ -60,12 +59,7 @@ async def stream_events(
     caller: CallerDep,
     context: ContextDep,
     request: Request,
-    last_event_id: Annotated[
-        int | None,
-        Header(
-            alias="Last-Event-ID", ge=0, lt=2**62, description="go on after this event, as a browser does by itself"
-        ),
-    ] = None,
+    last_event_id: LastEventId = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Jobs of the project as they change, each as `GET /v1/jobs/{id}` shows it.
 

@@ -17,7 +17,7 @@ from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
 from service.api.context import Context
 from service.api.credentials import secret_of
-from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us
+from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, LastEventId, Limit, answer, expiry_us
 from service.api.http.paging import newest
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
@@ -176,12 +176,7 @@ async def stream_job_events(
     job_id: Annotated[str, Depends(_existing)],
     context: ContextDep,
     request: Request,
-    last_event_id: Annotated[
-        int | None,
-        Header(
-            alias="Last-Event-ID", ge=0, lt=2**62, description="go on after this event, as a browser does by itself"
-        ),
-    ] = None,
+    last_event_id: LastEventId = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """The job's changes of state, from the beginning, and its newest progress, until it or the key has ended."""
     last, secret = last_event_id or 0, secret_of(request) or ""
