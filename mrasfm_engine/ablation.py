@@ -248,11 +248,9 @@ def warm_up(
     )
     images = len(few.images)
     poses = None if prior.world_from_rig is None else prior.world_from_rig[:WARM_UP_UNITS]
-    pairs = [p for p in matches if p.image_b < images]
+    keypoints, pairs = Keypoints.from_matches(few, features[:images], [p for p in matches if p.image_b < images])
     try:
-        components.map_drive(
-            few, Keypoints.from_features(few, features[:images]), pairs, poses, run.config, cancel=run.cancel
-        )
+        components.map_drive(few, keypoints, pairs, poses, run.config, cancel=run.cancel)
     except CancelledError:
         raise
     except ReconstructionError:

@@ -63,7 +63,7 @@ def build_scene(
         point_error_px=np.bincount(point, errors, minlength=len(tracks)) / counts,
         observation_point=point.astype(np.int64),
         observation_image=mapper.keypoints.image[rows],
-        observation_keypoint=rows - mapper.keypoints.first[mapper.keypoints.image[rows]],
+        observation_keypoint=mapper.keypoints.number[rows],
         features=list(features),
         pairs=list(pairs),
         georeference=prior.georeference if georeferenced else None,

@@ -25,24 +25,26 @@ def mapping(
     run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
 ) -> list[Mapper]:
     """Units registered one by one, points triangulated, everything adjusted; of every component, the largest first."""
-    keypoints = keypoints_of(run, found)
+    keypoints, numbered_pairs = keypoints_of(run, found, pairs)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        begun = mapping_of(run, keypoints, pairs, known)
+        begun = mapping_of(run, keypoints, numbered_pairs, known)
         begun.map_from_seeds()
         return packed(begun.finish(), found)
 
     return mappers(run, keypoints, known, work)
 
 
-def keypoints_of(run: Run, found: Sequence[ImageFeatures]) -> Keypoints:
-    """The keypoints of all images in one row of arrays."""
+def keypoints_of(
+    run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches]
+) -> tuple[Keypoints, list[PairMatches]]:
+    """The keypoints that can be part of a track in one row of arrays, and the pairs with matches numbered by them."""
     bands = RowBands.from_drive(run.drive, compensate=run.config.mapping.motion_compensation)
-    return Keypoints.from_features(run.drive, found, bands)
+    return Keypoints.from_matches(run.drive, found, pairs, bands)
 
 
 def mapping_of(run: Run, keypoints: Keypoints, pairs: Sequence[PairMatches], known: PriorTrajectory) -> DriveMapping:
-    """Mapping of the run's drive, of which nothing has a pose yet."""
+    """Mapping of the run's drive, of which nothing has a pose yet, from what `keypoints_of` gives."""
     return begin_mapping(
         run.drive,
         keypoints,

@@ -180,8 +180,7 @@ class SubmapRun:
         features, matches = self.features, self.matches  # in their order
 
         def work() -> tuple[Arrays, dict[str, Any]]:
-            keypoints = keypoints_of(self.run, features)
-            begun = mapping_of(self.run, keypoints, read_pairs(matches), self.known)
+            begun = mapping_of(self.run, *keypoints_of(self.run, features, read_pairs(matches)), self.known)
             arrays: Arrays = {"keyframe": begun.mapper.keyframe.copy()}
             begun.mapper.keyframe |= self.span.is_shared  # else creeping units might have no pose in common
             try:
@@ -366,12 +365,12 @@ def join_submaps(
     run.key = fingerprint(run.key or run.drive_key, [submap.run.key for submap in submaps])
     found = _joined_features(run, submaps)
     pairs = _joined_matches(run, submaps, found, known)
-    keypoints = keypoints_of(run, found)
+    keypoints, numbered_pairs = keypoints_of(run, found, pairs)
     parts = [part for submap in submaps for part in submap.parts()]
     keyframe = _keyframes(run, submaps)
 
     def work() -> tuple[Arrays, dict[str, Any]]:
-        arrays, report = packed(join(mapping_of(run, keypoints, pairs, known), parts, keyframe), found)
+        arrays, report = packed(join(mapping_of(run, keypoints, numbered_pairs, known), parts, keyframe), found)
         return arrays, report | _joined_counts([report, *(_entry(submap, Stage.MAPPING) for submap in submaps)])
 
     return found, pairs, mappers(run, keypoints, known, work)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,10 @@ from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 
 @dataclass(frozen=True, kw_only=True)
 class Keypoints:
-    """The keypoints of all images in one row of arrays; keypoint k of image i is at `first[i] + k`."""
+    """Keypoints of all images in one row of arrays: those of image i are at `first[i]` to `first[i + 1]`."""
 
     first: Ints  # (images + 1,)
+    number: Ints  # (n,) of a keypoint among the features of its image, ascending in every image
     image: Ints  # (n,)
     unit: Ints  # (n,)
     camera: Ints  # (n,)
@@ -37,12 +38,45 @@ class Keypoints:
 
     @staticmethod
     def from_features(drive: Drive, features: Sequence[ImageFeatures], bands: RowBands | None = None) -> Keypoints:
-        """Line up the features of all images of a drive; by default every image is one instant."""
-        counts = np.array([len(f.xy_px) for f in features], dtype=np.int64)
+        """Line up all features of a drive's images; by default every image is one instant."""
+        return Keypoints._of_numbers(drive, features, [np.arange(len(f.xy_px)) for f in features], bands)
+
+    @staticmethod
+    def from_matches(
+        drive: Drive, features: Sequence[ImageFeatures], pairs: Sequence[PairMatches], bands: RowBands | None = None
+    ) -> tuple[Keypoints, list[PairMatches]]:
+        """Line up the features that can be part of a track, and number the pairs' matches by them.
+
+        Most keypoints of an image match nothing: of a long drive, they would take most of the memory. All matches stay
+        of the images of one unit, as they are judged again when the calibration is corrected; of others the inliers.
+        """
+        unit = np.array([image.unit for image in drive.images], dtype=np.int64)
+        kept = [pair if unit[pair.image_a] == unit[pair.image_b] else _inliers_of(pair) for pair in pairs]
+        is_used = [np.zeros(len(f.xy_px), dtype=np.bool_) for f in features]
+        for pair in kept:
+            is_used[pair.image_a][pair.matches[:, 0]] = True
+            is_used[pair.image_b][pair.matches[:, 1]] = True
+        numbers = [np.flatnonzero(used) for used in is_used]
+
+        def numbered_anew(pair: PairMatches) -> PairMatches:
+            ends = (pair.image_a, pair.image_b)
+            rows = [np.searchsorted(numbers[image], pair.matches[:, side]) for side, image in enumerate(ends)]
+            return replace(pair, matches=np.stack(rows, axis=1).astype(np.int32))
+
+        return Keypoints._of_numbers(drive, features, numbers, bands), [numbered_anew(pair) for pair in kept]
+
+    @staticmethod
+    def _of_numbers(
+        drive: Drive, features: Sequence[ImageFeatures], numbers: Sequence[Ints], bands: RowBands | None
+    ) -> Keypoints:
+        """Line up the features of every image that have some numbers, ascending."""
+        counts = np.array([len(of_image) for of_image in numbers], dtype=np.int64)
         image = np.repeat(np.arange(len(features), dtype=np.int64), counts)
         unit_of_image = np.array([i.unit for i in drive.images], dtype=np.int64)
         camera_of_image = np.array([i.camera for i in drive.images], dtype=np.int64)
-        xy = np.concatenate([f.xy_px for f in features]).astype(np.float64).reshape(-1, 2)
+        of_images = zip(features, numbers, strict=True)
+        parts = [(f.xy_px[rows].astype(np.float64), f.classes[rows]) for f, rows in of_images]
+        xy = np.concatenate([xy for xy, _ in parts]).reshape(-1, 2)
         camera = camera_of_image[image]
         rays = np.empty((len(xy), 3))
         kinds, params = pack_cameras(drive.cameras)
@@ -51,14 +85,21 @@ class Keypoints:
             rays[rows] = unproject_pixels(int(kind), p, xy[rows])
         return Keypoints(
             first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            number=np.concatenate(numbers).astype(np.int64),
             image=image,
             unit=unit_of_image[image],
             camera=camera,
             band=image if bands is None else bands.of_pixels(image, xy),
             xy_px=xy,
             rays=rays,
-            classes=np.concatenate([f.classes for f in features]),
+            classes=np.concatenate([classes for _, classes in parts]),
         )
+
+
+def _inliers_of(pair: PairMatches) -> PairMatches:
+    """The pair without the matches that are no inliers."""
+    matches = pair.matches[pair.inliers]
+    return replace(pair, matches=matches, inliers=np.ones(len(matches), dtype=np.bool_))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ def keypoints_of(per_image: list[int]) -> Keypoints:
     n = len(image)
     return Keypoints(
         first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        number=np.concatenate([np.arange(count) for count in per_image]).astype(np.int64),
         image=image,
         unit=image,
         camera=np.zeros(n, dtype=np.int64),
@@ -136,3 +139,39 @@ def test_keypoints_line_up_images_and_their_rays() -> None:
         _, params = packed(PERSPECTIVE, simulated.truth.camera_params[image.camera])
         if len(f.xy_px):
             np.testing.assert_allclose(project_points(0, params, keypoints.rays[rows]), f.xy_px, atol=1e-3)
+
+
+def test_keypoints_of_matches_make_the_tracks_of_all_keypoints() -> None:
+    simulated = make_simulated_drive(units=4, seed=3)
+    rng = np.random.default_rng(0)
+    pairs = [replace(p, inliers=rng.random(len(p.matches)) < 0.5) for p in true_matches(simulated)]
+    every = Keypoints.from_features(simulated.drive, simulated.features)
+    few, numbered = Keypoints.from_matches(simulated.drive, simulated.features, pairs)
+    assert len(few.image) < len(every.image)
+    rows = every.first[few.image] + few.number
+    for name in ("image", "unit", "camera", "band", "xy_px", "rays", "classes"):
+        assert np.array_equal(getattr(few, name), getattr(every, name)[rows]), name
+    of_all, of_few = build_tracks(every, pairs), build_tracks(few, numbered)
+    assert len(of_few) > 0
+    assert np.array_equal(of_few.first, of_all.first)
+    assert np.array_equal(rows[of_few.keypoints], of_all.keypoints)
+
+
+def test_keypoints_of_matches_are_inliers_and_all_matches_within_a_unit() -> None:
+    simulated = make_simulated_drive(units=2, seed=1)
+    unit = [image.unit for image in simulated.drive.images]
+    pairs = [replace(p, inliers=np.arange(len(p.matches)) % 2 == 0) for p in true_matches(simulated)]
+    _, numbered = Keypoints.from_matches(simulated.drive, simulated.features, pairs)
+    within = [unit[p.image_a] == unit[p.image_b] for p in pairs]
+    assert any(within) and not all(within)
+    for before, after, same_unit in zip(pairs, numbered, within, strict=True):
+        if same_unit:
+            assert np.array_equal(after.inliers, before.inliers)
+        else:
+            assert len(after.matches) == before.inliers.sum() and after.inliers.all()
+
+
+def test_keypoints_of_no_match_are_none() -> None:
+    simulated = make_simulated_drive(units=2, seed=1)
+    keypoints, pairs = Keypoints.from_matches(simulated.drive, simulated.features, [])
+    assert not pairs and not len(keypoints.image) and keypoints.xy_px.shape == (0, 2) and keypoints.rays.shape == (0, 3)

@@ -78,6 +78,7 @@ def setting(
     flat = np.ascontiguousarray(xy.reshape(-1, 2))
     keypoints = Keypoints(
         first=(n * np.arange(units + 1)).astype(np.int64),
+        number=np.tile(np.arange(n), units).astype(np.int64),
         image=image,
         unit=image,
         camera=np.zeros(len(image), dtype=np.int64),
