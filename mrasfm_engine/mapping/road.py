@@ -160,9 +160,9 @@ def height_sigmas_m(mapper: Mapper, tracks: Ints, world_from_rig: Floats) -> Flo
 
 
 def _all_images_are_masked(mapper: Mapper) -> bool:
-    """Return whether every image with keypoints has some of a known class: an image without a mask has none."""
-    image, masked = mapper.keypoints.image, mapper.keypoints.classes != UNKNOWN
-    return bool(masked.any()) and len(np.unique(image[masked])) == len(np.unique(image))
+    """Every image with keypoints has some of a known class: an image without a mask has none."""
+    images = np.unique(mapper.keypoints.image)
+    return bool(len(images)) and bool(mapper.keypoints.is_masked[images].all())
 
 
 def _lowest_camera_m(mapper: Mapper) -> float:

@@ -13,7 +13,7 @@ from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-from mrasfm_engine.scene.semantics import majority_class
+from mrasfm_engine.scene.semantics import UNKNOWN, majority_class
 from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 
 
@@ -31,10 +31,14 @@ class Keypoints:
     rays: Floats  # (n, 3) unit viewing rays in camera axes under the given intrinsics
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
     classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
+    # (images,) which have a feature of a known class, here or among those that are not lined up; by default none
+    is_masked: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def __post_init__(self) -> None:
         if not len(self.classes):
             object.__setattr__(self, "classes", np.zeros(len(self.image), np.uint8))
+        if not len(self.is_masked):
+            object.__setattr__(self, "is_masked", np.zeros(len(self.first) - 1, np.bool_))
 
     @staticmethod
     def from_features(drive: Drive, features: Sequence[ImageFeatures], bands: RowBands | None = None) -> Keypoints:
@@ -74,9 +78,8 @@ class Keypoints:
         image = np.repeat(np.arange(len(features), dtype=np.int64), counts)
         unit_of_image = np.array([i.unit for i in drive.images], dtype=np.int64)
         camera_of_image = np.array([i.camera for i in drive.images], dtype=np.int64)
-        of_images = zip(features, numbers, strict=True)
-        parts = [(f.xy_px[rows].astype(np.float64), f.classes[rows]) for f, rows in of_images]
-        xy = np.concatenate([xy for xy, _ in parts]).reshape(-1, 2)
+        of_images = list(zip(features, numbers, strict=True))
+        xy = np.concatenate([f.xy_px[rows] for f, rows in of_images]).astype(np.float64).reshape(-1, 2)
         camera = camera_of_image[image]
         rays = np.empty((len(xy), 3))
         kinds, params = pack_cameras(drive.cameras)
@@ -92,7 +95,8 @@ class Keypoints:
             band=image if bands is None else bands.of_pixels(image, xy),
             xy_px=xy,
             rays=rays,
-            classes=np.concatenate([classes for _, classes in parts]),
+            classes=np.concatenate([f.classes[rows] for f, rows in of_images]),
+            is_masked=np.array([bool((f.classes != UNKNOWN).any()) for f in features]),
         )
 
 

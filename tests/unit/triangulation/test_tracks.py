@@ -163,15 +163,18 @@ def test_keypoints_of_matches_are_inliers_and_all_matches_within_a_unit() -> Non
     pairs = [replace(p, inliers=np.arange(len(p.matches)) % 2 == 0) for p in true_matches(simulated)]
     _, numbered = Keypoints.from_matches(simulated.drive, simulated.features, pairs)
     within = [unit[p.image_a] == unit[p.image_b] for p in pairs]
-    assert any(within) and not all(within)
+    assert any(within)
+    assert not all(within)
     for before, after, same_unit in zip(pairs, numbered, within, strict=True):
         if same_unit:
             assert np.array_equal(after.inliers, before.inliers)
         else:
-            assert len(after.matches) == before.inliers.sum() and after.inliers.all()
+            assert len(after.matches) == before.inliers.sum()
+            assert after.inliers.all()
 
 
 def test_keypoints_of_no_match_are_none() -> None:
     simulated = make_simulated_drive(units=2, seed=1)
     keypoints, pairs = Keypoints.from_matches(simulated.drive, simulated.features, [])
-    assert not pairs and not len(keypoints.image) and keypoints.xy_px.shape == (0, 2) and keypoints.rays.shape == (0, 3)
+    assert not pairs
+    assert (keypoints.xy_px.shape, keypoints.rays.shape) == ((0, 2), (0, 3))
