@@ -15,7 +15,14 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibration, ImageFeatures, PairMatches, Scene
+from mrasfm_engine.scene.scene import (
+    CalibrationObservability,
+    CameraCalibration,
+    ImageFeatures,
+    PairMatches,
+    Scene,
+    observed_colors,
+)
 from mrasfm_engine.scene.semantics import majority_class
 
 
@@ -34,7 +41,8 @@ def build_scene(
     tracks, point = np.unique(mapper.tracks.of_keypoint[rows], return_inverse=True)
     errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, mapper.tracks.of_keypoint[rows])
     counts = np.bincount(point, minlength=len(tracks)).clip(1)
-    colors = np.concatenate([f.colors for f in features])[rows].astype(np.float64)
+    image, keypoint = mapper.keypoints.image[rows], mapper.keypoints.number[rows]
+    colors = observed_colors(features, image, keypoint).astype(np.float64)
     mean_color = np.stack([np.bincount(point, colors[:, k], minlength=len(tracks)) for k in range(3)], 1)
     left_out = np.array([f.left_out is not None for f in features])
     units = len(mapper.registered)
@@ -62,8 +70,8 @@ def build_scene(
         point_colors=np.round(mean_color / counts[:, None]).astype(np.uint8),
         point_error_px=np.bincount(point, errors, minlength=len(tracks)) / counts,
         observation_point=point.astype(np.int64),
-        observation_image=mapper.keypoints.image[rows],
-        observation_keypoint=mapper.keypoints.number[rows],
+        observation_image=image,
+        observation_keypoint=keypoint,
         features=list(features),
         pairs=list(pairs),
         georeference=prior.georeference if georeferenced else None,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,17 @@ class ImageFeatures:
     def __post_init__(self) -> None:
         if not len(self.classes):
             object.__setattr__(self, "classes", np.zeros(len(self.xy_px), np.uint8))
+
+
+def observed_colors(features: Sequence[ImageFeatures], image: Ints, keypoint: Ints) -> Bytes:
+    """Colours (n, 3) of observations by keypoints (n,) of images (n,), which are read one after the other."""
+    result = np.empty((len(image), 3), np.uint8)
+    order = np.argsort(image, kind="stable")
+    images, first = np.unique(image[order], return_index=True)
+    for number, (begin, end) in zip(images.tolist(), pairwise([*first, len(order)]), strict=True):
+        rows = order[begin:end]
+        result[rows] = features[number].colors[keypoint[rows]]
+    return result
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mrasfm_engine.scene.scene import Scene
+from mrasfm_engine.scene.scene import Scene, observed_colors
 from mrasfm_engine.types import Floats
 from mrasfm_engine.visualization.mosaic import Mosaic
 from mrasfm_engine.visualization.views import REFINED
@@ -28,8 +28,7 @@ def exposure_gains(scene: Scene) -> Floats:
     gains = np.ones((len(scene.drive.images), 3))
     if not len(image):
         return gains
-    first = np.concatenate([[0], np.cumsum([len(f.xy_px) for f in scene.features])])
-    colors = np.concatenate([f.colors for f in scene.features])[first[image] + scene.observation_keypoint]
+    colors = observed_colors(scene.features, image, scene.observation_keypoint)
     order = np.argsort(image, kind="stable")
     image, point = image[order], point[order]
     log_color = np.log(np.maximum(colors[order].astype(np.float64), 2.0))
