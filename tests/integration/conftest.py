@@ -18,6 +18,8 @@ import pytest
 from mrasfm_engine.cli import main
 
 Document = dict[str, Any]
+# Pictures take seconds, and most tests look at none.
+WITHOUT_PICTURES = ("--config", Path(__file__).with_name("without_pictures.toml"))
 SMALL = ("--width", "480", "--height", "270", "--texture-px", "256")
 
 

@@ -13,7 +13,7 @@ from mrasfm_engine.cli import EXIT_BAD_INPUT
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import Pose
-from tests.integration.conftest import CommandResult, Document, Variant
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Document, Variant
 
 Run = Callable[..., CommandResult]
 FILE = "images/front/000002.jpg"
@@ -21,7 +21,7 @@ FILE = "images/front/000002.jpg"
 
 def refused(variant: Variant, run: Run, *options: str) -> str:
     """The error of a drive that is refused before the long work, with nothing written."""
-    result = run("reconstruct", variant.root, "--out", variant.scene, *options)
+    result = run("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES, *options)
     assert result.code == EXIT_BAD_INPUT
     assert "mrasfm: error: " in result.err
     assert "Traceback" not in result.err
@@ -145,7 +145,7 @@ def test_no_gnss_ignores_a_bad_receiver(variant: Variant, mrasfm: Run) -> None:
     gnss_on_gps_time(variant.document)
     variant.keep(cameras=["front", "left"], units=3)
     gnss_empty(variant.document)
-    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, "--no-gnss")
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES, "--no-gnss")
     assert (result.code, "georeferenced:    no" in result.out) == (0, True)
 
 
@@ -167,7 +167,7 @@ def test_nothing_matches(variant: Variant, mrasfm: Run) -> None:
     for file in variant.root.glob("images/*/*.jpg"):
         noise = rng.integers(0, 256, (270, 480, 3), dtype=np.uint8)
         variant.write(file.relative_to(variant.root).as_posix(), cv2.imencode(".jpg", noise)[1].tobytes())
-    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene)
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == EXIT_BAD_INPUT
     assert "nothing matches: none of" in result.err
     assert "Check that consecutive frames show the same scene" in result.err
@@ -185,7 +185,7 @@ def test_oddities_are_warned_of_and_used(variant: Variant, mrasfm: Run) -> None:
         deep = pixels.astype(np.uint16) * 257
         clear = np.dstack([pixels, np.full(pixels.shape[:2], 128, np.uint8)])
         assert cv2.imwrite(str(variant.root / image["file"]), deep if name == "deep" else clear)
-    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, "--no-gnss")
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES, "--no-gnss")
     assert result.code == 0
     assert "units registered: 4 of 4" in result.out
     for words in (
@@ -198,7 +198,7 @@ def test_oddities_are_warned_of_and_used(variant: Variant, mrasfm: Run) -> None:
 
 def test_two_frames(variant: Variant, mrasfm: Run) -> None:
     variant.keep(units=2)
-    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene)
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == 0
     assert "units registered: 2 of 2" in result.out
     assert "georeferenced:    no (only 2 registered units" in result.out
@@ -206,6 +206,6 @@ def test_two_frames(variant: Variant, mrasfm: Run) -> None:
 
 def test_one_camera_with_gnss(variant: Variant, mrasfm: Run) -> None:
     variant.keep(cameras=["front"])
-    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene)
+    result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == 0
     assert "its scale comes from GNSS alone" in result.out

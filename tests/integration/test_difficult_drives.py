@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from tests.benchmarks.moving_objects import VerifiedTracks, observed
-from tests.integration.conftest import CommandResult, Variant, read_report, synth
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, read_report, synth
 
 Run = Callable[..., CommandResult]
 
 
 def reconstructed(run: Run, drive: Path, scene: Path, *options: str) -> dict:  # type: ignore[type-arg]
     """Errors of the scene against the truth."""
-    result = run("reconstruct", drive, "--out", scene, *options)
+    result = run("reconstruct", drive, "--out", scene, *WITHOUT_PICTURES, *options)
     assert result.code == 0, result.err
     evaluated = run("evaluate", scene, "--truth", drive / "truth.tum", "--json")
     errors: dict = json.loads(evaluated.out)  # type: ignore[type-arg]

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
-from tests.integration.conftest import CommandResult, Variant, leftovers, mrasfm_process, read_report
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, leftovers, mrasfm_process, read_report
 
 Run = Callable[..., CommandResult]
 
@@ -25,7 +25,7 @@ def _wait_for(path: Path, seconds: float = 120.0) -> None:
 
 def test_interrupted_run_resumes(variant: Variant, mrasfm: Run) -> None:
     variant.keep(cameras=["front", "left"], units=5).save()
-    process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene)
+    process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     _wait_for(variant.scene / ".stages" / "features.npz")
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
@@ -34,7 +34,7 @@ def test_interrupted_run_resumes(variant: Variant, mrasfm: Run) -> None:
     assert "cancelled" in errors
     assert {path.name for path in variant.scene.iterdir()} == {".stages"}
     assert leftovers(variant.scene.parent) == []
-    result = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    result = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == 0
     stages = read_report(variant.scene)["by_stage"]
     assert stages["features"]["reused"]
@@ -49,7 +49,9 @@ def _small_files() -> None:
 
 def test_full_disk(variant: Variant) -> None:
     variant.keep(cameras=["front", "left"], units=3).save()
-    process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene, preexec_fn=_small_files)
+    process = mrasfm_process(
+        "reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES, preexec_fn=_small_files
+    )
     _, errors = process.communicate(timeout=120)
     assert process.returncode == EXIT_BAD_INPUT
     assert "Traceback" not in errors
@@ -65,12 +67,12 @@ def test_full_disk(variant: Variant) -> None:
 def test_disk_fills_while_the_scene_is_written(surround_drive: Path, variant: Variant, mrasfm: Run) -> None:
     """The stages are kept, and of the scene there is nothing."""
     variant.keep(cameras=["front", "left"], units=3).save()
-    assert mrasfm("reconstruct", variant.root, "--out", variant.scene).code == 0
+    assert mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES).code == 0
     stages = variant.scene / ".stages"
     other = variant.scene.parent / "other"
     other.mkdir()
     stages.rename(other / ".stages")
-    process = mrasfm_process("reconstruct", variant.root, "--out", other, preexec_fn=_small_files)
+    process = mrasfm_process("reconstruct", variant.root, "--out", other, *WITHOUT_PICTURES, preexec_fn=_small_files)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == EXIT_BAD_INPUT
     assert "Traceback" not in errors

@@ -11,19 +11,21 @@ import cv2
 import numpy as np
 import pytest
 
-from mrasfm_engine.config import EngineConfig, SubmapConfig
+from mrasfm_engine.config import EngineConfig, OutputConfig, SubmapConfig
 from mrasfm_engine.errors import StorageError
 from mrasfm_engine.features.sift import SiftExtractor
 from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from schemas.artifacts import PLAN_CHECKPOINTS, checkpoint_file, submap_checkpoint
-from tests.integration.conftest import CommandResult, Variant, read_report, synth
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, read_report, synth
 
 Run = Callable[..., CommandResult]
 
 UNITS = 15
-CONFIG = EngineConfig(use_gnss=False, submaps=SubmapConfig(count=3, overlap_units=3))
+CONFIG = EngineConfig(
+    use_gnss=False, submaps=SubmapConfig(count=3, overlap_units=3), output=OutputConfig(pictures=False)
+)
 STAGES = ("features", "matches", "mapping")
 
 
@@ -55,7 +57,7 @@ def errors(mrasfm: Run, scene: Path, drive: Path) -> dict:  # type: ignore[type-
 
 
 def test_the_scene_is_as_good_as_in_one_piece(drive: Path, scene: Path, tmp_path: Path, mrasfm: Run) -> None:
-    assert mrasfm("reconstruct", drive, "--no-gnss", "--out", tmp_path / "one").code == 0
+    assert mrasfm("reconstruct", drive, "--no-gnss", "--out", tmp_path / "one", *WITHOUT_PICTURES).code == 0
     cut, one = (errors(mrasfm, out, drive) for out in (scene, tmp_path / "one"))
     assert cut["registered_units"] == one["registered_units"] == UNITS
     assert 0 < cut["similarity"]["rmse_m"] < 1.2 * one["similarity"]["rmse_m"] + 1e-3

@@ -14,7 +14,7 @@ import pytest
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.visualization import birds_eye
 from tests.helpers.damaged_images import cut
-from tests.integration.conftest import CommandResult, Document, Variant, read_report
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Document, Variant, read_report
 
 Run = Callable[..., CommandResult]
 CAMERAS = ["front", "left"]
@@ -66,7 +66,7 @@ def test_some_truncated(variant: Variant, mrasfm: Run, monkeypatch: pytest.Monke
     assert not set(damaged) & {image.name for image in model.images.values()}
     assert shown
     assert not set(damaged) & set(shown)
-    again = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    again = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert again.code == 0
     repeated = read_report(variant.scene)
     assert repeated["by_stage"]["features"]["reused"]
@@ -76,7 +76,7 @@ def test_some_truncated(variant: Variant, mrasfm: Run, monkeypatch: pytest.Monke
 def test_all_truncated(variant: Variant, mrasfm: Run) -> None:
     variant.keep(cameras=CAMERAS, units=4).save()
     truncate(variant, images_of(variant))
-    result = mrasfm("reconstruct", variant.root, "--out", variant.scene)
+    result = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == 2
     assert f"8 of 8 images looked at are truncated: {images_of(variant)[0]}" in result.err
     assert "Copy the drive's images again" in result.err
@@ -96,7 +96,7 @@ def test_nothing_of_the_grey_rest_is_in_the_scene(variant: Variant, mrasfm: Run,
     poses = []
     for root in (variant.root, tmp_path / "without"):
         scene = tmp_path / f"scene-{root.name}"
-        assert mrasfm("reconstruct", root, "--out", scene).code == 0
+        assert mrasfm("reconstruct", root, "--out", scene, *WITHOUT_PICTURES).code == 0
         document = json.loads((scene / "poses.json").read_text(encoding="utf-8"))
         poses.append(np.array([unit["world_from_rig"]["translation_m"] for unit in document["units"]]))
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-6)
