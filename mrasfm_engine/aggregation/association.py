@@ -15,7 +15,7 @@ from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, common_view, nearest_
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.types import Floats
+from mrasfm_engine.types import Cancel, Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +36,17 @@ class Association:
         )
 
 
-def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Association:
+def associate(scenes: Sequence[SourceScene], config: AggregationConfig, *, cancel: Cancel | None = None) -> Association:
     """Put scenes into one frame by their positions, and say which are to be compared.
 
     The reference is the scene whose midpoint is nearest to the geometric centre of all (ties: more units, then the
     smaller name). Frames of different origins are combined through earth-centred coordinates. Scenes without positions
     are compared with those whose images look most like theirs.
+
+    Raises
+    ------
+    CancelledError
+        Where `cancel` answers True.
     """
     placed = [k for k, scene in enumerate(scenes) if scene.is_placed]
     middle = np.stack([se3.apply(s.ecef_from_local, s.midpoint_m[None])[0] for s in scenes])
@@ -55,7 +60,7 @@ def associate(scenes: Sequence[SourceScene], config: AggregationConfig) -> Assoc
     return Association(
         reference=reference,
         map_from_scene=map_from_scene,
-        pairs=tuple(sorted([*_pairs(scenes, placed, config), *similar_scenes(scenes, config)])),
+        pairs=tuple(sorted([*_pairs(scenes, placed, config), *similar_scenes(scenes, config, cancel=cancel)])),
     )
 
 

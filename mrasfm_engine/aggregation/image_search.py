@@ -17,19 +17,27 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.matching.retrieval import ImageIndex
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Cancel, Floats, Ints
 from schemas.artifacts import drive_of_scene
 
 SHORTLIST = 64  # candidates of an image, whose whole vectors are compared
 PAIRS_OF_IMAGE = 8
 
 
-def similar_images(a: SourceScene, b: SourceScene, config: AggregationConfig) -> list[Probe]:
-    """Units of b to look for in a by the images of a that look most like theirs, the most similar ones first."""
+def similar_images(
+    a: SourceScene, b: SourceScene, config: AggregationConfig, *, cancel: Cancel | None = None
+) -> list[Probe]:
+    """Units of b to look for in a by the images of a that look most like theirs, the most similar ones first.
+
+    Raises
+    ------
+    CancelledError
+        Where `cancel` answers True.
+    """
     images_a, images_b = (images_of(s, units) for s, units in zip((a, b), probe_units(a, b, config), strict=True))
     if not len(images_a) or not len(images_b):
         return []
-    index = ImageIndex.from_features([*_features(a, images_a), *_features(b, images_b)])
+    index = ImageIndex.from_features([*_features(a, images_a), *_features(b, images_b)], cancel=cancel)
     column = np.arange(len(images_a))
     found: dict[int, list[tuple[float, Ints]]] = {}
     for row, image_b in enumerate(images_b.tolist(), start=len(images_a)):
@@ -41,11 +49,18 @@ def similar_images(a: SourceScene, b: SourceScene, config: AggregationConfig) ->
     return [Probe(unit=unit, pairs=np.stack([pair for _, pair in rows])) for unit, rows in ranked]
 
 
-def similar_scenes(scenes: Sequence[SourceScene], config: AggregationConfig) -> list[tuple[int, int]]:
+def similar_scenes(
+    scenes: Sequence[SourceScene], config: AggregationConfig, *, cancel: Cancel | None = None
+) -> list[tuple[int, int]]:
     """Pairs of scenes to compare of which one at least has no positions, the smaller index first.
 
     Each scene without positions is compared with the `config.candidates` most similar scenes of other drives, and with
     as many of its own drive, whose images look like its own because they were taken under the same light.
+
+    Raises
+    ------
+    CancelledError
+        Where `cancel` answers True.
     """
     unplaced = [k for k, scene in enumerate(scenes) if not scene.is_placed]
     drives = [drive_of_scene(scene.name) for scene in scenes]
@@ -54,7 +69,7 @@ def similar_scenes(scenes: Sequence[SourceScene], config: AggregationConfig) -> 
         return []
     similarity = np.zeros((len(scenes), len(scenes)))
     if len(scenes) - 1 > config.candidates:  # else all are compared
-        similarity = _similarity(scenes, unplaced, config)
+        similarity = _similarity(scenes, unplaced, config, cancel)
     chosen: set[tuple[int, int]] = set()
     for k in unplaced:
         own = sorted((pair for pair in pairs if k in pair), key=lambda pair: -similarity[k, sum(pair) - k])
@@ -64,7 +79,9 @@ def similar_scenes(scenes: Sequence[SourceScene], config: AggregationConfig) -> 
     return sorted(chosen)
 
 
-def _similarity(scenes: Sequence[SourceScene], unplaced: Sequence[int], config: AggregationConfig) -> Floats:
+def _similarity(
+    scenes: Sequence[SourceScene], unplaced: Sequence[int], config: AggregationConfig, cancel: Cancel | None
+) -> Floats:
     """Mean similarity (scenes, scenes) of each scene's images, in rows, to the most similar one of each other scene.
 
     Rows of scenes that have positions are zero.
@@ -73,7 +90,7 @@ def _similarity(scenes: Sequence[SourceScene], unplaced: Sequence[int], config: 
     spacing = [probe_units(scene, scene, config)[0] for scene in scenes]
     images = [images_of(scene, units) for scene, units in zip(scenes, spacing, strict=True)]
     index = ImageIndex.from_features(
-        [one for scene, rows in zip(scenes, images, strict=True) for one in _features(scene, rows)]
+        [one for scene, rows in zip(scenes, images, strict=True) for one in _features(scene, rows)], cancel=cancel
     )
     first = np.concatenate([[0], np.cumsum([len(rows) for rows in images])])
     for k in unplaced:

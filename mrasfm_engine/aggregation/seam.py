@@ -93,7 +93,9 @@ def find_seam(
     """
     cross = CrossMatcher(a, b, matcher, config.matching, threads=config.threads)
     settings, by_positions = config.aggregation, coarse_a_from_b
-    wanted = similar_images(a, b, settings) if by_positions is None else probes(a, b, by_positions, settings)
+    wanted = (
+        similar_images(a, b, settings, cancel=cancel) if by_positions is None else probes(a, b, by_positions, settings)
+    )
     found, tried = _relocalise(a, b, wanted, cross, config, cancel=cancel, progress=progress)
     quality: dict[str, Any] = {
         "units_tried": found.units_tried,

@@ -325,7 +325,7 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
     """Place the scenes by their positions, and choose the pairs to compare."""
     started = time.perf_counter()
     run.begin(Stage.ASSOCIATION)
-    result = associate(found, run.config.aggregation)
+    result = associate(found, run.config.aggregation, cancel=run.cancel)
     result = replace(result, pairs=tuple(sorted({*result.pairs, *_pairs_with_seams(run.into, found)})))
     middle = np.array([m[:3, 3] for m in result.map_from_scene])
     if np.nanmax(np.abs(middle - middle[result.reference])) > FAR_APART_M:

@@ -25,7 +25,7 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.retrieval import revisit_pairs
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-from mrasfm_engine.types import Bools, Floats, Ints
+from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
 
 @dataclass
@@ -40,6 +40,7 @@ class PairChoice:
     features: Sequence[ImageFeatures]
     prior: PriorTrajectory
     config: EngineConfig
+    cancel: Cancel | None = None  # of the search for places that are seen again
     motion: Motion = field(init=False)
 
     def __post_init__(self) -> None:
@@ -85,7 +86,7 @@ class PairChoice:
         window = pairs_from_window(
             self.drive, pairs, self.motion, usable=self._usable, min_matches=self.config.matching.min_matches
         )
-        revisits = revisit_pairs(self.drive, self.features, pairs, self.motion)
+        revisits = revisit_pairs(self.drive, self.features, pairs, self.motion, cancel=self.cancel)
         every = np.unique(np.concatenate([window, revisits]), axis=0)
         done = set(map(tuple, self._next.tolist()))
         return every[[tuple(pair) not in done for pair in every.tolist()]]

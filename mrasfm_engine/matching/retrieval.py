@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import PairConfig
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE
 from mrasfm_engine.matching.image_motion import Motion
 from mrasfm_engine.matching.pair_selection import REVISIT_PATH_M, units_ahead
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.types import Bytes, Floats32, Ints
+from mrasfm_engine.types import Bytes, Cancel, Floats32, Ints
 
 WORDS = 64
 TRAINING_DESCRIPTORS = 30_000
@@ -29,7 +30,14 @@ NO_CANDIDATE = -2.0  # less than any scalar product of unit vectors
 MIN_LIKENESS = 0.5  # of what images at the edge of the window have with each other
 
 
-def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairConfig, motion: Motion) -> Ints:
+def revisit_pairs(
+    drive: Drive,
+    features: Sequence[ImageFeatures],
+    config: PairConfig,
+    motion: Motion,
+    *,
+    cancel: Cancel | None = None,
+) -> Ints:
     """Image pairs (n, 2) of units far apart along the path that look alike: candidates, to be matched and verified.
 
     Units nearer than `REVISIT_PATH_M`, or in each other's window, are alike because they are neighbours.
@@ -38,6 +46,11 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
     few directions gives candidates (Jegou and Chum, ECCV 2012), which the whole vectors then rank: no matrix of all
     images by all images exists, and of an image 9 KB stay in memory. Of every unit the most alike images are kept;
     where two units have a pair, their images of one camera are paired as well.
+
+    Raises
+    ------
+    CancelledError
+        Where `cancel` answers True.
     """
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     camera = np.array([image.camera for image in drive.images], dtype=np.int64)
@@ -50,7 +63,7 @@ def revisit_pairs(drive: Drive, features: Sequence[ImageFeatures], config: PairC
     edge = [(i, j) for i in range(len(unit)) if (j := where.get((int(last[unit[i]]), int(camera[i])))) is not None]
     if not edge:
         return np.zeros((0, 2), dtype=np.int64)
-    index = ImageIndex.from_features(features)
+    index = ImageIndex.from_features(features, cancel=cancel)
     limit = MIN_LIKENESS * float(np.median([index.likeness(i, np.array([j]))[0] for i, j in edge]))
     first = np.searchsorted(unit, np.arange(len(ahead) + 1))  # images are in the order of their units
     behind: list[list[int]] = [[] for _ in ahead]
@@ -109,11 +122,19 @@ class ImageIndex:
     steps: Floats32
 
     @staticmethod
-    def from_features(features: Sequence[ImageFeatures]) -> ImageIndex:
-        """Index of some images, with a vocabulary of their own."""
+    def from_features(features: Sequence[ImageFeatures], *, cancel: Cancel | None = None) -> ImageIndex:
+        """Index of some images, with a vocabulary of their own.
+
+        Raises
+        ------
+        CancelledError
+            Where `cancel` answers True.
+        """
         centres, count = _vocabulary(features), len(features)
         codes, steps = np.zeros((count, centres.size), np.int8), np.zeros(count, np.float32)
         for image, found in enumerate(features):
+            if cancel is not None and cancel():
+                raise CancelledError
             vector = _vlad(found, centres)
             steps[image] = max(float(np.abs(vector).max()), 1e-6) / np.iinfo(np.int8).max
             codes[image] = np.round(vector / steps[image])

@@ -40,7 +40,7 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
     """The stage of the matches and its report, whatever was found."""
 
     def work(stage: StageWriter) -> dict[str, Any]:
-        chosen = PairChoice(run.drive, found, known, run.config)
+        chosen = PairChoice(run.drive, found, known, run.config, run.cancel)
         result = match_pairs(
             run.drive,
             found,

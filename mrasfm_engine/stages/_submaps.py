@@ -414,7 +414,7 @@ def _joined_matches(
             is_apart = ~share_a_submap(spans, unit[pairs[:, 0]], unit[pairs[:, 1]]) | again[pairs].any(axis=1)
             return np.array([pair for pair in pairs[is_apart].tolist() if tuple(pair) not in inside]).reshape(-1, 2)
 
-        chosen = PairChoice(run.drive, found, known, run.config)
+        chosen = PairChoice(run.drive, found, known, run.config, run.cancel)
         further = chosen.further
         result = match_pairs(
             run.drive,

@@ -11,6 +11,7 @@ import pytest
 from mrasfm_engine.aggregation.image_search import similar_images, similar_scenes
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
+from mrasfm_engine.errors import CancelledError
 from tests.helpers.small_scenes import drive_along, make_street
 
 WAY = np.arange(0.0, 12.0, 2.0)
@@ -64,3 +65,11 @@ def test_units_are_looked_for_where_images_look_alike(scenes: dict[str, SourceSc
         apart_m = np.abs(WAY[first.image_unit[best[:, 0]]] - (WAY[probe.unit] + 1.0))
         assert np.median(apart_m) < 4.0
         assert (first.image_camera[best[:, 0]] == lost.image_camera[best[:, 1]]).mean() > 0.5
+
+
+def test_the_search_can_be_cancelled(scenes: dict[str, SourceScene]) -> None:
+    found = [scenes[name] for name in ("elsewhere", "far-away", "first", "lost", "second")]
+    with pytest.raises(CancelledError):
+        similar_scenes(found, AggregationConfig(candidates=2), cancel=lambda: True)
+    with pytest.raises(CancelledError):
+        similar_images(scenes["first"], scenes["lost"], AggregationConfig(), cancel=lambda: True)

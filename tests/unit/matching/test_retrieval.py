@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import PairConfig
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.matching import retrieval
 from mrasfm_engine.matching.image_motion import Motion
 from mrasfm_engine.matching.pair_selection import REVISIT_PATH_M
@@ -155,3 +156,10 @@ def test_memory_of_an_image_is_a_quarter_of_its_vector() -> None:
     likeness = np.stack([index.likeness(i, everything) for i in everything.tolist()])
     np.testing.assert_allclose(likeness, vectors @ vectors.T, atol=2e-3)
     np.testing.assert_allclose(index.directions @ index.directions.T, vectors @ vectors.T, atol=2e-3)
+
+
+def test_the_index_is_made_until_it_is_cancelled() -> None:
+    asked = iter([False, False, True])
+    with pytest.raises(CancelledError):
+        retrieval.ImageIndex.from_features(features_of(places_of_a_loop(), 1), cancel=lambda: next(asked))
+    assert next(asked, None) is None
