@@ -26,6 +26,7 @@ folds back, and what lies far outside the view would be projected into the image
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -82,8 +83,14 @@ def with_limit(kind: int, params: Floats) -> Floats:
     """The vector (PARAMETERS,) with the limit that its other parameters have."""
     result = np.array(params, dtype=np.float64)
     result[LIMIT] = -1.0
-    result[LIMIT] = math.cos(_largest_angle(kind, result, WIDEST_RAD[kind]))
+    result[LIMIT] = _cosine_of_limit(kind, result.tobytes())
     return result
+
+
+@lru_cache(maxsize=256)
+def _cosine_of_limit(kind: int, params: bytes) -> float:
+    """Cosine of the largest angle of a vector without limit: it takes a millisecond, and a drive has few cameras."""
+    return math.cos(_largest_angle(kind, np.frombuffer(params).copy(), WIDEST_RAD[kind]))
 
 
 def unpack_camera(model: str, params: Floats) -> Floats:
