@@ -106,13 +106,12 @@ def _sigmas(prior: CalibrationPrior, directions: Observability) -> tuple[Floats,
 
 def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:
     own = corrections[camera]
-    if (np.abs(own) / posterior).max() < SIGNIFICANT_SIGMAS:
-        return False
-    if (np.abs(own) / sigma).max() > BEYOND_PRIOR_SIGMAS:
+    certain = np.abs(own) >= SIGNIFICANT_SIGMAS * posterior  # a direction that is hardly known makes no other one large
+    if (np.abs(own) > BEYOND_PRIOR_SIGMAS * sigma)[certain].any():
         return True
     others = np.linalg.norm(np.delete(corrections, camera, axis=0), axis=1)
     usual = max(floor, UNUSUAL * float(np.median(others))) if len(others) >= MIN_OTHERS else np.inf
-    return bool(np.linalg.norm(own) > usual)
+    return bool(np.linalg.norm(own[certain]) > usual)
 
 
 def voted_out(registrations: Sequence[Registration], covered_units: set[int]) -> dict[str, int]:

@@ -348,7 +348,7 @@ def _hold_unobserved(
     if result.times is not None:
         result.held_times = result.times.to_hold
     hold_times = result.held_times is not None and (result.held_times.any() or holds_mean_time)
-    if result.calibration.free and (weighed.to_hold.any() or hold_times):
+    if weighed.to_hold[result.recalibrated].any() or hold_times:
         result.held = weighed.to_hold
         _adjust(mapper, result, free_units, rough=False, cancel=cancel)
     if result.georeferenced and weighed.scale_only_prior:
@@ -409,7 +409,8 @@ def _terms(mapper: Mapper, result: Refinement) -> list[Term]:
         terms += [] if result.given_scale is None else [result.given_scale]
     elif result.recalibrated.any():
         # The cameras that stay hold the gauge.
-        terms.append(replace(calibration_prior(mapper), gauge_weights=(~result.recalibrated).astype(np.float64)))
+        of_others = (~result.recalibrated).astype(np.float64)
+        terms.append(replace(calibration_prior(mapper, result.held), gauge_weights=of_others))
     if result.intrinsics is not None and result.intrinsics.free.any():
         terms.append(intrinsics_prior(mapper))
     if result.times_vary:

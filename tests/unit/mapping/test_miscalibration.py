@@ -20,7 +20,13 @@ from mrasfm_engine.mapping.miscalibration import (
 )
 from mrasfm_engine.mapping.refinement import Refinement, refine
 from mrasfm_engine.mapping.unit_registration import Registration
-from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    true_matches,
+    with_true_poses,
+)
 
 TURNING, STRAIGHT = 24, 8  # units
 
@@ -134,3 +140,51 @@ def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
     assert "cameras left and right are turned by 3.00 deg" in said.what
     at_rest = replace(state, camera_rotation=prior.rotation)
     assert find_wrong_pair(prior, at_rest, directions) is None
+
+
+@pytest.mark.parametrize(("about_y_deg", "wrong"), [(0.3, []), (1.5, [1])])
+def test_a_direction_that_is_hardly_known_makes_no_camera_wrong(about_y_deg: float, wrong: list[int]) -> None:
+    """A camera that shares little with the others: 1.2 deg about x are within what the drive leaves open."""
+    mapper = make_model(make_simulated_drive(units=4, cameras=4, points=200))
+    prior = calibration_prior(mapper)
+    rotation = prior.rotation.copy()
+    rotation[1] = se3.exp_so3(np.radians([1.2, about_y_deg, 0.0])) @ rotation[1]
+    state = replace(mapper.state, camera_rotation=rotation, camera_position_m=prior.position_m)
+    ratio = np.full((4, 6), 0.01)
+    ratio[1, 0] = np.radians(0.3) / prior.sigma_rotation_rad[1]
+    directions = Observability(
+        observed=np.ones((4, 6), dtype=np.bool_),
+        ratio=ratio,
+        scale_observed=False,
+        scale_only_prior=False,
+        sigma_scale=0.01,
+        prior_sigma_scale=0.01,
+    )
+    assert [one.camera for one in find_miscalibrations(prior, state, directions)] == wrong
+
+
+def test_what_the_drive_does_not_observe_of_a_wrong_camera_stays_as_given() -> None:
+    """A camera that shares no point with others, in three units of a straight street: nothing tells its pitch."""
+
+    def about_vertical(rig_from_cam: np.ndarray) -> np.ndarray:
+        rig_from_cam[2, :3, :3] = se3.exp_so3([0.0, 0.0, np.radians(3.0)]) @ rig_from_cam[2, :3, :3]
+        return rig_from_cam
+
+    simulated = make_simulated_drive(
+        units=STRAIGHT,
+        points=900,
+        straight=True,
+        given=about_vertical,
+        hidden=lambda unit, camera: camera == 2 and unit not in (2, 3, 4),
+    )
+    images = simulated.drive.images
+    pairs = [p for p in true_matches(simulated) if (images[p.image_a].camera == 2) == (images[p.image_b].camera == 2)]
+    mapper = with_true_poses(make_model(simulated, pairs), simulated, range(STRAIGHT))
+    adjust_globally(mapper, MappingLog(), None)
+    result = refine(mapper)
+    assert [wrong.camera for wrong in result.miscalibrations] == [2]
+    turn_deg = np.degrees(calibration_prior(mapper).corrections(mapper.state)[2, :3])
+    assert result.held is not None
+    np.testing.assert_array_equal(result.held[2], [True, False, False, True, True, True])
+    assert -3.3 < turn_deg[2] < -2.7
+    assert np.abs(turn_deg[0]) < 0.1
