@@ -10,7 +10,7 @@ from typing import Any
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.bag_cameras import camera_name, chosen_topics, same_calibration
-from mrasfm_engine.importers.bag_images import DEPTH_ENCODINGS, is_raw, size_and_suffix
+from mrasfm_engine.importers.bag_images import holds_depth, size_and_suffix
 from mrasfm_engine.importers.bag_reader import Bag, Entry
 from mrasfm_engine.importers.bag_transforms import TransformTree
 from schemas.drive import MAX_GNSS_SAMPLES
@@ -147,7 +147,7 @@ def _add_info(content: BagContent, entry: Entry) -> None:
 
 
 def _add_image(images: ImageTopic, entry: Entry) -> None:
-    images.holds_depth |= is_raw(entry.message) and entry.message.encoding in DEPTH_ENCODINGS
+    images.holds_depth |= holds_depth(entry.message)
     try:
         size, suffix = size_and_suffix(entry.message, topic=entry.topic)
         if images.suffixes and size != images.size:

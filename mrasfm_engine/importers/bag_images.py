@@ -40,12 +40,19 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
 }
 DEPTH_ENCODINGS = frozenset({"16UC1", "32FC1"})  # ROS's images of distances
+SUBSAMPLED = frozenset({"yuv422", "uyvy", "yuv422_yuy2", "yuyv"})  # two pixels share their colour
 PNG_EFFORT = 1  # of 9: more makes files a few percent smaller and takes several times as long
 
 
 def is_raw(message: Any) -> bool:
     """Return whether the message is an Image, not a CompressedImage."""
     return hasattr(message, "encoding")
+
+
+def holds_depth(message: Any) -> bool:
+    """Return whether the message is an image of distances; a compressed one says first what was compressed."""
+    kind = message.encoding if is_raw(message) else str(message.format).partition(";")[0].strip()
+    return kind in DEPTH_ENCODINGS
 
 
 def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
@@ -69,7 +76,19 @@ def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
                 remedy="Record the topic again.",
                 code="bad-image",
             )
+        if message.encoding in SUBSAMPLED and message.width % 2:
+            raise InputError(
+                f"{topic}: an image of {message.width} columns as {message.encoding}, which has pairs of them",
+                remedy="Record the topic again, or in another encoding.",
+                code="bad-image",
+            )
         return (int(message.width), int(message.height)), ".png"
+    if holds_depth(message):
+        raise InputError(
+            f"{topic}: compressed as {str(message.format)[:60]!r}, which holds distances",
+            remedy="Name the topics of images with --topics.",
+            code="unknown-encoding",
+        )
     try:
         header = header_of(message.data.tobytes(), topic)
     except ImageHeaderError as error:
