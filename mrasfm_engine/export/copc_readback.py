@@ -20,6 +20,7 @@ from pyproj import CRS, Transformer
 
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.geometry import utm
+from mrasfm_engine.geometry.earth_system import area_around
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import ROAD
 from mrasfm_engine.types import Floats
@@ -235,7 +236,7 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
         code = utm.epsg_code(place.origin_latitude_deg, place.origin_longitude_deg)
         expected = utm.well_known_text(code) if wanted is None else wanted
         yield Row("its coordinate reference system", text, expected.encode() + b"\0")
-        system = _transformer(text)
+        system = _transformer(text, place.origin_latitude_deg, place.origin_longitude_deg)
     origin_m = np.zeros(3) if system is None else _projected(scene, np.zeros((1, 3)), system)[0] - 0.5
     yield Row("its offset, whole metres,", offset_m, np.rint(offset_m))
     yield Row("its offset", offset_m, origin_m, 0.0 if system is None else 0.5 + 1e-6)
@@ -272,9 +273,11 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
 
 
 @cache
-def _transformer(text: bytes) -> Transformer:
-    """Transformer of longitude, latitude and height to the system that the file names."""
-    return Transformer.from_crs("EPSG:4979", CRS.from_wkt(text.decode("ascii").removesuffix("\0")), always_xy=True)
+def _transformer(text: bytes, latitude_deg: float, longitude_deg: float) -> Transformer:
+    """Transformer of longitude, latitude and height to the system that the file names, as it is best at a place."""
+    system = CRS.from_wkt(text.decode("ascii").removesuffix("\0"))
+    area = area_around(latitude_deg, longitude_deg)
+    return Transformer.from_crs("EPSG:4979", system, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
 
 
 @cache

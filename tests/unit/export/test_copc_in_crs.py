@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,15 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.transformer import TransformerGroup
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.contract import ExportOptions
 from mrasfm_engine.export.run_export import ExportRequest, run_export
 from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.geometry.earth_system import named_system
 from schemas.artifacts import COPC_FILE
 from tests.helpers.export_example import make_scene
@@ -89,3 +93,31 @@ def test_every_system_says_its_heights() -> None:
         text: Any = named_system(crs, at=(48.1, 11.5)).well_known_text
         assert text.startswith("COMPD_CS[")
         assert 'VERT_CS["Ellipsoid (metre)"' in text
+
+
+def test_old_datums_are_taken_as_they_are_at_the_scene(tmp_path: Path) -> None:
+    """ED50 has a transformation for each country: that of the whole of Europe is 3 m off in Norway."""
+    oslo = (59.9, 10.7)
+    near = AreaOfInterest(10.6, 59.8, 10.8, 60.0)
+    target = CRS("EPSG:23032").to_3d()
+    best = TransformerGroup("EPSG:4979", target, always_xy=True, area_of_interest=near).transformers[0]
+    system = named_system("EPSG:23032", at=oslo)
+    found = system.projected(np.zeros((1, 3)), geodesy.ecef_from_local([*oslo, 100.0]))[0]
+    assert np.abs(found - best.transform(10.7, 59.9, 100.0)).max() < 1e-4
+    anywhere = TransformerGroup("EPSG:4979", target, always_xy=True).transformers[0]
+    assert np.abs(found - anywhere.transform(10.7, 59.9, 100.0)).max() > 2.0
+    assert system.notes() == ["the transformation from WGS84 to EPSG:23032 has an accuracy of 1 m, as EPSG states it"]
+    assert named_system("EPSG:32632", at=(48.1, 11.5)).notes() == []
+    scene = make_scene()
+    assert scene.georeference is not None
+    place = replace(
+        scene.georeference,
+        origin_latitude_deg=oslo[0],
+        origin_longitude_deg=oslo[1],
+        origin_ellipsoidal_height_m=100.0,
+        ecef_from_local=geodesy.ecef_from_local([*oslo, 100.0]),
+    )
+    write_scene(replace(scene, georeference=place), tmp_path / "scene", {})
+    assert laspy.read(exported(tmp_path / "scene", "EPSG:23032")).header.point_count == len(scene.points_m)
+    with pytest.raises(InputError, match="es_ign_SPED2ETV2"):  # in Spain the best one is a grid
+        named_system("EPSG:23030", at=(40.4, -3.7))
