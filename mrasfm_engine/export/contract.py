@@ -189,10 +189,13 @@ class Written:
         A file that no check covers, and one whose check fails, withholds the format.
     notes
         What the format lacks of the scene, and why, for the user.
+    digests
+        SHA-256 of files by the same paths, of what was to be written: they are compared before the checks.
     """
 
     checks: Sequence[Check]
     notes: Sequence[str] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
 
 
 # Writes all files of a format into the work's folder. A user's mistake is an InputError; whatever else it raises

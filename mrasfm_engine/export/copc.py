@@ -15,6 +15,7 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.octree import GRID, Octree, build_octree
 from mrasfm_engine.geometry.earth_system import EarthSystem, utm_system
 from mrasfm_engine.scene.scene import Scene
@@ -53,10 +54,10 @@ def fits(scene: Scene) -> bool:
     return len(scene.points_m) > 0 and bool(reach_m <= REACH_M)
 
 
-def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> None:
+def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> str:
     """Write the points in steps of 0.1 mm: as UTM and ellipsoidal height, in the local frame without a place on earth.
 
-    They must fit.
+    They must fit. The SHA-256 of the file's content is returned.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> N
     bounds_m = low * STEP_M + offset_m, high * STEP_M + offset_m
     file.write(_header(bounds_m, offset_m, count=len(steps), records=len(records), offsets=(points_at, nodes_at)))
     file.write(_information(bounds_m[0], octree, nodes_at + 60, len(entries)))
-    path.write_bytes(file.getbuffer())
+    return write_content(path, file.getbuffer())
 
 
 def coordinates(scene: Scene, system: EarthSystem | None) -> tuple[Floats, Ints32]:

@@ -19,6 +19,7 @@ from mrasfm_engine.export import readers
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource, ExportWork, Written
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.pose_files import geodetic_positions
 from mrasfm_engine.types import Floats
 from schemas.file_names import composed
@@ -32,16 +33,18 @@ HALF_TURN_DEG = 180.0
 def write_geojson(work: ExportWork) -> Written:
     """Write the three files; the scene must be georeferenced."""
     source = work.source
+    digests: dict[str, str] = {}
     for name, features in ((TRAJECTORY, _lines(source)), (UNITS, _units(source)), (CAMERAS, _cameras(source))):
         document = {"type": "FeatureCollection", "features": list(features)}
         text = json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-        (work.folder / name).write_text(text + "\n", encoding="utf-8")
+        digests[name] = write_content(work.folder / name, text + "\n")
     return Written(
+        digests=digests,
         checks=[
             Check(TRAJECTORY, readers.json_object, partial(_compare_lines, source)),
             Check(UNITS, readers.json_object, partial(_compare_units, source)),
             Check(CAMERAS, readers.json_object, partial(_compare_cameras, source)),
-        ]
+        ],
     )
 
 

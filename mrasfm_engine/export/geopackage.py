@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from pyproj import CRS
 
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.pose_files import geodetic_positions
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats
@@ -55,8 +56,10 @@ HEIGHTS = "longitude, latitude; z is the height above the ellipsoid in metres"
 LOCAL = "metres in the scene's local frame, which has no place on the earth"
 
 
-def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path) -> None:
+def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path) -> str:
     """Write positions on WGS84; of a scene that is not georeferenced, in its local frame as an undefined system.
+
+    The SHA-256 of the file's content is returned.
 
     Parameters
     ----------
@@ -71,7 +74,7 @@ def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path) -> 
         with db:
             for table, rows in filter(itemgetter(1), (*_content_rows(scene), *_feature_rows(scene, scene_of_unit))):
                 db.executemany(f"INSERT INTO {table} VALUES ({', '.join('?' * len(rows[0]))})", rows)
-        path.write_bytes(db.serialize())
+        return write_content(path, db.serialize())
 
 
 def _positions(scene: Scene, poses: Floats) -> Floats:

@@ -18,8 +18,9 @@ from pyproj import Transformer
 
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.mcap_cameras import SentCamera
-from mrasfm_engine.export.readers import sha256, transforms
+from mrasfm_engine.export.readers import transforms
 from mrasfm_engine.types import Floats
 
 POSITION_TOLERANCE_M, ROTATION_TOLERANCE = 1e-9, 1e-9

@@ -54,13 +54,20 @@ def publishing(
         try:
             with _held(work):
                 yield work
-            with _held(out.parent, wait=True):
+            with while_nothing_moves(out):
                 _put_in_place(work, out, replaced() if callable(replaced) else replaced)
         finally:
             shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
         remedy = "Free space on this disk, or choose a folder that can be written."
         raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
+
+
+@contextmanager
+def while_nothing_moves(out: Path) -> Iterator[None]:
+    """Keep other runs from moving their results into `out`: until they have, what is there is no whole result."""
+    with _held(out.resolve().parent, wait=True):
+        yield
 
 
 @contextmanager

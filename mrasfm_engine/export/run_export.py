@@ -15,9 +15,9 @@ from mrasfm_engine import __version__
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, StorageError
 from mrasfm_engine.export.check import ReadBack
 from mrasfm_engine.export.contract import DriveFiles, ExportOptions, ExportSource, ExportWork, Written
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.formats import WRITERS
-from mrasfm_engine.export.publishing import publishing
-from mrasfm_engine.export.readers import sha256
+from mrasfm_engine.export.publishing import publishing, while_nothing_moves
 from mrasfm_engine.export.scene import write_json
 from mrasfm_engine.export.stored_scene import read_source
 from mrasfm_engine.preflight.drive_reader import read_drive
@@ -123,6 +123,7 @@ def _format(name: str, work: ExportWork) -> dict[str, Any]:
 def _fault(written: Written, folder: Path) -> str | None:
     """The first file that does not read back, and why."""
     read_back = ReadBack(folder)
+    read_back.expect(written.digests)
     for check in written.checks:
         fault = read_back.fault(check)
         if fault is not None:
@@ -168,7 +169,8 @@ def check_request(request: ExportRequest) -> None:
             remedy=_listed("Formats that do", (f.name for f in EXPORT_FORMATS.values() if f.takes_crs)),
             code="crs-not-taken",
         )
-    _replaced(request)
+    with while_nothing_moves(request.out):
+        _replaced(request)
 
 
 def _replaced(request: ExportRequest) -> list[str]:

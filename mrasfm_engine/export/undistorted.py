@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import MrasfmError
-from mrasfm_engine.export import readers
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource, ExportWork
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.pinhole_views import PinholeView, pinhole_views
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
@@ -318,7 +318,7 @@ def _not_made(camera: str, error: Any) -> MrasfmError:
 
 def folder_digests(folder: Path) -> dict[str, str]:
     """SHA-256 of all files in a folder, by their names."""
-    return {path.name: readers.sha256(path) for path in sorted(folder.iterdir())}
+    return {path.name: sha256(path) for path in sorted(folder.iterdir())}
 
 
 def same_digests(expected: dict[str, str], found: dict[str, str]) -> Rows:

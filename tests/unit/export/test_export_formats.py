@@ -120,10 +120,11 @@ def _changed(path: Path) -> Iterator[bytes]:
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_changed_digit_withholds_the_format_and_names_the_file(name: str, scene_folder: Path) -> None:
+    """By what the file says: digests, which would find it first, are left out."""
     source = read_source(scene_folder)
     work = ExportWork(source=source, options=ExportOptions(), folder=scene_folder.parent / "one", step=_nothing)
     work.folder.mkdir()
-    written = WRITERS[name](work)
+    written = replace(WRITERS[name](work), digests={})
     for path in [path for path in work.folder.rglob("*") if path.is_file()]:
         content = path.read_bytes()
         refused = total = 0
@@ -158,7 +159,7 @@ def test_a_defect_withholds_one_format_and_leaves_the_others(
         raise ZeroDivisionError("of nothing")
 
     for writer, said in (
-        (damaged, "kitti is withheld: 00/times.txt was written but does not read back: a time"),
+        (damaged, "kitti is withheld: 00/times.txt was written but does not read back: it is not what was written"),
         (unread, "kitti is withheld: surplus was written but does not read back: no check covers it"),
         (broken, "kitti is withheld: it cannot be written: ZeroDivisionError: of nothing"),
     ):
