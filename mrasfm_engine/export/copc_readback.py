@@ -52,7 +52,7 @@ _POINT = np.dtype(
     [("x", "<i4"), ("y", "<i4"), ("z", "<i4"), ("intensity", "<u2"), ("returns", "u1"), ("flags", "u1"),
      ("classification", "u1"), ("user_data", "u1"), ("scan_angle", "<i2"), ("source", "<u2"), ("gps_time", "<f8"),
      ("red", "<u2"), ("green", "<u2"), ("blue", "<u2"), ("point_id", "<u4"), ("track_length", "<u4"),
-     ("error_px", "<f4"), ("road_patch", "<i4")]
+     ("error_px", "<f4"), ("road_patch", "<i4"), ("component", "<i4")]
 )  # fmt: skip
 _UNUSED = ("intensity", "flags", "user_data", "scan_angle", "source", "gps_time")
 _ATTRIBUTES = {5: "<u4", 6: "<i4", 9: "<f4"}  # LAS's number of a type
@@ -180,7 +180,8 @@ def _records(scene: Scene, found: CopcFile) -> Rows:
     yield Row("its extra attributes", extra["name"].tolist(), [name.encode() for name in names])
     yield Row("their types", [_ATTRIBUTES.get(k) for k in extra["kind"].tolist()], [_POINT[n].str for n in names])
     descriptions = [b"its id in model/", b"images that observe it", b"mean reprojection error"]
-    yield Row("their descriptions", extra["description"].tolist(), [*descriptions, b"patch of road.json, -1: none"])
+    descriptions += [b"patch of road.json, -1: none", b"as report.json numbers them"]
+    yield Row("their descriptions", extra["description"].tolist(), descriptions)
     declared = extra["reserved"].any() or extra["options"].any() or extra["undeclared"].any()
     yield Row("what they declare besides", bool(declared), False)
     items = lazrs.LazVlr.new_for_compression(7, 4 * len(extra), True).record_data()
@@ -241,6 +242,7 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
     yield Row("its offset, whole metres,", offset_m, np.rint(offset_m))
     yield Row("its offset", offset_m, origin_m, 0.0 if system is None else 0.5 + 1e-6)
     lengths = np.bincount(scene.observation_point, minlength=len(scene.points_m))
+    components = _components(scene)
     low, high = np.full(3, np.iinfo(np.int32).max), np.full(3, np.iinfo(np.int32).min)
     unseen = np.ones(len(scene.points_m), dtype=np.bool_)
     cube_m = information["centre"] - information["half"]
@@ -263,6 +265,7 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
         yield Row("a track's length", points["track_length"], lengths[index])
         yield Row("a reprojection error", points["error_px"], scene.point_error_px[index].astype(np.float32))
         yield Row("a patch", points["road_patch"], scene.point_patches[index])
+        yield Row("a component", points["component"], components[index])
         yield Row("a return", bool((points["returns"] == 1 + 16).all()), True)
         yield Row("a field without use", [name for name in _UNUSED if points[name].any()], [])
     yield Row("the points that it lacks", bool(unseen.any()), False)
@@ -270,6 +273,16 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
     half_m = max(1, int((high - low).max())) * STEP_M / 2
     yield Row("half the side of its cube", information["half"], half_m)
     yield Row("the centre of its cube", information["centre"], header["ranges"][:, 1] + half_m)
+
+
+def _components(scene: Scene) -> NDArray[np.int64]:
+    """Component (p,) of every point: that of the first unit that observes it."""
+    if not scene.unit_component.any():
+        return np.zeros(len(scene.points_m), dtype=np.int64)
+    unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)[scene.observation_image]
+    found = np.zeros(len(scene.points_m), dtype=np.int64)
+    found[scene.observation_point[::-1]] = scene.unit_component[unit][::-1]  # the first of each point is written last
+    return found
 
 
 @cache

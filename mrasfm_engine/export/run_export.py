@@ -117,7 +117,9 @@ def _format(name: str, work: ExportWork) -> dict[str, Any]:
     if fault is not None:
         shutil.rmtree(work.folder)
         return {"withheld": f"{name} is withheld: {fault}"}
-    return {"files": list(_files(work.folder)), "notes": list(written.notes)}
+    known, crs = EXPORT_FORMATS[name], work.options.crs
+    without = [] if crs is None or known.takes_crs else [f"{crs} does not apply: {known.without_crs}"]
+    return {"files": list(_files(work.folder)), "notes": [*written.notes, *without]}
 
 
 def _fault(written: Written, folder: Path) -> str | None:

@@ -37,12 +37,18 @@ class EarthSystem:
     ----------
     well_known_text
         WKT 1 (OGC 01-009), with a system of heights.
+    horizontal
+        EPSG code of the system without heights.
+    has_vertical
+        Whether heights are in a vertical datum, not above the ellipsoid.
     code
         UTM's zone where the scene's own is meant, else None.
     """
 
     name: str
     well_known_text: str
+    horizontal: int
+    has_vertical: bool = False
     code: int | None = None
     transformer: Transformer | None = None
 
@@ -85,7 +91,7 @@ class EarthSystem:
 def utm_system(latitude_deg: float, longitude_deg: float) -> EarthSystem:
     """The UTM zone of a place, with ellipsoidal heights."""
     code = utm.epsg_code(latitude_deg, longitude_deg)
-    return EarthSystem(name=f"EPSG:{code}", well_known_text=utm.well_known_text(code), code=code)
+    return EarthSystem(name=f"EPSG:{code}", well_known_text=utm.well_known_text(code), horizontal=code, code=code)
 
 
 def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
@@ -116,7 +122,13 @@ def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
     _require_near(name, horizontal, at)
     target = horizontal.to_3d() if vertical is None else CRS.from_user_input(name)
     text = utm.with_ellipsoidal_heights(horizontal) if vertical is None else target.to_wkt("WKT1_GDAL")
-    return EarthSystem(name=name, well_known_text=text, transformer=_transformer(name, target, at))
+    return EarthSystem(
+        name=name,
+        well_known_text=text,
+        horizontal=int(match[1]),
+        has_vertical=vertical is not None,
+        transformer=_transformer(name, target, at),
+    )
 
 
 def _require_near(name: str, system: CRS, at: tuple[float, float]) -> None:
@@ -170,5 +182,7 @@ def _transformer(name: str, target: CRS, at: tuple[float, float]) -> Transformer
             code="missing-geoid-grid",
         )
     if not group.transformers:
-        raise InputError(f"no transformation to {name} is known", remedy=_REMEDY, code="bad-crs")
+        raise InputError(
+            f"no transformation from WGS84 to {name} is known where the scene lies", remedy=_REMEDY, code="bad-crs"
+        )
     return group.transformers[0]
