@@ -162,11 +162,28 @@ def area_around(latitude_deg: float, longitude_deg: float) -> AreaOfInterest:
 
 
 def _transformer(name: str, target: CRS, at: tuple[float, float]) -> Transformer:
-    """The best transformation that is known in the scene's area, and no other."""
+    return best_transformer(CRS.from_user_input(_SOURCE), target, at=at, name=name)
+
+
+def best_transformer(source: CRS, target: CRS, *, at: tuple[float, float], name: str) -> Transformer:
+    """The best transformation that is known around a place, and no other.
+
+    Parameters
+    ----------
+    at
+        Latitude and longitude.
+    name
+        What messages call the system that is not WGS84.
+
+    Raises
+    ------
+    InputError
+        Where its grid is not installed, or none is known.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of missing grids, which become an error here
         group = TransformerGroup(
-            _SOURCE,
+            source,
             target,
             always_xy=True,
             allow_ballpark=False,

@@ -58,7 +58,7 @@ def pose_of(transform: Any) -> np.ndarray:
 
 
 def test_content(tmp_path: Path) -> None:
-    scene = written(tmp_path, MODELS, kind="jpg")
+    scene = written(tmp_path, MODELS, kind="jpg", moving=False)
     _, folder = exported(tmp_path)
     found = messages(folder)
     images = [image for i, image in enumerate(scene.drive.images) if scene.image_registered[i]]
@@ -124,6 +124,22 @@ def test_a_camera_that_foxglove_has_no_model_for(tmp_path: Path) -> None:
     assert made.notes == ["Foxglove has no model for left: no calibration"]
     assert "/left/calibration" not in messages(folder)
     assert len(messages(folder)["/left/image"]) == 4
+
+
+def test_images_of_refined_time_offsets_are_where_they_were_taken(tmp_path: Path) -> None:
+    """Both cameras of a unit have one stamp, but were not taken at one time: the rig has two poses at that stamp."""
+    scene = written(tmp_path, MODELS)
+    assert scene.unit_from_image is not None
+    _, folder = exported(tmp_path)
+    poses = {(m.child_frame_id, time_ns): pose_of(m) for time_ns, m in messages(folder)["/tf"]}
+    off = []
+    for i in np.flatnonzero(scene.image_registered).tolist():
+        image = scene.drive.images[i]
+        name, time_ns = scene.drive.cameras[image.camera].name, image.timestamp_us * 1000
+        off.append(np.abs(poses["rig", time_ns] @ poses[name, time_ns] - scene.world_from_cam[i]).max())
+    assert len(off) == 7
+    assert 0 <= max(off) < 1e-6
+    assert np.abs(scene.unit_from_image[scene.image_registered] - np.eye(4)).max() > 0.1
 
 
 def test_every_changed_byte_withholds_the_file(tmp_path: Path) -> None:
