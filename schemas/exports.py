@@ -72,6 +72,12 @@ EXPORT_FORMATS = {
             needs_place=True,
             takes_crs=True,
         ),
+        ExportFormat(
+            name="geotiff",
+            description="picture of the road from above as GeoTIFF in a coordinate reference system of your choice",
+            needs_place=True,
+            takes_crs=True,
+        ),
         ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
         ExportFormat(
             name="geojson",

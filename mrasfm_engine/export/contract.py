@@ -54,6 +54,8 @@ class ExportSource:
         Masks (h, w) by camera, true where it shows the vehicle itself; cameras that do not are absent.
     files
         Images and masks of the drives; None where no format asked for them.
+    folder
+        The scene's or map's own.
     """
 
     scene: Scene
@@ -62,6 +64,7 @@ class ExportSource:
     scene_of_unit: Sequence[str]
     own_cars: Mapping[str, Bools]
     files: DriveFiles | None = None
+    folder: Path = Path()
 
     @cached_property
     def registered(self) -> list[int]:

@@ -12,6 +12,7 @@ from mrasfm_engine.export.contract import Writer
 from mrasfm_engine.export.copc_in_crs import write_copc_in_crs
 from mrasfm_engine.export.geojson import write_geojson
 from mrasfm_engine.export.geopackage_in_crs import write_geopackage_in_crs
+from mrasfm_engine.export.geotiff_in_crs import write_geotiff_in_crs
 from mrasfm_engine.export.kitti_odometry import write_kitti
 from mrasfm_engine.export.mcap import write_mcap
 from mrasfm_engine.export.nerfstudio import write_nerfstudio
@@ -24,6 +25,7 @@ WRITERS: dict[str, Writer] = {
     "mcap": write_mcap,
     "copc": write_copc_in_crs,
     "geopackage": write_geopackage_in_crs,
+    "geotiff": write_geotiff_in_crs,
     "kitti": write_kitti,
     "geojson": write_geojson,
 }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def read_source(folder: Path) -> ExportSource:
         state = f"has no {REPORT_FILE}" if folder.is_dir() else "is no folder"
         raise InputError(f"{folder} is no scene or map: it {state}", remedy=REMEDY, code="not-a-scene")
     with _damaged(folder):
-        return _map(folder) if is_map(folder) else _scene(folder)
+        return replace(_map(folder) if is_map(folder) else _scene(folder), folder=folder)
 
 
 @contextmanager
