@@ -56,6 +56,8 @@ class ExportSource:
         Images and masks of the drives; None where no format asked for them.
     folder
         The scene's or map's own.
+    masks_of_network
+        Number of images whose mask a network made while the scene was reconstructed; such masks are not kept.
     """
 
     scene: Scene
@@ -65,6 +67,7 @@ class ExportSource:
     own_cars: Mapping[str, Bools]
     files: DriveFiles | None = None
     folder: Path = Path()
+    masks_of_network: int = 0
 
     @cached_property
     def registered(self) -> list[int]:

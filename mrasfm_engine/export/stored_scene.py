@@ -77,7 +77,14 @@ def _scene(folder: Path) -> ExportSource:
         is_map=False,
         scene_of_unit=[manifest.name] * len(manifest.frames),
         own_cars=dict(_own_cars(folder, drive)),
+        masks_of_network=_masks_of_network(read_json(folder / REPORT_FILE, remedy=REMEDY)),
     )
+
+
+def _masks_of_network(report: Mapping[str, Any]) -> int:
+    """Number of images whose mask a network made, as the report's stages say."""
+    stages = report.get("stages", [])
+    return sum(stage.get("images_with_mask", {}).get("made_by_model", 0) for stage in stages)
 
 
 def _map(folder: Path) -> ExportSource:

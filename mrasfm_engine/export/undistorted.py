@@ -67,7 +67,18 @@ class UndistortedScene:
             *([f"wide cameras have two images each, of their left and right: {', '.join(wide)}"] if wide else []),
             *([f"{lost} points are left out: the pinhole images show them less than twice"] if lost else []),
             *([f"images have the pose of their middle row: {', '.join(rolling)}"] if rolling else []),
+            *self._missing_masks(),
         ]
+
+    def _missing_masks(self) -> Iterator[str]:
+        made = self.source.masks_of_network
+        if made:
+            yield (
+                f"no mask has the moving objects of {made} images: the network's masks are not kept with a scene, only "
+                "those of the drive are"
+            )
+        if self.source.is_map:
+            yield "no mask has the own car: a map does not keep its masks, only scenes do"
 
 
 def undistorted(source: ExportSource, image_size_px: int | None) -> UndistortedScene:

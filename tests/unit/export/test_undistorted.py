@@ -153,6 +153,17 @@ def test_masks_leave_out_what_moves_the_own_car_and_blank_pixels(tmp_path: Path)
             assert unused[-5].all() == of_car
 
 
+def test_masks_that_are_not_kept_are_said(tmp_path: Path) -> None:
+    scene = written(tmp_path, USUAL)
+    stages = [{"stage": "features", "images_with_mask": {"given": 0, "made_by_model": 7}}]
+    write_scene(scene, tmp_path / "scene", {"stages": stages})
+    notes = exported(tmp_path, "colmap", image_size_px=64)["formats"]["colmap"]["notes"]
+    assert [note for note in notes if "no mask has the moving objects of 7 images" in note]
+    write_scene(scene, tmp_path / "scene", {"stages": [{"stage": "features"}]})
+    notes = exported(tmp_path, "colmap", image_size_px=64)["formats"]["colmap"]["notes"]
+    assert [note for note in notes if "no mask" in note] == []
+
+
 def test_flipped_bits_withhold_the_format_and_name_the_file(tmp_path: Path) -> None:
     written(tmp_path, USUAL, masked=True)
     source = read_source(tmp_path / "scene")
