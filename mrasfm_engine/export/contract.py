@@ -58,6 +58,8 @@ class ExportSource:
         The scene's or map's own.
     masks_of_network
         Number of images whose mask a network made while the scene was reconstructed; such masks are not kept.
+    components_elsewhere
+        Folders of the parts of the drive that nothing links to this scene: they are scenes of their own.
     """
 
     scene: Scene
@@ -68,6 +70,7 @@ class ExportSource:
     files: DriveFiles | None = None
     folder: Path = Path()
     masks_of_network: int = 0
+    components_elsewhere: Sequence[str] = ()
 
     @cached_property
     def registered(self) -> list[int]:

@@ -72,6 +72,8 @@ def write_mcap(work: ExportWork) -> Written:
 
     source = work.source
     cameras = sent_cameras(source, work.options.image_size_px)
+    if taken := {camera.name for camera in cameras} & {RIG, WORLD}:
+        raise ValueError(f"camera {min(taken)} has the name of a frame: tf would lead in a circle")
     digests: dict[int, str] = {}
     with (work.folder / FILE).open("wb") as stream:
         file = HashingFile(stream)

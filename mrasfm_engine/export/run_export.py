@@ -23,7 +23,7 @@ from mrasfm_engine.export.stored_scene import read_source
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.types import Cancel, StageProgress
 from schemas import LabelMap
-from schemas.artifacts import REPORT_FILE, drive_of_scene
+from schemas.artifacts import REPORT_FILE, ROAD_TIFF_FILE, drive_of_scene
 from schemas.exports import EXPORT_FORMATS, MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX, unknown_formats
 
 VERSION = 1  # of the report
@@ -119,6 +119,7 @@ def _format(name: str, work: ExportWork) -> dict[str, Any]:
         return {"withheld": f"{name} is withheld: {fault}"}
     known, crs = EXPORT_FORMATS[name], work.options.crs
     without = [] if crs is None or known.takes_crs else [f"{crs} does not apply: {known.without_crs}"]
+    without += [f"{part} is a scene of its own, and not in it" for part in work.source.components_elsewhere]
     return {"files": list(_files(work.folder)), "notes": [*written.notes, *without]}
 
 
@@ -308,6 +309,7 @@ def _size_bytes(request: ExportRequest, source: ExportSource) -> int:
     for known in (EXPORT_FORMATS[name] for name in request.formats):
         total += POINT_BYTES * len(scene.points_m) + IMAGE_BYTES * len(scene.drive.images)
         total += 2 * images if known.needs_images else 0
+        total += _bytes(source.folder / ROAD_TIFF_FILE) if known.name == "geotiff" else 0
     return total
 
 

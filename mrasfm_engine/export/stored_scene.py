@@ -69,7 +69,7 @@ def _scene(folder: Path) -> ExportSource:
     except ValidationError as error:
         raise ValueError(f"manifest.json: {error.errors()[0]['msg']}") from error
     calibration = _document(folder / "calibration.json")["cameras"]
-    drive = Drive(Path(), manifest)
+    drive, report = Drive(Path(), manifest), read_json(folder / REPORT_FILE, remedy=REMEDY)
     calibrations = [_calibration(calibration[camera.name]) for camera in drive.cameras]
     return ExportSource(
         scene=_arrays(folder, drive, calibrations, np.zeros(len(drive.cameras), np.int64)),
@@ -77,7 +77,8 @@ def _scene(folder: Path) -> ExportSource:
         is_map=False,
         scene_of_unit=[manifest.name] * len(manifest.frames),
         own_cars=dict(_own_cars(folder, drive)),
-        masks_of_network=_masks_of_network(read_json(folder / REPORT_FILE, remedy=REMEDY)),
+        masks_of_network=_masks_of_network(report),
+        components_elsewhere=[part["folder"] for part in report.get("components", []) if part["folder"] != "."],
     )
 
 

@@ -341,6 +341,14 @@ def test_another_drive_with_the_same_names_is_refused(tmp_path: Path) -> None:
     assert found.value.code == "other-drive"
 
 
+def test_components_that_are_scenes_of_their_own_are_said(tmp_path: Path) -> None:
+    scene = make_scene()
+    write_scene(scene, tmp_path / "scene", {}, components=[(make_scene(georeferenced=False), {"component": 1})])
+    notes = _exported(tmp_path / "scene", "kitti")["formats"]["kitti"]["notes"]
+    assert notes == ["components/1 is a scene of its own, and not in it"]
+    assert _exported(tmp_path / "scene" / "components" / "1", "kitti")["formats"]["kitti"]["notes"] == []
+
+
 def test_checks_can_be_given_for_folders(tmp_path: Path) -> None:
     """As formats with many images do it: one check reads all files of a folder."""
     (tmp_path / "images").mkdir()
