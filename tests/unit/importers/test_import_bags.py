@@ -531,6 +531,23 @@ def test_padded_rows_and_big_endian_values(tmp_path: Path) -> None:
     assert np.array_equal(found, values.astype(np.uint16))
 
 
+@pytest.mark.parametrize(("bits", "encoding"), [(12, "mono16"), (10, "bayer_rggb16"), (14, "rgb16")])
+def test_sensors_of_fewer_bits_in_16(tmp_path: Path, bits: int, encoding: str) -> None:
+    """As they are, pictures of 12 bits would be all but black in 8."""
+    shape = (SIZE[1], SIZE[0], 3) if encoding == "rgb16" else (SIZE[1], SIZE[0])
+    values = np.random.default_rng(1).integers(2 ** (bits - 1), 2**bits, shape).astype("<u2")
+    made = stereo()
+    packed(values, encoding)(made)
+    drive, summary = imported(made, tmp_path)
+    note = f"Images of /left/image_raw use {bits} of 16 bits: all values are taken times {2 ** (16 - bits)}."
+    assert note in summary.notes
+    found = cv2.imread(str(drive.root / drive.images[0].file), cv2.IMREAD_UNCHANGED)
+    if encoding == "mono16":
+        assert np.array_equal(found, values << 4)
+    assert 100 < read_image_gray(drive.root / drive.images[0].file).mean() < 230
+    assert len(summary.notes) == 2  # of the right camera's images of 8 bits there is nothing to say
+
+
 def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     made = stereo()
     packed(RGB, "nv21")(made)
