@@ -14,12 +14,16 @@ import pytest
 
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import run_export as exports
+from mrasfm_engine.export.calibration import calibration_document
 from mrasfm_engine.export.check import Check, ReadBack
 from mrasfm_engine.export.contract import DriveFiles, ExportOptions, ExportSource, ExportWork
 from mrasfm_engine.export.formats import WRITERS
+from mrasfm_engine.export.map import MapContent, write_map
 from mrasfm_engine.export.scene import write_scene
-from mrasfm_engine.export.stored_scene import read_source
-from tests.helpers.export_example import scene_with_road, withheld_files
+from mrasfm_engine.export.stored_scene import _frame_in_map, read_source
+from mrasfm_engine.scene.drive import Drive
+from schemas import Rig
+from tests.helpers.export_example import make_scene, scene_with_road, withheld_files
 from tests.helpers.export_images import FISHEYES, USUAL, written
 
 FEW, MANY = 12, 2_000
@@ -66,6 +70,7 @@ def undetected(form: str, source: ExportSource, folder: Path, count: int) -> lis
     return found
 
 
+@pytest.mark.parametrize("source", ["usual"], indirect=True)
 @pytest.mark.parametrize("form", FORMS)
 def test_a_bit_of_any_file_of_a_format(form: str, source: ExportSource, tmp_path: Path) -> None:
     assert undetected(form, source, tmp_path, FEW) == []
@@ -94,12 +99,37 @@ def flipping(file: str, bit: float) -> Callable[[ReadBack, Check], str | None]:
     return fault
 
 
-def unseen(out: Path, file: str, bit: float, monkeypatch: pytest.MonkeyPatch) -> str | None:
+def write_road(out: Path) -> None:
+    write_scene(scene_with_road(), out, {}, PICTURES)
+
+
+def write_one_map(out: Path) -> None:
+    """A map of one scene: cameras and images are called a/NAME, and a checkpoint is kept."""
+    scene = make_scene()
+    manifest = scene.drive.manifest
+    cameras = [camera.model_copy(update={"name": f"a/{camera.name}"}) for camera in manifest.rig.cameras]
+    frames = [_frame_in_map(frame, "a") for frame in manifest.frames]
+    drive = Drive(Path(), manifest.model_copy(update={"rig": Rig.model_construct(cameras=cameras), "frames": frames}))
+    content = MapContent(
+        scene=replace(scene, drive=drive),
+        scene_of_unit=["a"] * len(frames),
+        document={"version": 1, "scenes": [], "seams": [], "components": []},
+        calibrations={"a": calibration_document(scene)},
+        pictures=PICTURES,
+        scenes={"a": ("0" * 64, {"points": np.arange(3000.0)}, {"manifest": manifest.model_dump(mode="json")})},
+        seams={},
+    )
+    write_map(content, out, {})
+
+
+def unseen(
+    out: Path, file: str, bit: float, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], None] = write_road
+) -> str | None:
     """Word of a scene that is published with a flipped bit in a file, or whose file is not named."""
     with monkeypatch.context() as patch:
         patch.setattr(ReadBack, "fault", flipping(file, bit))
         try:
-            write_scene(scene_with_road(), out, {}, PICTURES)
+            write(out)
         except MrasfmError as error:
             return None if file.rpartition("/")[2] in str(error) else f"{file}: {error}"
     named = [note for note in withheld_files(out) if file.rpartition("/")[2] in note]
@@ -131,4 +161,23 @@ def test_bits_of_all_files_of_a_scene(
     for file in files_of_a_scene:
         for number, bit in enumerate([0.0, 1.0, *rng.random(10).tolist()]):
             found.append(unseen(tmp_path / f"{file.replace('/', '_')} {number}", file, bit, monkeypatch))
+    assert [what for what in found if what is not None] == []
+
+
+@pytest.mark.parametrize("file", ["scenes/a.npz", "map.json", "model/images.bin", "calibration/a.json"])
+def test_a_bit_of_a_file_of_a_map(file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, bit in enumerate((0.31, 0.77)):
+        assert unseen(tmp_path / str(number), file, bit, monkeypatch, write_one_map) is None
+
+
+@pytest.mark.slow
+def test_bits_of_all_files_of_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_one_map(tmp_path / "map")
+    files = sorted(p.relative_to(tmp_path / "map").as_posix() for p in (tmp_path / "map").rglob("*") if p.is_file())
+    rng, found = np.random.default_rng(0), []
+    for file in files:
+        for number, bit in enumerate([0.0, 1.0, *rng.random(4).tolist()]):
+            out = tmp_path / f"{file.replace('/', '_')} {number}"
+            found.append(unseen(out, file, bit, monkeypatch, write_one_map))
+    assert len(files) > 20
     assert [what for what in found if what is not None] == []
