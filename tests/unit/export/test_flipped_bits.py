@@ -26,7 +26,7 @@ from schemas import Rig
 from tests.helpers.export_example import make_scene, scene_with_road, withheld_files
 from tests.helpers.export_images import FISHEYES, USUAL, written
 
-FEW, MANY = 12, 2_000
+FEW, MANY = 6, 2_000
 FORMS = [form for form in WRITERS if form != "geotiff"]  # it has a picture, and a test, of its own
 PICTURES = {"road.png": b"\x89PNG and so on" * 9}
 
