@@ -75,6 +75,8 @@ def read_directories(path: Path) -> list[dict[int, Entry]]:
             own: dict[int, Entry] = {}
             for row in range(count):
                 tag, kind, number, inline = struct.unpack_from("<HHQ8s", table, 20 * row)
+                if kind not in FORMAT:
+                    raise ValueError(f"its entry {tag} is of kind {kind}, which is not known")
                 length = number * struct.calcsize(FORMAT[kind])
                 own[tag] = (tag, kind, inline[:length] if length <= 8 else take(struct.unpack("<Q", inline)[0], length))
             found.append(own)
