@@ -11,6 +11,7 @@ with a `report.json` is complete.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.errors import InputError, MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
@@ -54,6 +55,16 @@ from schemas.artifacts import (
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
+ALWAYS = (
+    "model",
+    "points.ply",
+    "poses.tum",
+    "poses.json",
+    "calibration.json",
+    "frame.json",
+    "features.db",
+    MANIFEST_FILE,
+)
 REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 
@@ -98,6 +109,30 @@ def write_scene(
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
             _write(other, folder, own_report, NO_PICTURES)
+
+
+def require_free_folder(out: Path, checkpoints: str) -> None:
+    """Refuse a folder in which files that no scene has made would be replaced.
+
+    Parameters
+    ----------
+    checkpoints
+        Name of the folder of finished stages, which an interrupted run has left.
+
+    Raises
+    ------
+    InputError
+        That names one of them.
+    """
+    if (out / COMPLETE_MARK).exists() or (out / checkpoints).is_dir():
+        return
+    taken = [name for name in (*REPLACED, *ALWAYS) if os.path.lexists(out / name)]
+    if taken:
+        raise InputError(
+            f"{out / taken[0]} was made by no scene, and a scene would replace it",
+            remedy="Give the scene a new or empty folder with --out.",
+            code="bad-out-folder",
+        )
 
 
 def component_list(scenes: Sequence[Scene]) -> list[dict[str, Any]]:

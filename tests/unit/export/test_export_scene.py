@@ -16,16 +16,18 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mrasfm_engine.errors import MrasfmError, StorageError
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import InputError, MrasfmError, StorageError
 from mrasfm_engine.export import comparisons, feature_database, picture_files, ply, publishing, readers
 from mrasfm_engine.export.calibration import calibration_document, document_in_map
 from mrasfm_engine.export.colmap import approximations, colmap_models
 from mrasfm_engine.export.feature_database import write_features, write_matches
 from mrasfm_engine.export.pose_files import poses_document
-from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.export.scene import require_free_folder, write_scene
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
+from mrasfm_engine.pipeline import reconstruct
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.scene.scene import CalibrationObservability, ImageFeatures, Scene
 from schemas import Pose
@@ -591,3 +593,19 @@ def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
     rows = rows.copy()
     rows["component"][0] += 1
     assert [row.agrees for row in comparisons.ply(split, rows) if row.what == "a component"] == [False]
+
+
+def test_a_folder_with_files_that_no_scene_has_made_is_refused(scene: Scene, tmp_path: Path) -> None:
+    """Somebody's own pictures, say, would be replaced; other files are kept beside a scene."""
+    (tmp_path / "notes.txt").touch()
+    require_free_folder(tmp_path, ".stages")
+    require_free_folder(tmp_path / "new", ".stages")
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "mine.jpg").touch()
+    with pytest.raises(InputError, match=r"pictures was made by no scene") as found:
+        reconstruct(tmp_path / "no drive", tmp_path, EngineConfig())
+    assert found.value.code == "bad-out-folder"
+    (tmp_path / ".stages").mkdir()
+    require_free_folder(tmp_path, ".stages")  # of a run that was interrupted
+    write_scene(scene, tmp_path / "scene", {})
+    require_free_folder(tmp_path / "scene", ".stages")
