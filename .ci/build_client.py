@@ -93,11 +93,22 @@ def imports_of(path: Path) -> Iterator[str]:
         yield from (name for name in names if name.split(".")[0] in OURS)
 
 
+def _clear(out: Path) -> None:
+    """Remove an earlier project; anything else in the folder is refused."""
+    if not out.exists():
+        return
+    project_file = out / "pyproject.toml"
+    is_ours = project_file.is_file() and 'name = "mrasfm-client"' in project_file.read_text(encoding="utf-8")
+    if not is_ours and any(out.iterdir()):
+        raise SystemExit(f"{out} is not empty, and holds no earlier build: give another folder")
+    shutil.rmtree(out)
+
+
 def assemble(out: Path) -> dict[str, Path]:
     """Write the project; the modules that it has."""
     modules = needed(ROOTS)
     target = out / PACKAGE
-    shutil.rmtree(out, ignore_errors=True)
+    _clear(out)
     for path in modules.values():
         copy = target / path.relative_to(REPOSITORY)
         copy.parent.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from enum import StrEnum
 
 
@@ -38,6 +39,7 @@ REPORT_PAGE = "report.html"  # the same for people
 MAP_FILE = "map.json"
 COPC_FILE = "points.copc.laz"
 TRAJECTORY_FILE = "trajectory.gpkg"
+ROAD_TIFF_FILE = "pictures/road.tif"
 VIEW_FILE = "view.json"
 RIG_FOLDER = "rig"  # a scene's cameras in other people's formats; of a map: RIGS_FOLDER/SCENE
 RIGS_FOLDER = "rigs"
@@ -111,8 +113,12 @@ def is_read_by_next_version(path: str) -> bool:
     return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))
 
 
-def is_read_by_export(path: str) -> bool:
-    """Return whether an export reads this file of a scene or map; of a scene's smaller components none is read."""
+def is_read_by_export(path: str, formats: Collection[str]) -> bool:
+    """Return whether an export in these formats reads this file of a scene or map.
+
+    Of a scene's smaller components none is read; the picture of the road, which may be large, by its own format alone.
+    """
     files = (MAP_FILE, REPORT_FILE, "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply")
     folders = (f"{OWN_CAR_FOLDER}/", f"{SCENES_FOLDER}/", "calibration/")
-    return path in files or path in ("model/images.bin", "model/points3D.bin") or path.startswith(folders)
+    others = ("model/images.bin", "model/points3D.bin", *([ROAD_TIFF_FILE] if "geotiff" in formats else []))
+    return path in files or path in others or path.startswith(folders)

@@ -25,6 +25,8 @@ class ExportFormat:
         Only a georeferenced scene or map has it.
     takes_crs
         Its coordinates can be in a coordinate reference system of the user's choice.
+    without_crs
+        Why they cannot, for a user who asks for one for several formats.
     """
 
     name: str
@@ -32,6 +34,7 @@ class ExportFormat:
     needs_images: bool = False
     needs_place: bool = False
     takes_crs: bool = False
+    without_crs: str = "its coordinates are those of the local frame"
 
 
 EXPORT_FORMATS = {
@@ -63,9 +66,24 @@ EXPORT_FORMATS = {
             needs_place=True,
             takes_crs=True,
         ),
+        ExportFormat(
+            name="geopackage",
+            description="path and positions of units and cameras in a coordinate reference system of your choice",
+            needs_place=True,
+            takes_crs=True,
+        ),
+        ExportFormat(
+            name="geotiff",
+            description="picture of the road from above as GeoTIFF in a coordinate reference system of your choice",
+            needs_place=True,
+            takes_crs=True,
+        ),
         ExportFormat(name="kitti", description="poses, times and calibration as KITTI odometry has them"),
         ExportFormat(
-            name="geojson", description="path and positions of units and cameras as GeoJSON", needs_place=True
+            name="geojson",
+            description="path and positions of units and cameras as GeoJSON",
+            needs_place=True,
+            without_crs="GeoJSON (RFC 7946) has WGS84 alone",
         ),
     )
 }

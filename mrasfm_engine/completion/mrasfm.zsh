@@ -18,7 +18,7 @@ _shtab_mrasfm_commands() {
     demo:'Render two drives of one street, send them to a service of their own, get scenes and a map, compare with the truth.'
     describe:'Print the drive manifest'"'"'s format as Markdown (manifest) or as JSON Schema (schema), the engine'"'"'s settings with their defaults as a TOML file for --config (settings), or the environment variables of the service (service).'
     evaluate:'Compare the trajectory of a scene or a map with true poses: errors before and after alignment, and the errors of a map'"'"'s seams.'
-    export:'Write a scene or map in formats of other programs. Every file is read back before it is put in place. Formats: colmap: COLMAP workspace with undistorted pinhole images and masks, for 3DGS, nerfstudio and MVS; nerfstudio: transforms.json with undistorted pinhole images, masks and points, for nerfstudio; nuscenes: tables of nuScenes with pinhole images as keyframes, for its development kit and converters; mcap: one MCAP file with Foxglove'"'"'s schemas, for Foxglove, Lichtblick and rerun; copc: points as a cloud-optimised point cloud in a coordinate reference system of your choice; kitti: poses, times and calibration as KITTI odometry has them; geojson: path and positions of units and cameras as GeoJSON.'
+    export:'Write a scene or map in formats of other programs. Every file is read back before it is put in place. Formats: colmap: COLMAP workspace with undistorted pinhole images and masks, for 3DGS, nerfstudio and MVS; nerfstudio: transforms.json with undistorted pinhole images, masks and points, for nerfstudio; nuscenes: tables of nuScenes with pinhole images as keyframes, for its development kit and converters; mcap: one MCAP file with Foxglove'"'"'s schemas, for Foxglove, Lichtblick and rerun; copc: points as a cloud-optimised point cloud in a coordinate reference system of your choice; geopackage: path and positions of units and cameras in a coordinate reference system of your choice; geotiff: picture of the road from above as GeoTIFF in a coordinate reference system of your choice; kitti: poses, times and calibration as KITTI odometry has them; geojson: path and positions of units and cameras as GeoJSON.'
     import:'Turn a recording into a drive. The layout is recognised: a folder with rig.json, a sequence of KITTI odometry, a drive of KITTI raw, nuScenes, PandaSet, Argoverse 2, Waymo (version 2), COLMAP'"'"'s rig_config.json, or a ROS bag (ROS 1, or ROS 2 in MCAP or SQLite).'
     keys:'Create, list and revoke API keys.'
     map:'Send drives to a service, reconstruct those without a scene there, and download one map of all.'
@@ -174,7 +174,7 @@ _shtab_mrasfm_evaluate_defaults_added=0
 
 _shtab_mrasfm_export_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "*--format[format, may be repeated\: colmap, nerfstudio, nuscenes, mcap, copc, kitti, geojson]:FORMAT:(colmap nerfstudio nuscenes mcap copc kitti geojson)"
+  "*--format[format, may be repeated\: colmap, nerfstudio, nuscenes, mcap, copc, geopackage, geotiff, kitti, geojson]:FORMAT:(colmap nerfstudio nuscenes mcap copc geopackage geotiff kitti geojson)"
   "--out[folder for the export]:OUT:"
   "*--drive[folder of the drive, for formats with images\; of a map NAME\=DRIVE for each scene]:DRIVE:"
   "--image-size[scale images down to this longest side\; by default they are not]:PX:"

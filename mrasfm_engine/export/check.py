@@ -6,16 +6,17 @@ table covers is refused as well: nothing is published unread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
 
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import comparisons, readers
 from mrasfm_engine.export.colmap import text_model_fits
 from mrasfm_engine.export.comparisons import Rows
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.picture_files import LargeFile, PictureFiles
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import PICTURES_FOLDER, REPORT_FILE
@@ -67,7 +68,7 @@ def common_checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
 
 def _picture_check(name: str, data: bytes | LargeFile) -> Check:
     if isinstance(data, LargeFile):
-        return Check(name, readers.sha256, partial(comparisons.content, data.sha256))
+        return Check(name, sha256, partial(comparisons.content, data.sha256))
     return Check(name, Path.read_bytes, partial(comparisons.content, data))
 
 
@@ -77,6 +78,15 @@ class ReadBack:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._covered: set[str] = set()
+        self._contents: dict[str, str] = {}
+
+    def expect(self, digests: Mapping[str, str]) -> None:
+        """Let files have these contents, byte by byte: SHA-256 by their paths below the folder.
+
+        They are compared before a check reads the file: what it says is then compared in whole numbers and within
+        tolerances, and a count that is off cannot make a reader of others fill the memory.
+        """
+        self._contents |= digests
 
     def check(self, checks: Iterable[Check]) -> None:
         """Read files and compare them with what they must say.
@@ -105,6 +115,9 @@ class ReadBack:
         """
         self._covered.add(check.file)
         try:
+            for name in self._expected_in(check.file):
+                if sha256(self._folder / name) != self._contents.pop(name):
+                    return f"{name} is not what was written" if name != check.file else "it is not what was written"
             for row in check.compare(check.read(self._folder / check.file)):
                 if not row.agrees:
                     return row.difference
@@ -115,6 +128,10 @@ class ReadBack:
         except Exception as error:
             return f"{type(error).__name__}: {error}"
         return None
+
+    def _expected_in(self, file: str) -> list[str]:
+        """Files with a content that is not yet compared which a check of a file or folder reads."""
+        return [name for name in self._contents if file in (name, PurePosixPath(name).parent.as_posix())]
 
     def require_all(self) -> None:
         """Refuse a folder that holds a file which no check has read.

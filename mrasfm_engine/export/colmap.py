@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from mrasfm_engine.export.file_contents import sha256, write_content
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.colmap_cameras import NearestModel, nearest_model
 from mrasfm_engine.scene.scene import Scene
@@ -32,10 +33,9 @@ BINARY_FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D
 TEXT_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt")
 
 
-def write_model(scene: Scene, folder: Path) -> None:
-    """Write the binary model of all registered images into an existing folder."""
-    for name in BINARY_FILES:
-        (folder / name).write_bytes(binary_file(scene, name))
+def write_model(scene: Scene, folder: Path) -> dict[str, str]:
+    """Write the binary model of all registered images into an existing folder; the SHA-256 of its files by name."""
+    return {name: write_content(folder / name, binary_file(scene, name)) for name in BINARY_FILES}
 
 
 def binary_file(scene: Scene, name: str) -> bytes:
@@ -50,9 +50,10 @@ def binary_file(scene: Scene, name: str) -> bytes:
     return writers[name](scene)
 
 
-def write_text_model(binary_folder: Path, folder: Path) -> None:
-    """Write the text model of a binary one into an existing folder."""
+def write_text_model(binary_folder: Path, folder: Path) -> dict[str, str]:
+    """Write the text model of a binary one into an existing folder; the SHA-256 of its files by name."""
     pycolmap.Reconstruction(str(binary_folder)).write_text(str(folder))
+    return {name: sha256(folder / name) for name in TEXT_FILES}
 
 
 def text_model_fits(scene: Scene) -> bool:

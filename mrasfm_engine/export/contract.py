@@ -54,6 +54,12 @@ class ExportSource:
         Masks (h, w) by camera, true where it shows the vehicle itself; cameras that do not are absent.
     files
         Images and masks of the drives; None where no format asked for them.
+    folder
+        The scene's or map's own.
+    masks_of_network
+        Number of images whose mask a network made while the scene was reconstructed; such masks are not kept.
+    components_elsewhere
+        Folders of the parts of the drive that nothing links to this scene: they are scenes of their own.
     """
 
     scene: Scene
@@ -62,6 +68,9 @@ class ExportSource:
     scene_of_unit: Sequence[str]
     own_cars: Mapping[str, Bools]
     files: DriveFiles | None = None
+    folder: Path = Path()
+    masks_of_network: int = 0
+    components_elsewhere: Sequence[str] = ()
 
     @cached_property
     def registered(self) -> list[int]:
@@ -189,10 +198,13 @@ class Written:
         A file that no check covers, and one whose check fails, withholds the format.
     notes
         What the format lacks of the scene, and why, for the user.
+    digests
+        SHA-256 of files by the same paths, of what was to be written: they are compared before the checks.
     """
 
     checks: Sequence[Check]
     notes: Sequence[str] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
 
 
 # Writes all files of a format into the work's folder. A user's mistake is an InputError; whatever else it raises

@@ -15,6 +15,7 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.octree import GRID, Octree, build_octree
 from mrasfm_engine.geometry.earth_system import EarthSystem, utm_system
 from mrasfm_engine.scene.scene import Scene
@@ -29,13 +30,14 @@ POINT_FORMAT = 7
 POINT = np.dtype(
     [("xyz", "<i4", 3), ("intensity", "<u2"), ("returns", "u1"), ("flags", "u1"), ("classification", "u1"),
      ("user_data", "u1"), ("scan_angle", "<i2"), ("source", "<u2"), ("gps_time", "<f8"), ("rgb", "<u2", 3),
-     ("point_id", "<u4"), ("track_length", "<u4"), ("error_px", "<f4"), ("road_patch", "<i4")]
+     ("point_id", "<u4"), ("track_length", "<u4"), ("error_px", "<f4"), ("road_patch", "<i4"), ("component", "<i4")]
 )  # fmt: skip
 EXTRA = {  # name: LAS's number of its type, description
     "point_id": (5, "its id in model/"),
     "track_length": (5, "images that observe it"),
     "error_px": (9, "mean reprojection error"),
     "road_patch": (6, "patch of road.json, -1: none"),
+    "component": (6, "as report.json numbers them"),
 }
 ONE_OF_ONE_RETURN = 0x11
 # ASPRS: 0 never classified, 1 unclassified, 11 road surface; from 64 on a user's own
@@ -53,10 +55,10 @@ def fits(scene: Scene) -> bool:
     return len(scene.points_m) > 0 and bool(reach_m <= REACH_M)
 
 
-def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> None:
+def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> str:
     """Write the points in steps of 0.1 mm: as UTM and ellipsoidal height, in the local frame without a place on earth.
 
-    They must fit.
+    They must fit. The SHA-256 of the file's content is returned.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ def write_copc(scene: Scene, path: Path, system: EarthSystem | None = None) -> N
     bounds_m = low * STEP_M + offset_m, high * STEP_M + offset_m
     file.write(_header(bounds_m, offset_m, count=len(steps), records=len(records), offsets=(points_at, nodes_at)))
     file.write(_information(bounds_m[0], octree, nodes_at + 60, len(entries)))
-    path.write_bytes(file.getbuffer())
+    return write_content(path, file.getbuffer())
 
 
 def coordinates(scene: Scene, system: EarthSystem | None) -> tuple[Floats, Ints32]:
@@ -147,6 +149,7 @@ def _system_of(scene: Scene) -> EarthSystem | None:
 def _chunks(scene: Scene, steps: Ints32, octree: Octree) -> Iterator[NDArray[np.void]]:
     """The points of each node."""
     lengths = np.bincount(scene.observation_point, minlength=len(steps))
+    components = scene.point_component
     classification = np.array([CLASSIFICATION[code] for code in sorted(CLASSIFICATION)], dtype=np.uint8)
     for first, end in octree.bounds.tolist():
         of_node = octree.order[first:end]
@@ -159,6 +162,7 @@ def _chunks(scene: Scene, steps: Ints32, octree: Octree) -> Iterator[NDArray[np.
         points["track_length"] = lengths[of_node]
         points["error_px"] = scene.point_error_px[of_node]
         points["road_patch"] = scene.point_patches[of_node]
+        points["component"] = components[of_node]
         yield points
 
 

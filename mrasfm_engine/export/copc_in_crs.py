@@ -24,10 +24,12 @@ def write_copc_in_crs(work: ExportWork) -> Written:
             code="too-far",
         )
     system = _system(scene, work.options.crs)
-    copc.write_copc(scene, work.folder / COPC_FILE, system)
+    digest = copc.write_copc(scene, work.folder / COPC_FILE, system)
     compare = partial(copc_readback.copc, scene, text=system.well_known_text)
     check = Check(COPC_FILE, copc_readback.read_copc, compare)
-    return Written(checks=[check], notes=[f"coordinates are in {system.name}"])
+    return Written(
+        checks=[check], digests={COPC_FILE: digest}, notes=[f"coordinates are in {system.name}", *system.notes()]
+    )
 
 
 def _system(scene: Scene, crs: str | None) -> EarthSystem:

@@ -20,6 +20,7 @@ from pyproj import CRS, Transformer
 
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.geometry import utm
+from mrasfm_engine.geometry.earth_system import area_around
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import ROAD
 from mrasfm_engine.types import Floats
@@ -51,7 +52,7 @@ _POINT = np.dtype(
     [("x", "<i4"), ("y", "<i4"), ("z", "<i4"), ("intensity", "<u2"), ("returns", "u1"), ("flags", "u1"),
      ("classification", "u1"), ("user_data", "u1"), ("scan_angle", "<i2"), ("source", "<u2"), ("gps_time", "<f8"),
      ("red", "<u2"), ("green", "<u2"), ("blue", "<u2"), ("point_id", "<u4"), ("track_length", "<u4"),
-     ("error_px", "<f4"), ("road_patch", "<i4")]
+     ("error_px", "<f4"), ("road_patch", "<i4"), ("component", "<i4")]
 )  # fmt: skip
 _UNUSED = ("intensity", "flags", "user_data", "scan_angle", "source", "gps_time")
 _ATTRIBUTES = {5: "<u4", 6: "<i4", 9: "<f4"}  # LAS's number of a type
@@ -179,7 +180,8 @@ def _records(scene: Scene, found: CopcFile) -> Rows:
     yield Row("its extra attributes", extra["name"].tolist(), [name.encode() for name in names])
     yield Row("their types", [_ATTRIBUTES.get(k) for k in extra["kind"].tolist()], [_POINT[n].str for n in names])
     descriptions = [b"its id in model/", b"images that observe it", b"mean reprojection error"]
-    yield Row("their descriptions", extra["description"].tolist(), [*descriptions, b"patch of road.json, -1: none"])
+    descriptions += [b"patch of road.json, -1: none", b"as report.json numbers them"]
+    yield Row("their descriptions", extra["description"].tolist(), descriptions)
     declared = extra["reserved"].any() or extra["options"].any() or extra["undeclared"].any()
     yield Row("what they declare besides", bool(declared), False)
     items = lazrs.LazVlr.new_for_compression(7, 4 * len(extra), True).record_data()
@@ -235,11 +237,12 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
         code = utm.epsg_code(place.origin_latitude_deg, place.origin_longitude_deg)
         expected = utm.well_known_text(code) if wanted is None else wanted
         yield Row("its coordinate reference system", text, expected.encode() + b"\0")
-        system = _transformer(text)
+        system = _transformer(text, place.origin_latitude_deg, place.origin_longitude_deg)
     origin_m = np.zeros(3) if system is None else _projected(scene, np.zeros((1, 3)), system)[0] - 0.5
     yield Row("its offset, whole metres,", offset_m, np.rint(offset_m))
     yield Row("its offset", offset_m, origin_m, 0.0 if system is None else 0.5 + 1e-6)
     lengths = np.bincount(scene.observation_point, minlength=len(scene.points_m))
+    components = _components(scene)
     low, high = np.full(3, np.iinfo(np.int32).max), np.full(3, np.iinfo(np.int32).min)
     unseen = np.ones(len(scene.points_m), dtype=np.bool_)
     cube_m = information["centre"] - information["half"]
@@ -262,6 +265,7 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
         yield Row("a track's length", points["track_length"], lengths[index])
         yield Row("a reprojection error", points["error_px"], scene.point_error_px[index].astype(np.float32))
         yield Row("a patch", points["road_patch"], scene.point_patches[index])
+        yield Row("a component", points["component"], components[index])
         yield Row("a return", bool((points["returns"] == 1 + 16).all()), True)
         yield Row("a field without use", [name for name in _UNUSED if points[name].any()], [])
     yield Row("the points that it lacks", bool(unseen.any()), False)
@@ -271,10 +275,22 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
     yield Row("the centre of its cube", information["centre"], header["ranges"][:, 1] + half_m)
 
 
+def _components(scene: Scene) -> NDArray[np.int64]:
+    """Component (p,) of every point: that of the first unit that observes it."""
+    if not scene.unit_component.any():
+        return np.zeros(len(scene.points_m), dtype=np.int64)
+    unit = np.array([image.unit for image in scene.drive.images], dtype=np.int64)[scene.observation_image]
+    found = np.zeros(len(scene.points_m), dtype=np.int64)
+    found[scene.observation_point[::-1]] = scene.unit_component[unit][::-1]  # the first of each point is written last
+    return found
+
+
 @cache
-def _transformer(text: bytes) -> Transformer:
-    """Transformer of longitude, latitude and height to the system that the file names."""
-    return Transformer.from_crs("EPSG:4979", CRS.from_wkt(text.decode("ascii").removesuffix("\0")), always_xy=True)
+def _transformer(text: bytes, latitude_deg: float, longitude_deg: float) -> Transformer:
+    """Transformer of longitude, latitude and height to the system that the file names, as it is best at a place."""
+    system = CRS.from_wkt(text.decode("ascii").removesuffix("\0"))
+    area = area_around(latitude_deg, longitude_deg)
+    return Transformer.from_crs("EPSG:4979", system, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
 
 
 @cache

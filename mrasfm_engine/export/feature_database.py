@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.export.colmap import REFERENCE_SENSOR_ID, RIG_ID, colmap_models, frame_of_image
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.colmap_cameras import NearestModel, nearest_model
 from mrasfm_engine.scene.drive import Drive
@@ -23,8 +24,8 @@ from mrasfm_engine.scene.scene import ImageFeatures, PairMatches, Scene
 from mrasfm_engine.types import Floats
 
 
-def write_features(scene: Scene, path: Path) -> None:
-    """Write a scene's database, with the calibration as refined, in one transaction.
+def write_features(scene: Scene, path: Path) -> str:
+    """Write a scene's database, with the calibration as refined, in one transaction; the SHA-256 of its content.
 
     Raises
     ------
@@ -42,6 +43,7 @@ def write_features(scene: Scene, path: Path) -> None:
         ),
         path,
     )
+    return sha256(path)
 
 
 def write_matches(drive: Drive, features: Sequence[ImageFeatures], pairs: Sequence[PairMatches], path: Path) -> None:

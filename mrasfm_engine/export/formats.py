@@ -11,6 +11,8 @@ from mrasfm_engine.export.colmap_workspace import write_colmap
 from mrasfm_engine.export.contract import Writer
 from mrasfm_engine.export.copc_in_crs import write_copc_in_crs
 from mrasfm_engine.export.geojson import write_geojson
+from mrasfm_engine.export.geopackage_in_crs import write_geopackage_in_crs
+from mrasfm_engine.export.geotiff_in_crs import write_geotiff_in_crs
 from mrasfm_engine.export.kitti_odometry import write_kitti
 from mrasfm_engine.export.mcap import write_mcap
 from mrasfm_engine.export.nerfstudio import write_nerfstudio
@@ -22,6 +24,8 @@ WRITERS: dict[str, Writer] = {
     "nuscenes": write_nuscenes,
     "mcap": write_mcap,
     "copc": write_copc_in_crs,
+    "geopackage": write_geopackage_in_crs,
+    "geotiff": write_geotiff_in_crs,
     "kitti": write_kitti,
     "geojson": write_geojson,
 }

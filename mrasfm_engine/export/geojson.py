@@ -1,8 +1,8 @@
 """Format `geojson`: the layers of `trajectory.gpkg` as GeoJSON (RFC 7946), for web maps.
 
-`trajectory.geojson` has a line for each scene, `unit_positions.geojson` and `camera_positions.geojson` a point for each
-registered unit and image. Coordinates are longitude, latitude (WGS84) and ellipsoidal height; a line that crosses the
-antimeridian is cut there, as the RFC wants it.
+`trajectory.geojson` has a line for each component of a scene, `unit_positions.geojson` and `camera_positions.geojson`
+a point for each registered unit and image. Coordinates are longitude, latitude (WGS84) and ellipsoidal height; a line
+that crosses the antimeridian is cut there, as the RFC wants it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from mrasfm_engine.export import readers
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource, ExportWork, Written
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.pose_files import geodetic_positions
 from mrasfm_engine.types import Floats
 from schemas.file_names import composed
@@ -32,28 +33,30 @@ HALF_TURN_DEG = 180.0
 def write_geojson(work: ExportWork) -> Written:
     """Write the three files; the scene must be georeferenced."""
     source = work.source
+    digests: dict[str, str] = {}
     for name, features in ((TRAJECTORY, _lines(source)), (UNITS, _units(source)), (CAMERAS, _cameras(source))):
         document = {"type": "FeatureCollection", "features": list(features)}
         text = json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-        (work.folder / name).write_text(text + "\n", encoding="utf-8")
+        digests[name] = write_content(work.folder / name, text + "\n")
     return Written(
+        digests=digests,
         checks=[
             Check(TRAJECTORY, readers.json_object, partial(_compare_lines, source)),
             Check(UNITS, readers.json_object, partial(_compare_units, source)),
             Check(CAMERAS, readers.json_object, partial(_compare_cameras, source)),
-        ]
+        ],
     )
 
 
 def _lines(source: ExportSource) -> Iterator[dict[str, Any]]:
     places = _positions(source, source.scene.world_from_rig)
-    for name in dict.fromkeys(source.scene_of_unit):
-        units = _units_of(source, name)
+    for name, component in _parts(source):
+        units = _units_of(source, name, component)
         if len(units) < 2:
             continue
         parts = _cut(places[units])
         kind, coordinates = ("LineString", parts[0]) if len(parts) == 1 else ("MultiLineString", parts)
-        yield _feature(kind, coordinates, {"scene": name, "units": len(units)})
+        yield _feature(kind, coordinates, {"scene": name, "component": component, "units": len(units)})
 
 
 def _units(source: ExportSource) -> Iterator[dict[str, Any]]:
@@ -63,6 +66,7 @@ def _units(source: ExportSource) -> Iterator[dict[str, Any]]:
         properties = {
             "unit": u,
             "scene": source.scene_of_unit[u],
+            "component": int(scene.unit_component[u]),
             "source_frame": frame.source_frame,
             "timestamp_us": frame.timestamp_us,
         }
@@ -78,6 +82,7 @@ def _cameras(source: ExportSource) -> Iterator[dict[str, Any]]:
             "camera": scene.drive.cameras[image.camera].name,
             "unit": image.unit,
             "scene": source.scene_of_unit[image.unit],
+            "component": int(scene.unit_component[image.unit]),
             "timestamp_us": image.timestamp_us,
         }
         yield _feature("Point", _rounded(places[i]), properties)
@@ -98,9 +103,15 @@ def _positions(source: ExportSource, poses: Floats) -> Floats:
     return places[:, [1, 0, 2]]
 
 
-def _units_of(source: ExportSource, name: str) -> list[int]:
+def _parts(source: ExportSource) -> list[tuple[str, int]]:
+    """Scenes and the components of each, in order; no line leads from one to another, as nothing links them."""
+    return list(dict.fromkeys(zip(source.scene_of_unit, source.scene.unit_component.tolist(), strict=True)))
+
+
+def _units_of(source: ExportSource, name: str, component: int) -> list[int]:
     scene = source.scene
-    units = np.flatnonzero(scene.unit_registered & np.array([own == name for own in source.scene_of_unit]))
+    of_scene = np.array([own == name for own in source.scene_of_unit])
+    units = np.flatnonzero(scene.unit_registered & of_scene & (scene.unit_component == component))
     ordered: list[int] = units[np.argsort(scene.drive.timestamps_us[units], kind="stable")].tolist()
     return ordered
 
@@ -127,12 +138,12 @@ def _cut(places: Floats) -> list[list[list[float]]]:
 def _compare_lines(source: ExportSource, document: dict[str, Any]) -> Rows:
     """Every point of a line but those where it is cut."""
     places = _positions(source, source.scene.world_from_rig)
-    known = [name for name in dict.fromkeys(source.scene_of_unit) if len(_units_of(source, name)) > 1]
+    known = [part for part in _parts(source) if len(_units_of(source, *part)) > 1]
     features = document["features"]
     yield from _kinds(document, {"LineString", "MultiLineString"})
-    yield Row("its scenes", [feature["properties"]["scene"] for feature in features], known)
-    for name, feature in zip(known, features, strict=True):
-        units, coordinates = _units_of(source, name), feature["geometry"]["coordinates"]
+    yield Row("its scenes and their components", _properties(document, ("scene", "component")), known)
+    for (name, component), feature in zip(known, features, strict=True):
+        units, coordinates = _units_of(source, name, component), feature["geometry"]["coordinates"]
         lines = [coordinates] if feature["geometry"]["type"] == "LineString" else coordinates
         found = [place for line in lines for place in line]
         cuts = [[line[-1], following[0]] for line, following in pairwise(lines)]
@@ -148,8 +159,11 @@ def _compare_units(source: ExportSource, document: dict[str, Any]) -> Rows:
     yield from _kinds(document, {"Point"})
     yield from _points(document, _positions(source, scene.world_from_rig)[units])
     frames = scene.drive.manifest.frames
-    expected = [(u, source.scene_of_unit[u], frames[u].source_frame, frames[u].timestamp_us) for u in units]
-    keys = ("unit", "scene", "source_frame", "timestamp_us")
+    components = scene.unit_component.tolist()
+    expected = [
+        (u, source.scene_of_unit[u], components[u], frames[u].source_frame, frames[u].timestamp_us) for u in units
+    ]
+    keys = ("unit", "scene", "component", "source_frame", "timestamp_us")
     yield Row("a unit's properties", _properties(document, keys), expected)
 
 
@@ -159,10 +173,13 @@ def _compare_cameras(source: ExportSource, document: dict[str, Any]) -> Rows:
     yield from _points(document, _positions(source, scene.world_from_cam)[source.registered])
     images = [scene.drive.images[i] for i in source.registered]
     expected = [
-        (composed(i.file), scene.drive.cameras[i.camera].name, i.unit, source.scene_of_unit[i.unit], i.timestamp_us)
+        (
+            *(composed(i.file), scene.drive.cameras[i.camera].name, i.unit, source.scene_of_unit[i.unit]),
+            *(int(scene.unit_component[i.unit]), i.timestamp_us),
+        )
         for i in images
     ]
-    keys = ("image", "camera", "unit", "scene", "timestamp_us")
+    keys = ("image", "camera", "unit", "scene", "component", "timestamp_us")
     yield Row("an image's properties", _properties(document, keys), expected)
 
 

@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 from pyproj import CRS
 
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.pose_files import geodetic_positions
+from mrasfm_engine.geometry.earth_system import EarthSystem
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats
 
@@ -39,29 +41,45 @@ TABLES = {
     "column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, "
     "srs_id INTEGER NOT NULL REFERENCES gpkg_spatial_ref_sys(srs_id), z TINYINT NOT NULL, m TINYINT NOT NULL, "
     "PRIMARY KEY (table_name, column_name)",
-    TRAJECTORY: "fid INTEGER PRIMARY KEY NOT NULL, geom LINESTRING, scene TEXT, units INTEGER",
-    UNITS: "fid INTEGER PRIMARY KEY NOT NULL, geom POINT, scene TEXT, source_frame INTEGER, "
+    TRAJECTORY: "fid INTEGER PRIMARY KEY NOT NULL, geom LINESTRING, scene TEXT, component INTEGER, units INTEGER",
+    UNITS: "fid INTEGER PRIMARY KEY NOT NULL, geom POINT, scene TEXT, component INTEGER, source_frame INTEGER, "
     "timestamp_us INTEGER, time DATETIME, registered BOOLEAN, sigma_x_m DOUBLE, sigma_y_m DOUBLE, sigma_z_m DOUBLE",
-    CAMERAS: "fid INTEGER PRIMARY KEY NOT NULL, geom POINT, scene TEXT, unit INTEGER, camera TEXT, "
+    CAMERAS: "fid INTEGER PRIMARY KEY NOT NULL, geom POINT, scene TEXT, component INTEGER, unit INTEGER, camera TEXT, "
     "image TEXT, timestamp_us INTEGER, time DATETIME, registered BOOLEAN",
 }
 GEOMETRIES = {TRAJECTORY: LINE, UNITS: POINT, CAMERAS: POINT}
 DESCRIPTIONS = {
-    TRAJECTORY: "the rig's path",
+    TRAJECTORY: "the rig's path; a line for each component",
     UNITS: "the rig's positions; sigmas along the local frame's axes",
     CAMERAS: "the cameras' positions",
 }
 HEIGHTS = "longitude, latitude; z is the height above the ellipsoid in metres"
 LOCAL = "metres in the scene's local frame, which has no place on the earth"
+ELLIPSOIDAL, IN_DATUM = (
+    "z is the height above the ellipsoid in metres",
+    "z is the height in the system's vertical datum",
+)
+OWN_SYSTEM = 100_000  # id of a system with a vertical datum, for which EPSG has no code of its own
 
 
-def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path) -> None:
+def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path, system: EarthSystem | None = None) -> str:
     """Write positions on WGS84; of a scene that is not georeferenced, in its local frame as an undefined system.
+
+    The SHA-256 of the file's content is returned.
 
     Parameters
     ----------
     scene_of_unit
-        Name of the scene of each unit; each has a line in `trajectory`.
+        Name of the scene of each unit; each has a line in `trajectory` for each of its components.
+    system
+        In place of WGS84, of a scene with a place on the earth.
+
+    Raises
+    ------
+    OSError
+        Where the file cannot be written.
+    InputError
+        Where a position has no coordinates in the system.
     """
     with closing(sqlite3.connect(":memory:")) as db:  # on disk at once: a full disk is an OSError
         db.executescript(
@@ -69,22 +87,35 @@ def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path) -> 
             + "".join(f"CREATE TABLE {name} ({columns});" for name, columns in TABLES.items())
         )
         with db:
-            for table, rows in filter(itemgetter(1), (*_content_rows(scene), *_feature_rows(scene, scene_of_unit))):
+            content = (*_content_rows(scene, system), *_feature_rows(scene, scene_of_unit, system))
+            for table, rows in filter(itemgetter(1), content):
                 db.executemany(f"INSERT INTO {table} VALUES ({', '.join('?' * len(rows[0]))})", rows)
-        path.write_bytes(db.serialize())
+        return write_content(path, db.serialize())
 
 
-def _positions(scene: Scene, poses: Floats) -> Floats:
+def _positions(scene: Scene, poses: Floats, system: EarthSystem | None) -> Floats:
     """Origins (n, 3) of poses (n, 4, 4) in the file's system: longitude, latitude and height, or local coordinates.
 
     Across the antimeridian longitudes go on beyond 180 deg, on the side of the scene's origin: lines and extents would
     reach around the earth.
     """
+    if system is not None:
+        return projected_positions(scene, poses, system)
     geodetic, place = geodetic_positions(scene, poses), scene.georeference
     if geodetic is None or place is None:
         return poses[:, :3, 3]
     places: Floats = geodetic[:, [1, 0, 2]]
     places[:, 0] -= 360.0 * np.rint((places[:, 0] - place.origin_longitude_deg) / 360.0)
+    return places
+
+
+def projected_positions(scene: Scene, poses: Floats, system: EarthSystem) -> Floats:
+    """Origins (n, 3) of poses (n, 4, 4) in a system of coordinates; NaN where a pose is."""
+    assert scene.georeference is not None
+    places = np.full((len(poses), 3), np.nan)
+    known = np.isfinite(poses[:, :3, 3]).all(axis=1)
+    if known.any():
+        places[known] = system.projected(poses[known, :3, 3], scene.georeference.ecef_from_local)
     return places
 
 
@@ -95,18 +126,19 @@ def _date(timestamp_us: int) -> str | None:
     return f"{np.datetime64((timestamp_us + 500) // 1000, 'ms')}Z"
 
 
-def _content_rows(scene: Scene) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
+def _content_rows(scene: Scene, system: EarthSystem | None) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
     """Rows of the tables that describe the others, by table."""
-    srs = _srs_id(scene)
+    srs = _srs_id(scene, system)
     yield (
         "gpkg_spatial_ref_sys",
         [
             ("WGS 84", WGS84, "EPSG", WGS84, CRS.from_epsg(WGS84).to_wkt("WKT1_GDAL"), HEIGHTS),
             ("Undefined Cartesian", UNDEFINED_CARTESIAN, "NONE", UNDEFINED_CARTESIAN, "undefined", LOCAL),
             ("Undefined geographic", UNDEFINED_GEOGRAPHIC, "NONE", UNDEFINED_GEOGRAPHIC, "undefined", None),
+            *([] if system is None else [_system_row(system)]),
         ],
     )
-    rig, cameras = (_positions(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
+    rig, cameras = (_positions(scene, poses, system) for poses in (scene.world_from_rig, scene.world_from_cam))
     # No time of writing: the same scene is the same file.
     last_change = _date(int(scene.drive.timestamps_us.max())) or NO_DATE
     yield (
@@ -119,22 +151,35 @@ def _content_rows(scene: Scene) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
     yield "gpkg_geometry_columns", [(table, "geom", kind, srs, 1, 0) for table, kind in GEOMETRIES.items()]
 
 
-def _feature_rows(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
+def _system_row(system: EarthSystem) -> tuple[Any, ...]:
+    if system.has_vertical:
+        name = CRS.from_wkt(system.well_known_text).name
+        return name, OWN_SYSTEM, "NONE", OWN_SYSTEM, system.well_known_text, IN_DATUM
+    horizontal = CRS.from_epsg(system.horizontal)
+    text, code = horizontal.to_wkt("WKT1_GDAL"), system.horizontal
+    return horizontal.name, code, "EPSG", code, text, ELLIPSOIDAL
+
+
+def _feature_rows(
+    scene: Scene, scene_of_unit: Sequence[str], system: EarthSystem | None
+) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
     """Rows of the tables with geometries, by table."""
-    srs, drive = _srs_id(scene), scene.drive
-    rig, cameras = (_positions(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
+    srs, drive, component = _srs_id(scene, system), scene.drive, scene.unit_component.tolist()
+    rig, cameras = (_positions(scene, poses, system) for poses in (scene.world_from_rig, scene.world_from_cam))
     lines: list[tuple[Any, ...]] = []
-    for name in dict.fromkeys(scene_of_unit):
-        units = np.flatnonzero(scene.unit_registered & np.array([own == name for own in scene_of_unit]))
+    # No line leads from one component to another: nothing links them.
+    for name, number in dict.fromkeys(zip(scene_of_unit, component, strict=True)):
+        own = [pair == (name, number) for pair in zip(scene_of_unit, component, strict=True)]
+        units = np.flatnonzero(scene.unit_registered & np.array(own))
         units = units[np.argsort(drive.timestamps_us[units], kind="stable")]
         if len(units) > 1:
-            lines.append((len(lines) + 1, _line(rig[units], srs), name, len(units)))
+            lines.append((len(lines) + 1, _line(rig[units], srs), name, number, len(units)))
     yield TRAJECTORY, lines
     yield (
         UNITS,
         [
             (
-                *(u + 1, _point(rig[u], srs), scene_of_unit[u], frame.source_frame),
+                *(u + 1, _point(rig[u], srs), scene_of_unit[u], component[u], frame.source_frame),
                 *(frame.timestamp_us, _date(frame.timestamp_us), bool(scene.unit_registered[u])),
                 *_known(scene.sigma_position_m[u]),
             )
@@ -145,7 +190,7 @@ def _feature_rows(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[
         CAMERAS,
         [
             (
-                *(i + 1, _point(cameras[i], srs), scene_of_unit[image.unit], image.unit + 1),
+                *(i + 1, _point(cameras[i], srs), scene_of_unit[image.unit], component[image.unit], image.unit + 1),
                 *(drive.cameras[image.camera].name, image.file, image.timestamp_us, _date(image.timestamp_us)),
                 bool(scene.image_registered[i]),
             )
@@ -154,8 +199,10 @@ def _feature_rows(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[
     )
 
 
-def _srs_id(scene: Scene) -> int:
+def _srs_id(scene: Scene, system: EarthSystem | None) -> int:
     """Id of the file's spatial reference system."""
+    if system is not None:
+        return OWN_SYSTEM if system.has_vertical else system.horizontal
     return UNDEFINED_CARTESIAN if scene.georeference is None else WGS84
 
 

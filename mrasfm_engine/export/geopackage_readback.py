@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import CRS
+from pyproj import CRS, Transformer
 
 from mrasfm_engine.export.comparisons import Row, Rows
-from mrasfm_engine.export.geopackage import DESCRIPTIONS, HEIGHTS, LOCAL, TABLES
+from mrasfm_engine.export.geopackage import DESCRIPTIONS, ELLIPSOIDAL, HEIGHTS, IN_DATUM, LOCAL, TABLES
 from mrasfm_engine.export.pose_files import geodetic_positions
+from mrasfm_engine.geometry.earth_system import area_around
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
 
+PROJECTED_TOLERANCE = 1e-5  # of a system's unit; numbers of millions have nine more digits
 Select = Callable[[str], list[tuple[Any, ...]]]
 
 _POINT = np.dtype(
@@ -41,8 +43,14 @@ def read_geopackage(path: Path) -> Select:
     return select
 
 
-def geopackage(scene: Scene, scene_of_unit: Sequence[str], select: Select) -> Rows:
-    """The tables as the standard wants them, and every attribute and coordinate."""
+def geopackage(scene: Scene, scene_of_unit: Sequence[str], select: Select, *, crs: str | None = None) -> Rows:
+    """The tables as the standard wants them, and every attribute and coordinate.
+
+    Parameters
+    ----------
+    crs
+        Name of the system of coordinates, as `EPSG:25832` or `EPSG:25832+7837`, where it is not WGS84.
+    """
     yield Row("its application id", select("PRAGMA application_id"), [(0x47504B47,)])
     yield Row("its version", select("PRAGMA user_version"), [(10300,)])
     yield Row("its integrity", select("PRAGMA integrity_check"), [("ok",)])
@@ -50,36 +58,67 @@ def geopackage(scene: Scene, scene_of_unit: Sequence[str], select: Select) -> Ro
         select("SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite%'")
     )
     yield Row("its tables", tables, {name: f"CREATE TABLE {name} ({columns})" for name, columns in TABLES.items()})
-    rig, cameras = (_places(scene, poses) for poses in (scene.world_from_rig, scene.world_from_cam))
-    yield from _contents(scene, select, rig=rig, cameras=cameras)
+    system = None if crs is None else _named(crs)
+    srs = _srs(scene) if system is None else system[1]
+    rig, cameras = (_places(scene, poses, system) for poses in (scene.world_from_rig, scene.world_from_cam))
+    tolerance = None if system is None else PROJECTED_TOLERANCE
+    yield from _contents(scene, select, srs=srs, system=system, rig=rig, cameras=cameras, tolerance=tolerance)
     for table, places, attributes in (
         ("unit_positions", rig, list(_units(scene, scene_of_unit))),
         ("camera_positions", cameras, list(_images(scene, scene_of_unit))),
     ):
         rows = select(f"SELECT * FROM {table} ORDER BY fid")
         yield Row(f"the rows of {table}", [(row[0], *row[2:]) for row in rows], attributes)
-        yield from _points(scene, table, [row[1] for row in rows], places)
-    yield from _lines(scene, scene_of_unit, select("SELECT * FROM trajectory ORDER BY fid"), rig)
+        yield from _points(srs, table, [row[1] for row in rows], places, tolerance)
+    lines = select("SELECT * FROM trajectory ORDER BY fid")
+    yield from _lines(scene, scene_of_unit, lines, rig, srs=srs, tolerance=tolerance)
 
 
-def _contents(scene: Scene, select: Select, *, rig: Floats, cameras: Floats) -> Rows:
-    srs = _srs(scene)
+def _named(crs: str) -> tuple[Any, ...]:
+    """The row of a system in the table of reference systems."""
+    system = CRS.from_user_input(crs)
+    if "+" in crs:
+        return system.name, 100_000, "NONE", 100_000, system.to_wkt("WKT1_GDAL"), IN_DATUM
+    code = int(crs.removeprefix("EPSG:"))
+    return system.name, code, "EPSG", code, system.to_wkt("WKT1_GDAL"), ELLIPSOIDAL
+
+
+def _contents(
+    scene: Scene,
+    select: Select,
+    *,
+    srs: int,
+    system: tuple[Any, ...] | None,
+    rig: Floats,
+    cameras: Floats,
+    tolerance: float | None,
+) -> Rows:
     yield Row(
         "its reference systems",
         sorted(select("SELECT * FROM gpkg_spatial_ref_sys")),
-        [
-            ("Undefined Cartesian", -1, "NONE", -1, "undefined", LOCAL),
-            ("Undefined geographic", 0, "NONE", 0, "undefined", None),
-            ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), HEIGHTS),
-        ],
+        sorted(
+            [
+                *([] if system is None else [system]),
+                ("Undefined Cartesian", -1, "NONE", -1, "undefined", LOCAL),
+                ("Undefined geographic", 0, "NONE", 0, "undefined", None),
+                ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), HEIGHTS),
+            ],
+            key=lambda row: row[:4],
+        ),
     )
     changed = _date(max(frame.timestamp_us for frame in scene.drive.manifest.frames)) or "1970-01-01T00:00:00.000Z"
     extents = {}
     for table, places in (("trajectory", rig), ("unit_positions", rig), ("camera_positions", cameras)):
         known = places[~np.isnan(places[:, 0])][:, :2]
         extents[table] = [*known.min(0).tolist(), *known.max(0).tolist()] if len(known) else [None] * 4
-    described = [(t, "features", t, DESCRIPTIONS[t], changed, *extents[t], srs) for t in sorted(extents)]
-    yield Row("its contents", sorted(select("SELECT * FROM gpkg_contents")), described)
+    described = [(t, "features", t, DESCRIPTIONS[t], changed, srs) for t in sorted(extents)]
+    rows = sorted(select("SELECT * FROM gpkg_contents"))
+    yield Row("its contents", [(*row[:5], *row[9:]) for row in rows], described)
+    for row in rows:
+        if tolerance is None or None in extents[row[0]]:
+            yield Row(f"the extent of {row[0]}", list(row[5:9]), extents[row[0]])
+        else:
+            yield Row(f"the extent of {row[0]}", list(row[5:9]), extents[row[0]], tolerance)
     geometries = [(t, "geom", "LINESTRING" if t == "trajectory" else "POINT", srs, 1, 0) for t in sorted(extents)]
     yield Row("its geometry columns", sorted(select("SELECT * FROM gpkg_geometry_columns")), geometries)
 
@@ -88,15 +127,25 @@ def _units(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[Any, ..
     for u, (frame, name) in enumerate(zip(scene.drive.manifest.frames, scene_of_unit, strict=True)):
         sigma = scene.sigma_position_m[u].tolist()
         sigma = [None] * 3 if np.isnan(sigma).any() else sigma
-        known = int(scene.unit_registered[u])
-        yield u + 1, name, frame.source_frame, frame.timestamp_us, _date(frame.timestamp_us), known, *sigma
+        known, component = int(scene.unit_registered[u]), int(scene.unit_component[u])
+        yield u + 1, name, component, frame.source_frame, frame.timestamp_us, _date(frame.timestamp_us), known, *sigma
 
 
 def _images(scene: Scene, scene_of_unit: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     for i, image in enumerate(scene.drive.images):
         name, camera = scene_of_unit[image.unit], scene.drive.cameras[image.camera].name
         when, known = image.timestamp_us, int(scene.image_registered[i])
-        yield i + 1, name, image.unit + 1, camera, image.file, when, _date(when), known
+        yield (
+            i + 1,
+            name,
+            int(scene.unit_component[image.unit]),
+            image.unit + 1,
+            camera,
+            image.file,
+            when,
+            _date(when),
+            known,
+        )
 
 
 def _date(timestamp_us: int) -> str | None:
@@ -107,29 +156,38 @@ def _date(timestamp_us: int) -> str | None:
     return rounded.strftime("%Y-%m-%dT%H:%M:%S.") + f"{rounded.microsecond // 1000:03d}Z"
 
 
-def _points(scene: Scene, table: str, blobs: list[bytes | None], places: Floats) -> Rows:
+def _points(srs: int, table: str, blobs: list[bytes | None], places: Floats, tolerance: float | None) -> Rows:
     known = np.flatnonzero(~np.isnan(places[:, 0]))
     yield Row(f"which of {table} have a place", [k for k, blob in enumerate(blobs) if blob is not None], known.tolist())
     found = np.frombuffer(b"".join(blob for blob in blobs if blob is not None), dtype=_POINT)
     heads = np.unique(found[["magic", "version", "flags", "srs", "order", "kind"]]).tolist()
-    expected = [(b"GP", 0, 1, _srs(scene), 1, 1001)] if len(known) else []
+    expected = [(b"GP", 0, 1, srs, 1, 1001)] if len(known) else []
     yield Row(f"how the geometries of {table} begin", heads, expected)
-    yield Row(f"a place of {table}", found["place"], places[known])
+    yield Row(f"a place of {table}", found["place"], places[known], tolerance)
 
 
-def _lines(scene: Scene, scene_of_unit: Sequence[str], rows: list[tuple[Any, ...]], places: Floats) -> Rows:
-    units = {
-        name: _path(scene, np.array([own == name for own in scene_of_unit])) for name in dict.fromkeys(scene_of_unit)
-    }
-    expected = [(name, len(path)) for name, path in units.items() if len(path) > 1]
+def _lines(
+    scene: Scene,
+    scene_of_unit: Sequence[str],
+    rows: list[tuple[Any, ...]],
+    places: Floats,
+    *,
+    srs: int,
+    tolerance: float | None,
+) -> Rows:
+    parts = [*zip(scene_of_unit, scene.unit_component.tolist(), strict=True)]
+    units = {part: _path(scene, np.array([own == part for own in parts])) for part in dict.fromkeys(parts)}
+    expected = [(*part, len(path)) for part, path in units.items() if len(path) > 1]
     yield Row("the rows of trajectory", [row[2:] for row in rows], expected)
     yield Row("the ids of trajectory", [row[0] for row in rows], [*range(1, len(rows) + 1)])
-    for _, blob, name, count in rows:
-        head, line = np.frombuffer(blob[: _LINE.itemsize], dtype=_LINE)[0], places[units[name]]
+    for _, blob, name, component, count in rows:
+        head, line = np.frombuffer(blob[: _LINE.itemsize], dtype=_LINE)[0], places[units[name, component]]
         described = head[["magic", "version", "flags", "srs", "order", "kind", "count"]].tolist()
-        yield Row(f"the beginning of {name}'s line", described, (b"GP", 0, 5, _srs(scene), 1, 1002, count))
-        yield Row(f"the envelope of {name}'s line", head["envelope"], np.stack([line.min(0), line.max(0)], -1))
-        yield Row(f"{name}'s line", np.frombuffer(blob[_LINE.itemsize :], dtype="<f8").reshape(-1, 3), line)
+        yield Row(f"the beginning of {name}'s line", described, (b"GP", 0, 5, srs, 1, 1002, count))
+        envelope = np.stack([line.min(0), line.max(0)], -1)
+        yield Row(f"the envelope of {name}'s line", head["envelope"], envelope, tolerance)
+        found = np.frombuffer(blob[_LINE.itemsize :], dtype="<f8").reshape(-1, 3)
+        yield Row(f"{name}'s line", found, line, tolerance)
 
 
 def _path(scene: Scene, of_scene: NDArray[np.bool_]) -> Ints:
@@ -139,11 +197,13 @@ def _path(scene: Scene, of_scene: NDArray[np.bool_]) -> Ints:
     return np.array(sorted(units, key=lambda u: frames[u].timestamp_us), dtype=np.int64)
 
 
-def _places(scene: Scene, poses: Floats) -> Floats:
+def _places(scene: Scene, poses: Floats, system: tuple[Any, ...] | None) -> Floats:
     """Origins of poses as `poses.json` has them, as x, y, z; its own check compares them with the poses.
 
-    Longitudes are those within 180 deg of the origin's.
+    Longitudes are those within 180 deg of the origin's. In another system they are PROJ's, of earth-centred ones.
     """
+    if system is not None:
+        return _projected(scene, poses, system)
     geodetic = geodetic_positions(scene, poses)
     if geodetic is None:
         return poses[:, :3, 3]
@@ -152,6 +212,21 @@ def _places(scene: Scene, poses: Floats) -> Floats:
     east = longitude - scene.georeference.origin_longitude_deg
     longitude = np.where(east > 180.0, longitude - 360.0, np.where(east < -180.0, longitude + 360.0, longitude))
     return np.stack([longitude, latitude, height], -1)
+
+
+def _projected(scene: Scene, poses: Floats, system: tuple[Any, ...]) -> Floats:
+    place = scene.georeference
+    assert place is not None
+    ecef = poses[:, :3, 3] @ place.ecef_from_local[:3, :3].T + place.ecef_from_local[:3, 3]
+    known = np.isfinite(ecef).all(axis=1)
+    geodetic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*ecef[known].T)
+    crs = CRS.from_wkt(system[4])
+    target = crs if system[2] == "NONE" else crs.to_3d()
+    area = area_around(place.origin_latitude_deg, place.origin_longitude_deg)
+    transformer = Transformer.from_crs("EPSG:4979", target, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
+    places = np.full(ecef.shape, np.nan)
+    places[known] = np.stack(transformer.transform(*geodetic), -1)
+    return places
 
 
 def _srs(scene: Scene) -> int:

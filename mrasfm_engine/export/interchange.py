@@ -27,10 +27,14 @@ from mrasfm_engine.export import (
     view_readback,
 )
 from mrasfm_engine.export.check import Check, ReadBack
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import AUTOWARE_FOLDER, COPC_FILE, RIG_FOLDER, RIGS_FOLDER, TRAJECTORY_FILE, VIEW_FILE
 
 OPTIONAL = (COPC_FILE, AUTOWARE_FOLDER, TRAJECTORY_FILE, VIEW_FILE, RIG_FOLDER, RIGS_FOLDER)  # not of every scene
+
+
+Made = tuple[Sequence[str], Mapping[str, str]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +44,8 @@ class _Part:
     Attributes
     ----------
     write
-        Writes it; what it lacks, and why.
+        Writes it; what it lacks, and why, and the SHA-256 of what was to be written, by file below the part's path
+        (the empty name where that is the file).
     checks
         Checks of what was written.
     is_whole
@@ -48,7 +53,7 @@ class _Part:
     """
 
     path: str
-    write: Callable[[Path], Sequence[str]]
+    write: Callable[[Path], Made]
     checks: Callable[[], Iterable[Check]]
     is_whole: bool = True
 
@@ -73,7 +78,9 @@ class Interchange:
         notes: list[str] = []
         for part in self._parts():
             try:
-                notes += [f"{part.path}/{what}" for what in part.write(folder / part.path)]
+                lacks, digests = part.write(folder / part.path)
+                notes += [f"{part.path}/{what}" for what in lacks]
+                read_back.expect({f"{part.path}/{file}".removesuffix("/"): d for file, d in digests.items()})
                 notes += _withheld(part, folder, read_back)
             except (OSError, StorageError):
                 raise
@@ -99,21 +106,18 @@ class Interchange:
         if copc.fits(scene):
             yield _Part(path=COPC_FILE, write=partial(_write_copc, scene), checks=partial(_copc_checks, scene))
 
-    def _write_trajectory(self, path: Path) -> Sequence[str]:
-        geopackage.write_geopackage(self.scene, self.scene_of_unit, path)
-        return ()
+    def _write_trajectory(self, path: Path) -> Made:
+        return (), {"": geopackage.write_geopackage(self.scene, self.scene_of_unit, path)}
 
     def _trajectory_checks(self) -> Iterator[Check]:
         compare = partial(geopackage_readback.geopackage, self.scene, self.scene_of_unit)
         yield Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, compare)
 
-    def _write_view(self, path: Path) -> Sequence[str]:
+    def _write_view(self, path: Path) -> Made:
         places = view.read_image_places(path.parent)
         document = view.view_document(self.scene, self.scene_of_unit, places, self.map_document)
-        path.write_text(
-            json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8"
-        )
-        return ()
+        text = json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+        return (), {"": write_content(path, text + "\n")}
 
     def _view_checks(self) -> Iterator[Check]:
         yield Check(VIEW_FILE, view_readback.read_view, partial(view_readback.view, self.scene))
@@ -145,18 +149,18 @@ def _remove(path: Path, folder: Path) -> None:
             parent.rmdir()
 
 
-def _write_rig(scene: Scene, prefix: str, folder: Path) -> Sequence[str]:
-    return rig_files.write_rig(rig_files.rig_cameras(scene, prefix), folder)
+def _write_rig(scene: Scene, prefix: str, folder: Path) -> Made:
+    # Its texts are compared as a whole.
+    return rig_files.write_rig(rig_files.rig_cameras(scene, prefix), folder), {}
 
 
-def _write_autoware(scene: Scene, folder: Path) -> Sequence[str]:
-    autoware.write_autoware(scene, folder)
-    return ()
+def _write_autoware(scene: Scene, folder: Path) -> Made:
+    autoware.write_autoware(scene, folder)  # every bit of the two files is compared
+    return (), {}
 
 
-def _write_copc(scene: Scene, path: Path) -> Sequence[str]:
-    copc.write_copc(scene, path)
-    return ()
+def _write_copc(scene: Scene, path: Path) -> Made:
+    return (), {"": copc.write_copc(scene, path)}
 
 
 def _copc_checks(scene: Scene) -> Iterator[Check]:

@@ -18,6 +18,7 @@ import numpy as np
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource, ExportWork, Written
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats, Ints
 
@@ -30,23 +31,23 @@ TOLERANCE = 0.51e-9
 def write_kitti(work: ExportWork) -> Written:
     """Write a folder for each sequence that has a pose."""
     checks: list[Check] = []
+    digests: dict[str, str] = {}
     for name, units in sequences(work.source):
         folder = work.folder / name
         folder.mkdir()
         poses = first_camera_poses(work.source, units)
-        _write_rows(folder / POSES, poses[:, :3].reshape(-1, 12))
+        rows = [" ".join(f"{v:.{DECIMALS}f}" for v in row) + "\n" for row in poses[:, :3].reshape(-1, 12).tolist()]
         times_us = work.source.scene.drive.timestamps_us[units]
         seconds = [f"{us // 1_000_000}.{us % 1_000_000:06d}\n" for us in (times_us - times_us[0]).tolist()]
-        (folder / TIMES).write_text("".join(seconds), encoding="ascii")
         frames = [f"{work.source.scene.drive.manifest.frames[u].source_frame}\n" for u in units.tolist()]
-        (folder / FRAMES).write_text("".join(frames), encoding="ascii")
         lines = [
             f"Tr_{camera}: {' '.join(f'{v:.{DECIMALS}f}' for v in pose[:3].ravel().tolist())}\n"
             for camera, pose in cameras_from_first(work.source, units).items()
         ]
-        (folder / CALIBRATION).write_text("".join(lines), encoding="utf-8")
+        for file, texts in ((POSES, rows), (TIMES, seconds), (FRAMES, frames), (CALIBRATION, lines)):
+            digests[f"{name}/{file}"] = write_content(folder / file, "".join(texts))
         checks += _checks(work.source, name, units)
-    return Written(checks=checks)
+    return Written(checks=checks, digests=digests)
 
 
 def sequences(source: ExportSource) -> Iterator[tuple[str, Ints]]:
@@ -86,11 +87,6 @@ def _cameras(source: ExportSource, units: Ints) -> list[int]:
         return list(range(len(source.scene.drive.cameras)))
     prefix = f"{source.scene_of_unit[unit]}/"
     return [k for k, camera in enumerate(source.scene.drive.cameras) if camera.name.startswith(prefix)]
-
-
-def _write_rows(path: Path, rows: Floats) -> None:
-    text = "".join(" ".join(f"{v:.{DECIMALS}f}" for v in row) + "\n" for row in rows.tolist())
-    path.write_text(text, encoding="ascii")
 
 
 def _checks(source: ExportSource, name: str, units: Ints) -> list[Check]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.export import comparisons, coordinate_frame, interchange, picture_files, pose_files, readers
 from mrasfm_engine.export.check import Check, ReadBack, common_checks
 from mrasfm_engine.export.comparisons import Row, Rows
+from mrasfm_engine.export.file_contents import sha256, write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.export.report_page import map_page, write_page
@@ -86,20 +87,23 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
     rigs = {f"{RIGS_FOLDER}/{name}": f"{name}/" for name in content.calibrations}
     others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs, map_document=content.document)
     figures["notes"] += others.write(work, read_back)
-    (work / "poses.tum").write_text(_poses_text(scene), encoding="utf-8")
-    write_json(work / "poses.json", _poses_document(content))
-    write_json(work / "frame.json", _frame_document(scene))
+    digests = {"poses.tum": write_content(work / "poses.tum", _poses_text(scene))}
+    digests["poses.json"] = write_json(work / "poses.json", _poses_document(content))
+    digests["frame.json"] = write_json(work / "frame.json", _frame_document(scene))
     (work / CALIBRATION_FOLDER).mkdir()
     for name, document in content.calibrations.items():
-        write_json(work / CALIBRATION_FOLDER / f"{name}.json", document)
-    write_json(work / MAP_FILE, content.document)
+        file = f"{CALIBRATION_FOLDER}/{name}.json"
+        digests[file] = write_json(work / file, document)
+    digests[MAP_FILE] = write_json(work / MAP_FILE, content.document)
     for folder, kept in ((SCENES_FOLDER, content.scenes), (SEAMS_FOLDER, content.seams)):
         store = StageStore(work / folder)
         for name, (key, arrays, documents) in kept.items():
             store.save(name, key, arrays, documents)
+            digests[f"{folder}/{checkpoint_file(name)}"] = sha256(work / folder / checkpoint_file(name))
     written = {**report, "summary": figures}
     figures["notes"] += write_page(work, partial(map_page, content.document, work, written), read_back)
-    write_json(work / COMPLETE_MARK, written)
+    digests[COMPLETE_MARK] = write_json(work / COMPLETE_MARK, written)
+    read_back.expect(digests)
     read_back.check(_checks(content))
     read_back.require_all()
     return written

@@ -2,14 +2,16 @@
 
 | topic | schema | content |
 |---|---|---|
-| `/tf` | FrameTransform | `rig` in `map` at the time of every unit and image, every camera in `rig` once |
+| `/tf` | FrameTransform | `rig` in `map` at the time of every unit and image; cameras in `rig`, once or with images |
 | `/points` | PointCloud | points with colours, once |
 | `/fix` | LocationFix | positions of units of a georeferenced scene, with their sigmas |
 | `/CAMERA/image` | CompressedImage | registered images, as they are |
 | `/CAMERA/calibration` | CameraCalibration | beside every image |
 
 Frames and topics of a map begin with the scene's name. Foxglove's pixels count from the centre of the top left one: the
-principal point is less by half a pixel. All times are those of the drive.
+principal point is less by half a pixel. All times are those of the drive. Where a camera's images were taken at other
+times than their stamps say (refined time offsets), the rig has no one pose at a stamp: such a camera is placed in the
+rig with each of its images, so that the image is where it was taken.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ WORLD = "map"
 POINT = np.dtype([*((axis, "<f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue", "alpha"))])
 KANNALA_BRANDT = "kannala_brandt"  # Foxglove's name of ROS's equidistant
 JPEG_QUALITY = 95
+SAME_POSE = 1e-9  # metres, and elements of a rotation: rounding of two products
 DIAGONAL_KNOWN = 2  # of a covariance
 
 
@@ -69,6 +72,8 @@ def write_mcap(work: ExportWork) -> Written:
 
     source = work.source
     cameras = sent_cameras(source, work.options.image_size_px)
+    if taken := {camera.name for camera in cameras} & {RIG, WORLD}:
+        raise ValueError(f"camera {min(taken)} has the name of a frame: tf would lead in a circle")
     digests: dict[int, str] = {}
     with (work.folder / FILE).open("wb") as stream:
         file = HashingFile(stream)
@@ -119,8 +124,10 @@ def _events(work: ExportWork, cameras: list[SentCamera], digests: dict[int, str]
     source = work.source
     times = rig_poses(source)
     start_us = min((time_us for time_us, _, _ in times), default=0)
-    for camera in cameras:
-        yield start_us, lambda sink, t, c=camera: sink.transform(c.rig, c.name, c.rig_from_cam, t)  # type: ignore[misc]
+    shifted = shifted_cameras(source, times)
+    for k, camera in enumerate(cameras):
+        for time_us, pose in shifted.get(k, [(start_us, camera.rig_from_cam)]):
+            yield time_us, lambda sink, t, c=camera, p=pose: sink.transform(c.rig, c.name, p, t)  # type: ignore[misc]
     yield start_us, lambda sink, t: sink.put("/points", _points(source, t), t)
     for time_us, rig, pose in times:
         yield time_us, lambda sink, t, r=rig, p=pose: sink.transform(WORLD, r, p, t)  # type: ignore[misc]
@@ -147,6 +154,28 @@ def rig_poses(source: ExportSource) -> list[tuple[int, str, Floats]]:
             key = (image.timestamp_us, rig_of_unit(source, image.unit))
             found.setdefault(key, scene.world_from_rig[image.unit] @ scene.unit_from_image[i])
     return [(time_us, rig, found[time_us, rig]) for time_us, rig in sorted(found)]
+
+
+def shifted_cameras(source: ExportSource, rigs: list[tuple[int, str, Floats]]) -> dict[int, list[tuple[int, Floats]]]:
+    """Times and poses (4, 4) in the rig of cameras whose images are not where the rig and their calibration place them.
+
+    By camera; all others have the pose of their calibration at all times.
+    """
+    scene = source.scene
+    if scene.unit_from_image is None:
+        return {}
+    world_from_rig = {(time_us, rig): pose for time_us, rig, pose in rigs}
+    found: dict[int, list[tuple[int, Floats]]] = {}
+    moved: set[int] = set()
+    for i in source.registered:
+        image = scene.drive.images[i]
+        at_stamp = world_from_rig[image.timestamp_us, rig_of_unit(source, image.unit)]
+        rig_from_cam = scene.calibration[image.camera].rig_from_cam
+        at_image = scene.world_from_rig[image.unit] @ scene.unit_from_image[i]
+        found.setdefault(image.camera, []).append((image.timestamp_us, se3.inverse(at_stamp) @ at_image @ rig_from_cam))
+        if np.abs(found[image.camera][-1][1] - rig_from_cam).max() > SAME_POSE:
+            moved.add(image.camera)
+    return {camera: poses for camera, poses in found.items() if camera in moved}
 
 
 def rig_of_unit(source: ExportSource, unit: int) -> str:

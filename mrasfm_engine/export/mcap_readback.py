@@ -18,13 +18,15 @@ from pyproj import Transformer
 
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.mcap_cameras import SentCamera
-from mrasfm_engine.export.readers import sha256, transforms
+from mrasfm_engine.export.readers import transforms
 from mrasfm_engine.types import Floats
 
 POSITION_TOLERANCE_M, ROTATION_TOLERANCE = 1e-9, 1e-9
 DEGREES, METRES = 1e-9, 1e-4  # of positions on the earth
 PIXELS = 1e-9
+SAME_POSE = 1e-9
 MODELS = {"radtan": "plumb_bob", "rational": "rational_polynomial", "equidistant": "kannala_brandt"}
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "kannala_brandt": 4}
 
@@ -88,13 +90,29 @@ class _Known:
         self._times = set(self._units)
         if scene.unit_from_image is not None:
             self._times |= {(self._rig(scene.drive.images[i].unit), _ns(source, i)) for i in source.registered}
+        self._shifted = self._shifted_images()
 
     def _rig(self, unit: int) -> str:
         return f"{self._source.scene_of_unit[unit]}/rig" if self._source.is_map else "rig"
 
+    def _shifted_images(self) -> dict[tuple[str, int], Floats]:
+        """Poses in the rig, by camera and time, of cameras that are elsewhere at a stamp than their calibration says.
+
+        As the rig is at the stamp: at the unit's time the unit's, else that of the first image.
+        """
+        scene, found, moving = self._source.scene, {}, set()
+        for i in self._source.registered if scene.unit_from_image is not None else ():
+            image = scene.drive.images[i]
+            name, rig = scene.drive.cameras[image.camera].name, self._pose(self._rig(image.unit), _ns(self._source, i))
+            found[name, _ns(self._source, i)] = np.linalg.solve(rig, scene.world_from_cam[i])
+            off = np.abs(found[name, _ns(self._source, i)] - self._cameras[name].rig_from_cam).max()
+            moving |= {name} if off > SAME_POSE else set()
+        return {key: pose for key, pose in found.items() if key[0] in moving}
+
     def counts(self) -> dict[str, int]:
         """Messages by topic."""
-        counts: Counter[str] = Counter({"/tf": len(self._cameras) + len(self._times), "/points": 1})
+        fixed = len(self._cameras.keys() - {camera for camera, _ in self._shifted})
+        counts: Counter[str] = Counter({"/tf": fixed + len(self._shifted) + len(self._times), "/points": 1})
         for camera, _ in self._images:
             counts[f"/{camera}/image"] += 1
             counts[f"/{camera}/calibration"] += self._cameras[camera].lens is not None
@@ -126,7 +144,8 @@ class _Known:
         if child in self._cameras:
             camera = self._cameras[child]
             yield Row(f"the parent of {child}", message.parent_frame_id, camera.rig)
-            expected = camera.rig_from_cam
+            moves = any(name == child for name, _ in self._shifted)
+            expected = self._shifted[child, time_ns] if moves else camera.rig_from_cam
         else:
             yield Row(f"the parent of {child}", message.parent_frame_id, "map")
             expected = self._pose(child, time_ns)

@@ -28,13 +28,15 @@ def write_nerfstudio(work: ExportWork) -> Written:
     made = undistorted(work.source, work.options.image_size_px)
     checks = write_images(work, made)
     masked = (work.folder / MASKS).is_dir()
-    write_json(work.folder / TRANSFORMS, _document(made.scene, masked=masked))
-    ply.write_ply(made.scene, work.folder / POINTS)
+    digests = {
+        TRANSFORMS: write_json(work.folder / TRANSFORMS, _document(made.scene, masked=masked)),
+        POINTS: ply.write_ply(made.scene, work.folder / POINTS),
+    }
     checks += [
         Check(TRANSFORMS, readers.json_object, partial(_compare, made.scene, masked)),
         Check(POINTS, readers.ply, partial(_compare_points, made.scene)),
     ]
-    return Written(checks=checks, notes=made.notes())
+    return Written(checks=checks, notes=made.notes(), digests=digests)
 
 
 def _document(scene: Scene, *, masked: bool) -> dict[str, Any]:

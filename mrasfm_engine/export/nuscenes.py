@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.contract import ExportSource, ExportWork, Written
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.nuscenes_channels import PLAIN, Channel, Shot, channels_of, shots_of
 from mrasfm_engine.export.nuscenes_readback import (
     DECIMALS,
@@ -51,13 +52,14 @@ def write_nuscenes(work: ExportWork) -> Written:
     channels = list(channels_of(source, is_plain, made))
     shots = list(shots_of(source, channels, made))
     (work.folder / VERSION).mkdir()
+    digests: dict[str, str] = {}
     for name, rows in _tables(source, channels, shots).items():
-        text = json.dumps(rows, allow_nan=False, ensure_ascii=False, indent=0)
-        (work.folder / VERSION / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+        text, file = json.dumps(rows, allow_nan=False, ensure_ascii=False, indent=0), f"{VERSION}/{name}.json"
+        digests[file] = write_content(work.folder / file, text + "\n")
     checks = [*_write_images(work, shots, made), *_write_mask(work.folder)]
     known = compare_tables(source, channels, shots)
     checks += [Check(f"{VERSION}/{name}.json", read_table, partial(known, name)) for name in TABLES]
-    return Written(checks=checks, notes=_notes(source, is_plain, made))
+    return Written(checks=checks, notes=_notes(source, is_plain, made), digests=digests)
 
 
 def _notes(source: ExportSource, is_plain: list[bool], made: UndistortedScene | None) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import CLASS_NAMES
 
@@ -15,8 +16,8 @@ FLOAT32_LIMIT_M = 8000.0
 PLY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<i4": "int"}
 
 
-def write_ply(scene: Scene, path: Path) -> None:
-    """Write a binary little-endian PLY in the local frame.
+def write_ply(scene: Scene, path: Path) -> str:
+    """Write a binary little-endian PLY in the local frame; the SHA-256 of its content.
 
     Properties are x y z, red green blue, track_length, error_px, class (the header's comment names the numbers),
     road_patch, the index of the patch in `road.json` whose surface the point lies on, or -1, and component, the number
@@ -50,6 +51,4 @@ def write_ply(scene: Scene, path: Path) -> None:
         "comment component: as report.json numbers a scene's and map.json a map's, 0 the largest\n"
         f"element vertex {n}\n{properties}end_header\n"
     )
-    with path.open("wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(rows.tobytes())
+    return write_content(path, header, rows.view(np.uint8).data)

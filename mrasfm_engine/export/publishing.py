@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import glob
 import os
 import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -23,16 +24,20 @@ LOCK = "lock"  # in a scratch folder, held while its run lives
 
 
 @contextmanager
-def publishing(out: Path, needed_bytes: int, *, replaced: Sequence[str] = ()) -> Iterator[Path]:
+def publishing(
+    out: Path, needed_bytes: int, *, replaced: Sequence[str] | Callable[[], Sequence[str]] = ()
+) -> Iterator[Path]:
     """A temporary folder whose content replaces that of `out` when the `with` block ends well.
 
     A new folder appears at once; into an existing one the files move one by one, its old `report.json` goes first and
-    the new one comes last. Other files in it are kept.
+    the new one comes last. Other files in it are kept. Of two runs into one folder, the later one replaces the other's
+    result as a whole.
 
     Parameters
     ----------
     replaced
-        Names that an older result may have left in `out`: they go where the new one does not have them.
+        Names that an older result may have left in `out`: they go where the new one does not have them. A function is
+        called just before anything moves, and may refuse to replace what has come to be there by raising.
 
     Raises
     ------
@@ -47,13 +52,53 @@ def publishing(out: Path, needed_bytes: int, *, replaced: Sequence[str] = ()) ->
         work = home / f".{out.name}.partial-{os.getpid()}-{secrets.token_hex(4)}"
         work.mkdir()
         try:
-            yield work
-            _put_in_place(work, out, replaced)
+            with _held(work):
+                yield work
+            with while_nothing_moves(out):
+                _put_in_place(work, out, replaced() if callable(replaced) else replaced)
         finally:
             shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
         remedy = "Free space on this disk, or choose a folder that can be written."
         raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
+
+
+@contextmanager
+def while_nothing_moves(out: Path) -> Iterator[None]:
+    """Keep other runs from moving their results into `out`: until they have, what is there is no whole result."""
+    with _held(out.resolve().parent, wait=True):
+        yield
+
+
+@contextmanager
+def _held(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold a folder's lock, which a killed process gives up.
+
+    A file system without locks has none to hold, and a folder that cannot be listed cannot be locked.
+    """
+    with ExitStack() as stack:
+        with suppress(OSError):
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+
+
+def _is_held(folder: Path) -> bool:
+    """Return whether a run that lives holds a folder's lock."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
 
 
 @contextmanager
@@ -110,7 +155,8 @@ def _remove_scratch(out: Path) -> None:
 
 def _remove_leftovers(folder: Path, pattern: str) -> None:
     for leftover in folder.glob(pattern):
-        _remove_if_old(leftover)
+        if not _is_held(leftover):
+            _remove_if_old(leftover)
 
 
 def _remove_if_old(folder: Path) -> None:
@@ -124,7 +170,7 @@ def _prepare(needed: int, out: Path, home: Path) -> None:
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
     home.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(home, f".{out.name}.partial-*")
+    _remove_leftovers(home, f".{glob.escape(out.name)}.partial-*")
     free = shutil.disk_usage(home).free
     if free < needed:
         raise StorageError(
@@ -137,17 +183,26 @@ def _put_in_place(work: Path, out: Path, replaced: Sequence[str]) -> None:
     if not out.exists():
         work.rename(out)
         return
-    (out / COMPLETE_MARK).unlink(missing_ok=True)
-    # An older result's that this one does not have: it would be taken for this one's.
-    for name in replaced:
-        if (out / name).exists() and not (work / name).exists():
-            (out / name).rename(work / f"old-{name}")
-    items = sorted(
-        (item for item in work.iterdir() if not item.name.startswith("old-")),
-        key=lambda item: item.name == COMPLETE_MARK,
-    )
-    for item in items:
-        target = out / item.name
-        if item.is_dir() and target.is_dir():
-            target.rename(work / f"old-{item.name}")
-        item.rename(target)
+    items = sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK)
+    moved: list[tuple[Path, Path]] = []  # from, to
+
+    def move(source: Path, target: Path) -> None:
+        source.rename(target)
+        moved.append((source, target))
+
+    try:
+        if (out / COMPLETE_MARK).exists():
+            move(out / COMPLETE_MARK, work / f"old-{COMPLETE_MARK}")
+        # An older result's that this one does not have: it would be taken for this one's.
+        for name in replaced:
+            if (out / name).exists() and not (work / name).exists():
+                move(out / name, work / f"old-{name}")
+        for item in items:
+            target = out / item.name
+            if target.exists():
+                move(target, work / f"old-{item.name}")
+            move(item, target)
+    except BaseException:  # what was there is there again
+        for source, target in reversed(moved):
+            target.rename(source)
+        raise

@@ -7,7 +7,6 @@ parsed here.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sqlite3
 import struct
@@ -26,12 +25,6 @@ from mrasfm_engine.export.colmap import BINARY_FILES, TEXT_FILES
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.types import Floats, Ints
 from schemas import DriveManifest
-
-
-def sha256(path: Path) -> str:
-    """Digest of a file of any size, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class ModelImage(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -14,15 +15,15 @@ from mrasfm_engine import __version__
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, StorageError
 from mrasfm_engine.export.check import ReadBack
 from mrasfm_engine.export.contract import DriveFiles, ExportOptions, ExportSource, ExportWork, Written
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.formats import WRITERS
-from mrasfm_engine.export.publishing import publishing
-from mrasfm_engine.export.readers import sha256
+from mrasfm_engine.export.publishing import publishing, while_nothing_moves
 from mrasfm_engine.export.scene import write_json
 from mrasfm_engine.export.stored_scene import read_source
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.types import Cancel, StageProgress
 from schemas import LabelMap
-from schemas.artifacts import REPORT_FILE, drive_of_scene
+from schemas.artifacts import REPORT_FILE, ROAD_TIFF_FILE, drive_of_scene
 from schemas.exports import EXPORT_FORMATS, MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX, unknown_formats
 
 VERSION = 1  # of the report
@@ -69,7 +70,8 @@ def run_export(request: ExportRequest, *, progress: StageProgress, cancel: Cance
     if any(EXPORT_FORMATS[name].needs_images for name in request.formats):
         source = replace(source, files=_drive_files(request, source))
     results: dict[str, Any] = {}
-    with publishing(request.out, _size_bytes(request, source), replaced=tuple(EXPORT_FORMATS)) as work:
+    replaced = partial(_replaced, request)
+    with publishing(request.out, _size_bytes(request, source), replaced=replaced) as work:
         for name in dict.fromkeys(request.formats):
             step = partial(_step, progress, cancel, name)
             step(0, 0)
@@ -115,12 +117,16 @@ def _format(name: str, work: ExportWork) -> dict[str, Any]:
     if fault is not None:
         shutil.rmtree(work.folder)
         return {"withheld": f"{name} is withheld: {fault}"}
-    return {"files": list(_files(work.folder)), "notes": list(written.notes)}
+    known, crs = EXPORT_FORMATS[name], work.options.crs
+    without = [] if crs is None or known.takes_crs else [f"{crs} does not apply: {known.without_crs}"]
+    without += [f"{part} is a scene of its own, and not in it" for part in work.source.components_elsewhere]
+    return {"files": list(_files(work.folder)), "notes": [*written.notes, *without]}
 
 
 def _fault(written: Written, folder: Path) -> str | None:
     """The first file that does not read back, and why."""
     read_back = ReadBack(folder)
+    read_back.expect(written.digests)
     for check in written.checks:
         fault = read_back.fault(check)
         if fault is not None:
@@ -166,23 +172,64 @@ def check_request(request: ExportRequest) -> None:
             remedy=_listed("Formats that do", (f.name for f in EXPORT_FORMATS.values() if f.takes_crs)),
             code="crs-not-taken",
         )
-    if not _may_be_replaced(request.out):
-        raise InputError(
-            f"{request.out} is not empty, and holds no earlier export: its files could be replaced",
-            remedy="Give a new or empty folder for the export, or that of an earlier one.",
-            code="bad-out-folder",
-        )
+    with while_nothing_moves(request.out):
+        _replaced(request)
 
 
-def _may_be_replaced(out: Path) -> bool:
-    """Return whether nothing is lost where a folder becomes an export's."""
+def _replaced(request: ExportRequest) -> list[str]:
+    """Formats of the export that is in `out`, whose folders go.
+
+    Raises
+    ------
+    InputError
+        Where there is anything that no export has made.
+    """
+    out = request.out
     if not out.is_dir() or all(path.name.startswith(".") for path in out.iterdir()):
-        return True
+        return []
+    earlier = _earlier_files(out)
+    if earlier is None:
+        raise _not_ours(f"{out} is not empty, and holds no earlier export: its files could be replaced")
+    for name in dict.fromkeys([*earlier, *request.formats]):
+        for path in _everything_in(out / name):
+            # A folder is the export's where everything in it is: an empty one holds nothing to lose.
+            if path.is_symlink() or (not path.is_dir() and not _is_as_listed(path, out, earlier.get(name, {}))):
+                raise _not_ours(f"{path} is no file of the export in {out}, and would be removed with its folder")
+    return [*earlier]
+
+
+def _not_ours(what: str) -> InputError:
+    return InputError(
+        what,
+        remedy="Give a new or empty folder for the export, or that of an earlier one, and keep other files elsewhere.",
+        code="bad-out-folder",
+    )
+
+
+def _earlier_files(out: Path) -> dict[str, dict[str, int]] | None:
+    """Files with their sizes, by format, that the report of an export in `out` lists; None where it is no export."""
     try:
         report = json.loads((out / REPORT_FILE).read_bytes())
-        return set(report) == REPORT_KEYS and set(report["formats"]) <= EXPORT_FORMATS.keys()
-    except (OSError, ValueError, TypeError, KeyError):
-        return False
+        if set(report) != REPORT_KEYS or not set(report["formats"]) <= EXPORT_FORMATS.keys():
+            return None
+        return {
+            name: {file["path"]: file["bytes"] for file in result.get("files", ())}
+            for name, result in report["formats"].items()
+        }
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return None
+
+
+def _everything_in(folder: Path) -> Iterator[Path]:
+    """A file or folder with all that is below it; links are not followed."""
+    if os.path.lexists(folder):
+        yield folder
+    for parent, folders, files in os.walk(folder):
+        yield from (Path(parent, name) for name in sorted([*folders, *files]))
+
+
+def _is_as_listed(path: Path, out: Path, listed: Mapping[str, int]) -> bool:
+    return listed.get(path.relative_to(out).as_posix()) == path.lstat().st_size
 
 
 def _listed(what: str, names: Iterator[str]) -> str:
@@ -221,10 +268,14 @@ def _drive_files(request: ExportRequest, source: ExportSource) -> DriveFiles:
                 code="drive-needed",
             )
         drive = read_drive(folder)
-        missing = sorted(files - {image.file for image in drive.images})
-        if missing:
+        times_us = {image.file: image.timestamp_us for image in drive.images}
+        # Drives of one vehicle have cameras and files of the same names: their times tell them apart.
+        for file, time_us in files.items():
+            if times_us.get(file) == time_us:
+                continue
+            there = f"has image {file} at {times_us.get(file)} us, the scene at {time_us} us"
             raise InputError(
-                f"drive {folder} has no image {missing[0]}",
+                f"drive {folder} {there if file in times_us else f'has no image {file}'}",
                 remedy=f"Give the drive that scene {scene} was made of." if scene else "Give the scene's own drive.",
                 code="other-drive",
             )
@@ -239,12 +290,13 @@ def _drive_files(request: ExportRequest, source: ExportSource) -> DriveFiles:
     return DriveFiles(folders=folders, label_maps=labels)
 
 
-def _named_files(source: ExportSource) -> dict[str, set[str]]:
-    """Names of the registered images within their drives, by scene."""
-    result: dict[str, set[str]] = {}
+def _named_files(source: ExportSource) -> dict[str, dict[str, int]]:
+    """Names of the registered images within their drives, with their times, by scene."""
+    result: dict[str, dict[str, int]] = {}
     for image in source.registered:
-        scene, file = source.place_of_file(source.scene.drive.images[image].file, image)
-        result.setdefault(scene, set()).add(file)
+        known = source.scene.drive.images[image]
+        scene, file = source.place_of_file(known.file, image)
+        result.setdefault(scene, {})[file] = known.timestamp_us
     return result
 
 
@@ -257,6 +309,7 @@ def _size_bytes(request: ExportRequest, source: ExportSource) -> int:
     for known in (EXPORT_FORMATS[name] for name in request.formats):
         total += POINT_BYTES * len(scene.points_m) + IMAGE_BYTES * len(scene.drive.images)
         total += 2 * images if known.needs_images else 0
+        total += _bytes(source.folder / ROAD_TIFF_FILE) if known.name == "geotiff" else 0
     return total
 
 

@@ -11,6 +11,7 @@ with a `report.json` is complete.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.errors import InputError, MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
@@ -34,6 +35,7 @@ from mrasfm_engine.export import (
     road,
 )
 from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
@@ -53,6 +55,16 @@ from schemas.artifacts import (
 NO_PICTURES: PictureFiles = MappingProxyType({})
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
+ALWAYS = (
+    "model",
+    "points.ply",
+    "poses.tum",
+    "poses.json",
+    "calibration.json",
+    "frame.json",
+    "features.db",
+    MANIFEST_FILE,
+)
 REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 
@@ -97,6 +109,30 @@ def write_scene(
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
             _write(other, folder, own_report, NO_PICTURES)
+
+
+def require_free_folder(out: Path, checkpoints: str) -> None:
+    """Refuse a folder in which files that no scene has made would be replaced.
+
+    Parameters
+    ----------
+    checkpoints
+        Name of the folder of finished stages, which an interrupted run has left.
+
+    Raises
+    ------
+    InputError
+        That names one of them.
+    """
+    if (out / COMPLETE_MARK).exists() or (out / checkpoints).is_dir():
+        return
+    taken = [name for name in (*REPLACED, *ALWAYS) if os.path.lexists(out / name)]
+    if taken:
+        raise InputError(
+            f"{out / taken[0]} was made by no scene, and a scene would replace it",
+            remedy="Give the scene a new or empty folder with --out.",
+            code="bad-out-folder",
+        )
 
 
 def component_list(scenes: Sequence[Scene]) -> list[dict[str, Any]]:
@@ -153,19 +189,20 @@ def _write(
     others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
     figures["notes"] += others.write(work, read_back)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
-    feature_database.write_features(scene, work / "features.db")
+    digests = {"features.db": feature_database.write_features(scene, work / "features.db")}
     if scene.road is not None:
-        write_json(work / ROAD_FILE, road.road_document(scene))
-    (work / "poses.tum").write_text(pose_files.poses_text(scene), encoding="utf-8")
-    write_json(work / "poses.json", pose_files.poses_document(scene, components))
+        digests[ROAD_FILE] = write_json(work / ROAD_FILE, road.road_document(scene))
+    digests["poses.tum"] = write_content(work / "poses.tum", pose_files.poses_text(scene))
+    digests["poses.json"] = write_json(work / "poses.json", pose_files.poses_document(scene, components))
     calibrated = calibration.calibration_document(scene, report.get("component", 0))
-    write_json(work / "calibration.json", calibrated)
-    write_json(work / "frame.json", coordinate_frame.frame_document(scene))
+    digests["calibration.json"] = write_json(work / "calibration.json", calibrated)
+    digests["frame.json"] = write_json(work / "frame.json", coordinate_frame.frame_document(scene))
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
-    (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
+    digests[MANIFEST_FILE] = write_content(work / MANIFEST_FILE, manifest + "\n")
     document = {**report, "summary": figures}
     figures["notes"] += write_page(work, partial(scene_page, scene, work, document, calibrated), read_back, calibrated)
-    write_json(work / COMPLETE_MARK, document)
+    digests[COMPLETE_MARK] = write_json(work / COMPLETE_MARK, document)
+    read_back.expect(digests)
     read_back.check(_checks(scene, pictures))
     read_back.require_all()
 
@@ -175,14 +212,15 @@ def write_common(scene: Scene, work: Path, pictures: PictureFiles, read_back: Re
     picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
     model, figures = work / "model", summary(scene)
     model.mkdir()
-    colmap.write_model(scene, model)
+    read_back.expect({f"model/{name}": digest for name, digest in colmap.write_model(scene, model).items()})
     read_back.check(binary_model_checks(scene))
     if colmap.text_model_fits(scene):
         (model / "text").mkdir()
-        colmap.write_text_model(model, model / "text")
+        text = colmap.write_text_model(model, model / "text")
+        read_back.expect({f"model/text/{name}": digest for name, digest in text.items()})
     else:
         figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
-    ply.write_ply(scene, work / "points.ply")
+    read_back.expect({"points.ply": ply.write_ply(scene, work / "points.ply")})
     return figures
 
 
@@ -212,8 +250,8 @@ def _own_car_files(scene: Scene) -> dict[str, bytes]:
     }
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document.
+def write_json(path: Path, document: Mapping[str, Any]) -> str:
+    """Write a JSON document; the SHA-256 of its text.
 
     Raises
     ------
@@ -228,7 +266,7 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
             remedy="This is a defect of mrasfm, please report it.",
             code="export-check-failed",
         ) from error
-    path.write_text(text + "\n", encoding="utf-8")
+    return write_content(path, text + "\n")
 
 
 def _plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def read_source(folder: Path) -> ExportSource:
         state = f"has no {REPORT_FILE}" if folder.is_dir() else "is no folder"
         raise InputError(f"{folder} is no scene or map: it {state}", remedy=REMEDY, code="not-a-scene")
     with _damaged(folder):
-        return _map(folder) if is_map(folder) else _scene(folder)
+        return replace(_map(folder) if is_map(folder) else _scene(folder), folder=folder)
 
 
 @contextmanager
@@ -68,7 +69,7 @@ def _scene(folder: Path) -> ExportSource:
     except ValidationError as error:
         raise ValueError(f"manifest.json: {error.errors()[0]['msg']}") from error
     calibration = _document(folder / "calibration.json")["cameras"]
-    drive = Drive(Path(), manifest)
+    drive, report = Drive(Path(), manifest), read_json(folder / REPORT_FILE, remedy=REMEDY)
     calibrations = [_calibration(calibration[camera.name]) for camera in drive.cameras]
     return ExportSource(
         scene=_arrays(folder, drive, calibrations, np.zeros(len(drive.cameras), np.int64)),
@@ -76,7 +77,15 @@ def _scene(folder: Path) -> ExportSource:
         is_map=False,
         scene_of_unit=[manifest.name] * len(manifest.frames),
         own_cars=dict(_own_cars(folder, drive)),
+        masks_of_network=_masks_of_network(report),
+        components_elsewhere=[part["folder"] for part in report.get("components", []) if part["folder"] != "."],
     )
+
+
+def _masks_of_network(report: Mapping[str, Any]) -> int:
+    """Number of images whose mask a network made, as the report's stages say."""
+    stages = report.get("stages", [])
+    return sum(stage.get("images_with_mask", {}).get("made_by_model", 0) for stage in stages)
 
 
 def _map(folder: Path) -> ExportSource:

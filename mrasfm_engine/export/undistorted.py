@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import MrasfmError
-from mrasfm_engine.export import readers
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource, ExportWork
+from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.pinhole_views import PinholeView, pinhole_views
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
@@ -67,7 +67,18 @@ class UndistortedScene:
             *([f"wide cameras have two images each, of their left and right: {', '.join(wide)}"] if wide else []),
             *([f"{lost} points are left out: the pinhole images show them less than twice"] if lost else []),
             *([f"images have the pose of their middle row: {', '.join(rolling)}"] if rolling else []),
+            *self._missing_masks(),
         ]
+
+    def _missing_masks(self) -> Iterator[str]:
+        made = self.source.masks_of_network
+        if made:
+            yield (
+                f"no mask has the moving objects of {made} images: the network's masks are not kept with a scene, only "
+                "those of the drive are"
+            )
+        if self.source.is_map:
+            yield "no mask has the own car: a map does not keep its masks, only scenes do"
 
 
 def undistorted(source: ExportSource, image_size_px: int | None) -> UndistortedScene:
@@ -318,7 +329,7 @@ def _not_made(camera: str, error: Any) -> MrasfmError:
 
 def folder_digests(folder: Path) -> dict[str, str]:
     """SHA-256 of all files in a folder, by their names."""
-    return {path.name: readers.sha256(path) for path in sorted(folder.iterdir())}
+    return {path.name: sha256(path) for path in sorted(folder.iterdir())}
 
 
 def same_digests(expected: dict[str, str], found: dict[str, str]) -> Rows:

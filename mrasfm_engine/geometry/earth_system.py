@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
@@ -24,6 +25,7 @@ from schemas.findings import listed
 _SOURCE = "EPSG:4979"
 _NAMED = re.compile(r"EPSG:([0-9]{4,6})(?:\+([0-9]{4,6}))?")
 _NEAR_DEG = 6.0  # of a system's area
+_SCENE_DEG = 0.05  # that a scene's area reaches from its origin: some kilometres
 _REMEDY = "Give a projected system, as EPSG:25832, if need be with a vertical datum, as EPSG:25832+7837."
 
 
@@ -35,12 +37,18 @@ class EarthSystem:
     ----------
     well_known_text
         WKT 1 (OGC 01-009), with a system of heights.
+    horizontal
+        EPSG code of the system without heights.
+    has_vertical
+        Whether heights are in a vertical datum, not above the ellipsoid.
     code
         UTM's zone where the scene's own is meant, else None.
     """
 
     name: str
     well_known_text: str
+    horizontal: int
+    has_vertical: bool = False
     code: int | None = None
     transformer: Transformer | None = None
 
@@ -65,6 +73,13 @@ class EarthSystem:
             raise self._outside("points have no coordinates in it")
         return result
 
+    def notes(self) -> list[str]:
+        """Words on how good the transformation from WGS84 is, where it is not exact."""
+        accuracy_m = None if self.transformer is None else self.transformer.accuracy
+        if not accuracy_m or accuracy_m < 0.0:
+            return []
+        return [f"the transformation from WGS84 to {self.name} has an accuracy of {accuracy_m:g} m, as EPSG states it"]
+
     def _outside(self, why: str) -> InputError:
         return InputError(
             f"the scene cannot be given in {self.name}: {why}",
@@ -76,7 +91,7 @@ class EarthSystem:
 def utm_system(latitude_deg: float, longitude_deg: float) -> EarthSystem:
     """The UTM zone of a place, with ellipsoidal heights."""
     code = utm.epsg_code(latitude_deg, longitude_deg)
-    return EarthSystem(name=f"EPSG:{code}", well_known_text=utm.well_known_text(code), code=code)
+    return EarthSystem(name=f"EPSG:{code}", well_known_text=utm.well_known_text(code), horizontal=code, code=code)
 
 
 def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
@@ -107,7 +122,13 @@ def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
     _require_near(name, horizontal, at)
     target = horizontal.to_3d() if vertical is None else CRS.from_user_input(name)
     text = utm.with_ellipsoidal_heights(horizontal) if vertical is None else target.to_wkt("WKT1_GDAL")
-    return EarthSystem(name=name, well_known_text=text, transformer=_transformer(name, target))
+    return EarthSystem(
+        name=name,
+        well_known_text=text,
+        horizontal=int(match[1]),
+        has_vertical=vertical is not None,
+        transformer=_transformer(name, target, at),
+    )
 
 
 def _require_near(name: str, system: CRS, at: tuple[float, float]) -> None:
@@ -133,11 +154,41 @@ def _known(name: str, code: str) -> CRS:
         raise InputError(f"EPSG:{code} of {name!r} is not known", remedy=_REMEDY, code="bad-crs") from None
 
 
-def _transformer(name: str, target: CRS) -> Transformer:
-    """The best transformation that is known, and no other."""
+def area_around(latitude_deg: float, longitude_deg: float) -> AreaOfInterest:
+    """The area that a transformation must be good in: old datums have one for each country, metres apart elsewhere."""
+    south, north = max(latitude_deg - _SCENE_DEG, -90.0), min(latitude_deg + _SCENE_DEG, 90.0)
+    west, east = (((longitude_deg + side * _SCENE_DEG + 180.0) % 360.0) - 180.0 for side in (-1, 1))
+    return AreaOfInterest(west, south, east, north)
+
+
+def _transformer(name: str, target: CRS, at: tuple[float, float]) -> Transformer:
+    return best_transformer(CRS.from_user_input(_SOURCE), target, at=at, name=name)
+
+
+def best_transformer(source: CRS, target: CRS, *, at: tuple[float, float], name: str) -> Transformer:
+    """The best transformation that is known around a place, and no other.
+
+    Parameters
+    ----------
+    at
+        Latitude and longitude.
+    name
+        What messages call the system that is not WGS84.
+
+    Raises
+    ------
+    InputError
+        Where its grid is not installed, or none is known.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of missing grids, which become an error here
-        group = TransformerGroup(_SOURCE, target, always_xy=True, allow_ballpark=False)
+        group = TransformerGroup(
+            source,
+            target,
+            always_xy=True,
+            allow_ballpark=False,
+            area_of_interest=area_around(*at),  # type: ignore[arg-type]
+        )
     if not group.best_available:
         grids = [grid.short_name for operation in group.unavailable_operations for grid in operation.grids]
         named = listed(list(dict.fromkeys(grids))[:3]) or "a grid"
@@ -148,5 +199,7 @@ def _transformer(name: str, target: CRS) -> Transformer:
             code="missing-geoid-grid",
         )
     if not group.transformers:
-        raise InputError(f"no transformation to {name} is known", remedy=_REMEDY, code="bad-crs")
+        raise InputError(
+            f"no transformation from WGS84 to {name} is known where the scene lies", remedy=_REMEDY, code="bad-crs"
+        )
     return group.transformers[0]

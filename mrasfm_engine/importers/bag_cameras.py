@@ -6,6 +6,7 @@ principal point.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,6 +19,9 @@ from mrasfm_engine.importers.recording import pinhole_params
 from mrasfm_engine.types import Floats
 
 COMPRESSED = "/compressed"  # image_transport's topic of JPEG or PNG beside the raw one
+# The last part of a topic that says no more than that these are images; image_left is a camera's own name.
+_ONLY_IMAGES = re.compile(r"image(_(raw|colou?r|mono|gr[ae]y|rect|rectified|rgb|bgr|bayer))*")
+_RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 _CALIBRATE = "Record the calibrated camera's CameraInfo, or give the calibration with --calibration."
 
 
@@ -30,12 +34,12 @@ def namespace(topic: str) -> str:
     """The camera's namespace: the topic without its last part, where that says only that these are images."""
     base = image_base(topic)
     parent, _, last = base.rpartition("/")
-    return parent if last.startswith("image") else base
+    return parent if _ONLY_IMAGES.fullmatch(last) else base
 
 
 def is_rectified(topic: str) -> bool:
     """Return whether the topic has rectified images, by ROS's names: image_rect, image_rect_color."""
-    return "rect" in image_base(topic).rpartition("/")[2]
+    return _RECTIFIED.search(image_base(topic).rpartition("/")[2]) is not None
 
 
 def camera_name(topic: str) -> str:
@@ -138,8 +142,12 @@ def frame_from_camera(info: Any, *, rectified: bool, shares_frame: bool) -> Floa
 
 def same_calibration(one: Any, other: Any) -> bool:
     """Return whether two CameraInfos say the same of the lens and of what is read out."""
-    return all(np.array_equal(_field(one, name), _field(other, name)) for name in ("K", "D", "R", "P")) and all(
-        getattr(one, name) == getattr(other, name) for name in ("width", "height", "binning_x", "binning_y")
+    return (
+        all(np.array_equal(_field(one, name), _field(other, name), equal_nan=True) for name in ("K", "D", "R", "P"))
+        and all(getattr(one, name) == getattr(other, name) for name in ("width", "height", "distortion_model"))
+        and all(getattr(one, name) == getattr(other, name) for name in ("binning_x", "binning_y"))
+        and all(getattr(one.roi, name) == getattr(other.roi, name) for name in ("x_offset", "y_offset"))
+        and all(getattr(one.roi, name) == getattr(other.roi, name) for name in ("width", "height"))
     )
 
 

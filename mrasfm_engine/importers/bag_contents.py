@@ -10,7 +10,7 @@ from typing import Any
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.bag_cameras import camera_name, chosen_topics, same_calibration
-from mrasfm_engine.importers.bag_images import DEPTH_ENCODINGS, is_raw, size_and_suffix
+from mrasfm_engine.importers.bag_images import holds_depth, largest_value, size_and_suffix, unused_bits
 from mrasfm_engine.importers.bag_reader import Bag, Entry
 from mrasfm_engine.importers.bag_transforms import TransformTree
 from schemas.drive import MAX_GNSS_SAMPLES
@@ -31,6 +31,12 @@ class ImageTopic:
     repeated: int = 0  # images with a stamp that another one has
     defects: list[InputError] = field(default_factory=list)  # of the other images
     holds_depth: bool = False
+    largest: int = 0  # value of images of 16 bits
+
+    @property
+    def shift(self) -> int:
+        """Bits by which values are raised: of a sensor of 12 bits in 16, a picture would be all but black."""
+        return unused_bits(self.largest)
 
 
 @dataclass(kw_only=True)
@@ -147,7 +153,7 @@ def _add_info(content: BagContent, entry: Entry) -> None:
 
 
 def _add_image(images: ImageTopic, entry: Entry) -> None:
-    images.holds_depth |= is_raw(entry.message) and entry.message.encoding in DEPTH_ENCODINGS
+    images.holds_depth |= holds_depth(entry.message)
     try:
         size, suffix = size_and_suffix(entry.message, topic=entry.topic)
         if images.suffixes and size != images.size:
@@ -156,6 +162,7 @@ def _add_image(images: ImageTopic, entry: Entry) -> None:
                 remedy="Record one size.",
                 code="bad-image",
             )
+        images.largest = max(images.largest, largest_value(entry.message, topic=entry.topic))
     except InputError as defect:
         images.defects.append(defect)
         return
@@ -183,6 +190,9 @@ def without_unusable(content: BagContent, *, is_asked: bool) -> list[str]:
         elif images.defects:
             first = images.defects[0].what
             notes.append(f"Left out: {len(images.defects)} images of {topic}. The first: {first}"[:1500])
+        if images.shift:
+            bits = 16 - images.shift
+            notes.append(f"Images of {topic} use {bits} of 16 bits: all values are taken times {2**images.shift}.")
         if images.repeated:
             notes.append(f"Left out: {images.repeated} images of {topic} with a stamp that an earlier one has.")
     if not content.images:

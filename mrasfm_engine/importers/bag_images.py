@@ -40,12 +40,20 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
 }
 DEPTH_ENCODINGS = frozenset({"16UC1", "32FC1"})  # ROS's images of distances
+SUBSAMPLED = frozenset({"yuv422", "uyvy", "yuv422_yuy2", "yuyv"})  # two pixels share their colour
+SENSOR_BITS = (10, 12, 14)  # of sensors whose drivers fill the lower bits of 16
 PNG_EFFORT = 1  # of 9: more makes files a few percent smaller and takes several times as long
 
 
 def is_raw(message: Any) -> bool:
     """Return whether the message is an Image, not a CompressedImage."""
     return hasattr(message, "encoding")
+
+
+def holds_depth(message: Any) -> bool:
+    """Return whether the message is an image of distances; a compressed one says first what was compressed."""
+    kind = message.encoding if is_raw(message) else str(message.format).partition(";")[0].strip()
+    return kind in DEPTH_ENCODINGS
 
 
 def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
@@ -69,7 +77,19 @@ def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
                 remedy="Record the topic again.",
                 code="bad-image",
             )
+        if message.encoding in SUBSAMPLED and message.width % 2:
+            raise InputError(
+                f"{topic}: an image of {message.width} columns as {message.encoding}, which has pairs of them",
+                remedy="Record the topic again, or in another encoding.",
+                code="bad-image",
+            )
         return (int(message.width), int(message.height)), ".png"
+    if holds_depth(message):
+        raise InputError(
+            f"{topic}: compressed as {str(message.format)[:60]!r}, which holds distances",
+            remedy="Name the topics of images with --topics.",
+            code="unknown-encoding",
+        )
     try:
         header = header_of(message.data.tobytes(), topic)
     except ImageHeaderError as error:
@@ -81,8 +101,32 @@ def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
     return (header.width, header.height), ".jpg" if header.format == "JPEG" else ".png"
 
 
-def file_content(message: Any, *, topic: str) -> bytes:
+def largest_value(message: Any, *, topic: str) -> int:
+    """Largest value of a raw image of 16 bits; 0 of all others.
+
+    Raises
+    ------
+    InputError
+        If the image is shorter than its size says.
+    """
+    if not is_raw(message) or _ENCODINGS[message.encoding][0] != "u2":
+        return 0
+    return int(_values(message, topic).max())
+
+
+def unused_bits(largest: int) -> int:
+    """Bits by which values of 16 bits are too small where a sensor of fewer bits fills the lower ones."""
+    bits = next((bits for bits in SENSOR_BITS if largest >> bits == 0), 16)
+    return 16 - bits if largest else 0
+
+
+def file_content(message: Any, *, topic: str, shift: int = 0) -> bytes:
     """Bytes of a JPEG or PNG file of the image.
+
+    Parameters
+    ----------
+    shift
+        Bits by which values of 16 bits are raised.
 
     Raises
     ------
@@ -92,7 +136,9 @@ def file_content(message: Any, *, topic: str) -> bytes:
     if not is_raw(message):
         content: bytes = message.data.tobytes()
         return content
-    done, encoded = cv2.imencode(".png", _pixels(message, topic), [cv2.IMWRITE_PNG_COMPRESSION, PNG_EFFORT])
+    pixels = _pixels(message, topic)
+    pixels = pixels << shift if shift else pixels
+    done, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, PNG_EFFORT])
     if not done:
         raise InputError(f"{topic}: an image could not be written as PNG", remedy="Record the topic again.")
     return encoded.tobytes()
@@ -100,7 +146,13 @@ def file_content(message: Any, *, topic: str) -> bytes:
 
 def _pixels(message: Any, topic: str) -> NDArray[Any]:
     """Gray values (h, w) or blue, green, red (h, w, 3), of 8 or 16 bits."""
-    kind, channels, conversion = _ENCODINGS[message.encoding]
+    conversion, values = _ENCODINGS[message.encoding][2], _values(message, topic)
+    return values if conversion is None else cv2.cvtColor(values, conversion)
+
+
+def _values(message: Any, topic: str) -> NDArray[Any]:
+    """Values (h, w) or (h, w, channels) as they were sent."""
+    kind, channels, _ = _ENCODINGS[message.encoding]
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = int(message.height), int(message.width), int(message.step)
     row_bytes = width * channels * dtype.itemsize
@@ -113,5 +165,4 @@ def _pixels(message: Any, topic: str) -> NDArray[Any]:
         )
     rows = np.lib.stride_tricks.as_strided(message.data, (height, row_bytes), (step, 1), writeable=False)
     pixels = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
-    shaped = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
-    return shaped if conversion is None else cv2.cvtColor(shaped, conversion)
+    return pixels.reshape((height, width) if channels == 1 else (height, width, channels))

@@ -7,7 +7,7 @@ commands that read none start without it.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 ROS1_SUFFIX = ".bag"
 SUFFIXES = (ROS1_SUFFIX, ".mcap", ".db3")
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which is a folder
+# Recorders close a chunk of messages after some megabytes; only one message that is larger makes a larger one, and no
+# image that is read here has a gigabyte.
+MAX_CHUNK_BYTES = 1 << 30
 _REMEDIES = {
     ROS1_SUFFIX: "Repair it with `rosbag reindex` and `rosbag fix`, or record it again.",
     ".mcap": "Repair it with `mcap recover`, or record it again; its messages must be of ROS 2.",
@@ -110,7 +113,40 @@ class Bag:
 def _reader(path: Path) -> Reader1 | Reader2:
     from rosbags import rosbag1, rosbag2
 
+    _bound_decompression()
     return rosbag1.Reader(path) if path.suffix == ROS1_SUFFIX and path.is_file() else rosbag2.Reader(path)
+
+
+def _bound_decompression() -> None:
+    """Let rosbags take nothing larger than `MAX_CHUNK_BYTES` out of a chunk: a small file may say to fill the memory.
+
+    rosbags looks its decompressors up in two tables, and gives them no limit.
+    """
+    from bz2 import BZ2Decompressor
+
+    from backports.zstd import ZstdDecompressor
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import storage_mcap
+
+    storage_mcap.DECOMPRESSORS.update(lz4=_bounded(LZ4FrameDecompressor), zstd=_bounded(ZstdDecompressor))
+    ros1.decompressors.update(lz4=_bounded(LZ4FrameDecompressor), bz2=_bounded(BZ2Decompressor))
+
+
+def _bounded(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+    def decompress(data: bytes, *_: int) -> bytes:
+        parts: list[bytes] = []
+        left = MAX_CHUNK_BYTES
+        while data:
+            stream = decompressor()
+            parts.append(stream.decompress(data, max_length=left))
+            left -= len(parts[-1])
+            if not stream.eof:
+                raise ValueError(f"a compressed chunk ends early, or holds over {MAX_CHUNK_BYTES / 1e6:.0f} MB")
+            data = stream.unused_data or b""
+        return b"".join(parts)
+
+    return decompress
 
 
 def _entries(path: Path, reader: Reader1 | Reader2, topics: Collection[str]) -> Iterator[Entry]:

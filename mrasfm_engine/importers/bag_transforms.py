@@ -45,6 +45,8 @@ class TransformTree:
 
     def __init__(self, *, keeps_motion: bool = False) -> None:
         self._edges: dict[str, _Edge] = {}
+        self._defects: dict[str, InputError] = {}  # by the child of the transforms at fault
+        self._left_out: dict[str, InputError] = {}  # by the parent that is not the first of its child
         self._keeps_motion = keeps_motion
         self._samples = 0
 
@@ -56,24 +58,34 @@ class TransformTree:
     def add(self, message: Any, *, topic: str) -> None:
         """Add the transforms of one TFMessage.
 
+        A rotation that is no unit quaternion, and a second parent of a frame, are refused where a chain of transforms
+        needs that frame: bags hold frames of arms, wheels and other maps that no camera depends on.
+
         Raises
         ------
         InputError
-            If a rotation is no unit quaternion, or a frame has two parents.
+            If there are more than can be kept.
         """
         for stamped in message.transforms:
             self._add(stamped, topic)
 
     def _add(self, stamped: Any, topic: str) -> None:
         parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
-        pose = _matrix(stamped.transform, where=f"{topic}: transform from {child} to {parent}")
+        try:
+            pose = _matrix(stamped.transform, where=f"{topic}: transform from {child} to {parent}")
+        except InputError as defect:
+            self._defects.setdefault(child, defect)
+            return
         edge = self._edges.setdefault(child, _Edge(parent=parent, parent_from_child=pose))
         if edge.parent != parent:
-            raise InputError(
+            two_parents = InputError(
                 f"{topic}: frame {child} has two parents, {edge.parent} and {parent}",
                 remedy="Record one publisher of this transform.",
                 code="bad-transforms",
             )
+            self._defects.setdefault(child, two_parents)
+            self._left_out.setdefault(parent, two_parents)
+            return
         if edge.is_fixed:  # a frame that has moved needs no second look, and bags have many transforms
             difference = se3.inverse(edge.parent_from_child) @ pose
             edge.motion_m = max(edge.motion_m, float(np.linalg.norm(difference[:3, 3])))
@@ -103,7 +115,7 @@ class TransformTree:
         Raises
         ------
         InputError
-            If one of them is unknown, nothing links them, or a transform between them moves.
+            If one of them is unknown, nothing links them, or a transform between them moves or is at fault.
         """
         to_from_root, root_from_frame = self._chains(to, frame, what=what)
         for child, edge in [*to_from_root, *root_from_frame]:
@@ -122,7 +134,7 @@ class TransformTree:
         Raises
         ------
         InputError
-            If one of them is unknown, or nothing links them.
+            If one of them is unknown, nothing links them, or a transform between them is at fault.
         """
         to_from_root, root_from_frame = self._chains(to, frame, what=what)
         moving = [edge for _, edge in [*to_from_root, *root_from_frame] if not edge.is_fixed]
@@ -142,6 +154,8 @@ class TransformTree:
         """Edges from each of the frames up to the first that they have in common."""
         for name in (to, frame):
             if name not in self.frames:
+                if known_defect := self._defects.get(name, self._left_out.get(name)):
+                    raise known_defect
                 known = ", ".join(self.frames[:20]) or "none: the bag has no tf or tf_static"
                 raise InputError(
                     f"{what}: no transform has the frame {name!r}. Known frames: {known}",
@@ -152,13 +166,21 @@ class TransformTree:
         above_to, above_frame = list(self._upward(to)), list(self._upward(frame))
         shared = {name for name, _ in above_frame} & {name for name, _ in above_to}
         if not shared:
+            # What is at fault may be the link that is missing.
+            for name, _ in [*above_to, *above_frame]:
+                if name in self._defects:
+                    raise self._defects[name]
             raise InputError(
                 f"{what}: no transforms link the frames {frame!r} and {to!r}",
                 remedy="Record tf_static completely, name the vehicle's frame with --rig-frame, or give the cameras' "
                 "poses with --calibration.",
                 code="missing-transform",
             )
-        return _up_to(above_to, shared), _up_to(above_frame, shared)
+        chains = _up_to(above_to, shared), _up_to(above_frame, shared)
+        for name, _ in [*chains[0], *chains[1]]:
+            if name in self._defects:
+                raise self._defects[name]
+        return chains
 
     def _upward(self, frame: str) -> Iterator[tuple[str, _Edge | None]]:
         """A frame and those above it, each with the edge that leads farther up."""

@@ -7,7 +7,7 @@ by default base_link. The bag is read twice, message by message: for what is in 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,7 +97,7 @@ def read(
         units=units,
         gnss=gnss,
         notes=[*notes, *camera_notes, *gnss_notes, READOUT_NOTE],
-        contents=lambda wanted: _contents(paths, wanted),
+        contents=lambda wanted: _contents(paths, wanted, {t: found.shift for t, found in content.images.items()}),
     )
 
 
@@ -124,7 +124,9 @@ def _rough_poses(content: BagContent, units: list[SourceUnit], world_frame: str,
     return [replace(unit, rough_world_from_rig=by_time.get(unit.timestamp_us)) for unit in units]
 
 
-def _contents(paths: Sequence[Path], wanted: Collection[ImageKey]) -> Iterator[tuple[ImageKey, bytes]]:
+def _contents(
+    paths: Sequence[Path], wanted: Collection[ImageKey], shifts: Mapping[str, int]
+) -> Iterator[tuple[ImageKey, bytes]]:
     """Files of the wanted images, as the bag has them one after the other."""
     missing = set(wanted)
     with Bag(paths) as bag:
@@ -132,6 +134,6 @@ def _contents(paths: Sequence[Path], wanted: Collection[ImageKey]) -> Iterator[t
             key = (entry.topic, stamp_ns(entry))
             if key in missing:
                 missing.remove(key)
-                yield key, file_content(entry.message, topic=entry.topic)
+                yield key, file_content(entry.message, topic=entry.topic, shift=shifts[entry.topic])
             if not missing:
                 return

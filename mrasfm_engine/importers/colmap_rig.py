@@ -142,8 +142,11 @@ def _images(folder: Path, rig: _Rig, names: list[str], file: Path) -> dict[str, 
     all_images = sorted(p for p in root.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     relative = {path.relative_to(root).as_posix(): path for path in all_images}
     found: dict[str, dict[str, Path]] = {}
+    prefixes = [camera.image_prefix for camera in rig.cameras]
+    # Images of cam10 begin with cam1, too: the longest prefix says whose an image is.
+    of = {k: max((prefix for prefix in prefixes if k.startswith(prefix)), key=len, default=None) for k in relative}
     for name, camera in zip(names, rig.cameras, strict=True):
-        own = {k.removeprefix(camera.image_prefix): p for k, p in relative.items() if k.startswith(camera.image_prefix)}
+        own = {k.removeprefix(camera.image_prefix): p for k, p in relative.items() if of[k] == camera.image_prefix}
         if not own:
             raise InputError(
                 f"rig configuration {file}: {root} has no images that begin with {camera.image_prefix!r}",

@@ -72,9 +72,15 @@ def grouped_by_time(times_us: Mapping[str, Ints]) -> list[dict[str, int]]:
 
 
 def _usual_delay_us(times_us: Ints, reference_us: Ints) -> int:
-    """Median time from an image of the reference to the nearest one of the camera."""
+    """Median time from an image of the reference to the nearest one of the camera; zero where none is near.
+
+    A camera that begins after the other has ended, or one image at another time, is not late: farther than half of the
+    longer period away, the nearest image is not that of the same release.
+    """
     after = np.clip(np.searchsorted(times_us, reference_us), 1, max(len(times_us) - 1, 1))
     candidates = times_us[np.stack([after - 1, np.minimum(after, len(times_us) - 1)])]
     delays = candidates - reference_us
     nearest = np.where(np.abs(delays[0]) <= np.abs(delays[1]), delays[0], delays[1])
-    return round(float(np.median(nearest)))
+    periods = [float(np.median(np.diff(times))) for times in (times_us, reference_us) if len(times) > 1]
+    near = nearest[np.abs(nearest) <= SAME_FRAME * max(periods, default=0.0)]
+    return round(float(np.median(near))) if len(near) else 0

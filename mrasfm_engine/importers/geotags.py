@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import math
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import utm
+from mrasfm_engine.geometry.earth_system import best_transformer
 from mrasfm_engine.importers.tables import read_lines
 
 EXIF, GPS = 0x8769, 0x8825
@@ -141,6 +144,19 @@ def read_geo_txt(path: Path) -> dict[str, GeoTag]:
     }
 
 
+def _transformer(system: Any, points: Any, name: str) -> Any:
+    """The best transformation to WGS84 where the points are; another one may be metres off without a word."""
+    import pyproj
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of missing grids, which become an error below
+        rough = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+        longitude, latitude = rough.transform(float(np.median(points[:, 0])), float(np.median(points[:, 1])))
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+        return rough  # whose results are refused
+    return best_transformer(system, pyproj.CRS.from_epsg(4326), at=(latitude, longitude), name=name)
+
+
 def _accuracy(values: list[float], column: int) -> float | None:
     return values[column] if len(values) > column and values[column] > 0 else None
 
@@ -170,11 +186,18 @@ def _geodetic(system: str, points: Any, path: Path) -> Any:
     from pyproj.exceptions import CRSError, ProjError
 
     remedy = "Give EPSG:4326, another EPSG code, a PROJ string or WGS84 UTM 32N in the first line."
-    if match := _UTM.fullmatch(system):
+    if (match := _UTM.fullmatch(system)) and 1 <= int(match[1]) <= utm.ZONES:
         system = f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
     try:
         crs = pyproj.CRS.from_user_input(system)
-        to_wgs84 = pyproj.Transformer.from_crs(crs.to_2d(), "EPSG:4326", always_xy=True)
+        if crs.is_compound or crs.is_vertical:
+            raise InputError(
+                f"image positions {path}, line 1: {system[:80]!r} has heights of its own, and those of the lines are "
+                "taken as metres above the ellipsoid",
+                remedy="Give the horizontal system alone, and ellipsoidal heights in metres.",
+                code="bad-table",
+            )
+        to_wgs84 = _transformer(crs.to_2d(), points, system)
         found = np.stack(to_wgs84.transform(points[:, 0], points[:, 1], errcheck=True), -1)
     except (CRSError, ProjError) as error:
         said = " ".join(str(error).split())[:150]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
@@ -70,7 +70,13 @@ class _Sensor(_Row):
     modality: str
 
 
-_Quaternion = Annotated[list[Finite], Field(min_length=4, max_length=4)]  # w, x, y, z
+def _of_norm_1(wxyz: list[float]) -> list[float]:
+    if abs(float(np.linalg.norm(wxyz)) - 1.0) > 1e-3:
+        raise ValueError("is no unit quaternion")
+    return wxyz
+
+
+_Quaternion = Annotated[list[Finite], Field(min_length=4, max_length=4), AfterValidator(_of_norm_1)]  # w, x, y, z
 
 
 class _Posed(_Row):

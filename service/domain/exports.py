@@ -170,7 +170,8 @@ def inputs_of(session: Session, held: jobs.Claim) -> ExportInputs:
         table, mine = MapFile, (MapFile.map_id == export.map_id) & (MapFile.number == export.map_version)
         subject = session.get_one(MapVersion, (export.map_id, export.map_version))
     statement = select(table.path, Blob.key).join(Blob, table.blob_id == Blob.id).where(mine).order_by(table.path)
-    files = [StoredArtifact(path, key) for path, key in session.execute(statement) if is_read_by_export(path)]
+    stored, formats = session.execute(statement), export.formats
+    files = [StoredArtifact(path, key) for path, key in stored if is_read_by_export(path, formats)]
     return ExportInputs(
         files=files,
         drives=_drives(session, subject) if _needs_images(export.formats) else {},

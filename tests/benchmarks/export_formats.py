@@ -22,6 +22,7 @@ from mrasfm_engine.synthetic.rigs import true_cameras
 from tests.benchmarks import fisheyes
 from tests.benchmarks.commands import CommandFailed, mrasfm
 from tests.benchmarks.table import Figure, exactly
+from tests.helpers import splatting_rule
 
 LINE = "33"
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -67,6 +68,9 @@ def _workspace(title: str, drive: Path, work: Path) -> Iterator[Figure]:
     yield Figure(line=LINE, what=what, value=float(np.median(errors)) / own, above=0.3, most=MOST_OF_OWN)
     shown = len(errors) / len(source.observation_point)
     yield Figure(line=LINE, what=f"{title}: observations that they show", value=shown, above=SHOWN, most=1.5)
+    by_rule = float(np.median(splatting_rule.errors_px(*splatting_rule.load(out / "colmap"))))
+    what = f"{title}: median reprojection by the rule of 3DGS, in that of the scene"
+    yield Figure(line=LINE, what=what, value=by_rule / own, above=0.3, most=MOST_OF_OWN)
     yield exactly(LINE, f"{title}: cameras that 3DGS takes", _taken_by_splatting(model, out), len(model.cameras))
     yield exactly(LINE, f"{title}: frames of transforms.json with all their files", _frames(out), len(model.images))
     yield from _of_nerfstudio(title, out, own, len(model.images))

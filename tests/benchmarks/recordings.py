@@ -24,6 +24,7 @@ from tests.helpers.bag_writing import FORMATS, messages_of_drive
 LINE = "34"
 START_US = 1_700_000_000_000_000
 RENDERED = ("--cameras", 6, "--units", 20, "--seed", 7)
+CONVERTED, CONVERTED_DEG = 1e-6, 1e-9
 
 
 def recordings(data: Path, work: Path) -> Iterator[Figure]:
@@ -38,7 +39,7 @@ def recordings(data: Path, work: Path) -> Iterator[Figure]:
     scene, out = reconstructed(drive, work / "rendered for data sets, scene"), work / "exports"
     mrasfm("export", scene, "--drive", drive, "--format", "nuscenes", "--format", "mcap", "--out", out)
     yield from _nuscenes(scene, drive, out / "nuscenes", work, kits)
-    yield from _mcap(out / "mcap" / "scene.mcap", work)
+    yield from _mcap(out / "mcap" / "scene.mcap", scene, work)
 
 
 def _bags(data: Path, work: Path) -> Iterator[Figure]:
@@ -109,7 +110,7 @@ def _nuscenes(scene: Path, drive_folder: Path, root: Path, work: Path, kits: Pat
     yield exactly(LINE, "nuScenes tables: samples", said["samples"], len(drive.manifest.frames))
 
 
-def _mcap(file: Path, work: Path) -> Iterator[Figure]:
+def _mcap(file: Path, scene: Path, work: Path) -> Iterator[Figure]:
     python = python_readers(work, "requirements.lock")
     if isinstance(python, str):
         yield Figure(line=LINE, what="rerun: skipped, cannot be installed here", value=0, remark=python)
@@ -118,3 +119,12 @@ def _mcap(file: Path, work: Path) -> Iterator[Figure]:
     for what, words in (("check", [file]), ("convert", [file, "-o", work / "scene.rrd"])):
         problem = problem_of([rerun, "mcap", what, *words], work)
         yield exactly(LINE, f"MCAP: rerun mcap {what}" + (f": {problem}" if problem else ""), int(not problem), 1)
+    said = output_of([python, READERS / "read_rerun.py", work / "scene.rrd", scene], work)
+    yield exactly(LINE, "MCAP: units that rerun has", said["units"], said["expected_units"])
+    # Of a metre, or of the coordinate where that is larger: rerun's numbers have 24 bits there.
+    for what, key in (("positions", "position_off"), ("rotations", "quaternion_off"), ("points", "point_off")):
+        yield Figure(line=LINE, what=f"MCAP: {what} as rerun has them, off", value=said[key], above=-1, most=CONVERTED)
+    off = said["degrees_off"]
+    yield Figure(line=LINE, what="MCAP: places on the earth as rerun has them, off", value=off, unit="deg", above=-1,
+                 most=CONVERTED_DEG)  # fmt: skip
+    yield exactly(LINE, "MCAP: places on the earth that rerun has", said["fixes"], said["expected_units"])

@@ -37,7 +37,7 @@ def read_laspy(scene: Path) -> Found:
     to_ecef = Transformer.from_crs(las.header.parse_crs(), "EPSG:4978", always_xy=True)
     local_m = (np.stack(to_ecef.transform(las.x, las.y, las.z), -1) - matrix[:3, 3]) @ matrix[:3, :3]
     own = rows[las["point_id"] - 1]
-    same = [np.array_equal(las[name], own[name]) for name in ("track_length", "error_px", "road_patch")]
+    same = [np.array_equal(las[name], own[name]) for name in ("track_length", "error_px", "road_patch", "component")]
     same += [np.array_equal(las[name] // 257, own[name]) for name in ("red", "green", "blue")]
     return {
         "points": len(las.x),

@@ -115,12 +115,16 @@ class Messages:
         """Write all as a bag of the kind; each message is recorded some time after its stamp."""
         if kind == "ros1":
             with rosbag1.Writer(path) as bag:
-                self._write(bag, self.store.serialize_ros1, late_us)
+                self.write_into(bag, late_us=late_us)
             return path
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         with rosbag2.Writer(path, version=9, storage_plugin=plugin) as bag:
             self._write(bag, self.store.serialize_cdr, late_us)
         return path
+
+    def write_into(self, bag: rosbag1.Writer, *, late_us: int = 3000) -> None:
+        """Write all into an open bag of ROS 1."""
+        self._write(bag, self.store.serialize_ros1, late_us)
 
     def _write(self, bag: Any, serialize: Any, late_us: int) -> None:
         connections: dict[str, Any] = {}

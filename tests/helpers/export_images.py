@@ -42,9 +42,16 @@ def image_of(model: str, params: Floats) -> Bytes:
     return np.round(seen_along(rays)).reshape(HEIGHT, WIDTH, 3).astype(np.uint8)
 
 
-def written(tmp_path: Path, models: Mapping[str, list[float]], *, kind: str = "png", masked: bool = False) -> Scene:
-    """A scene in `scene` and its drive in `drive`."""
-    scene = make_scene(models=models, moving=True)
+def written(
+    tmp_path: Path,
+    models: Mapping[str, list[float]],
+    *,
+    kind: str = "png",
+    masked: bool = False,
+    moving: bool = True,
+) -> Scene:
+    """A scene in `scene` and its drive in `drive`; `moving` as in `make_scene`."""
+    scene = make_scene(models=models, moving=moving)
     (tmp_path / "drive").mkdir(parents=True)
     manifest = scene.drive.manifest
     frames = []

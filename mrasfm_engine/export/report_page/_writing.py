@@ -10,6 +10,7 @@ from typing import Any
 from mrasfm_engine.errors import StorageError
 from mrasfm_engine.export import comparisons
 from mrasfm_engine.export.check import Check, ReadBack
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.report_page._read_back import faults_of
 from schemas.artifacts import REPORT_PAGE
 
@@ -26,7 +27,7 @@ def write_page(
     """
     path = folder / REPORT_PAGE
     try:
-        path.write_text(make(), encoding="utf-8")
+        read_back.expect({REPORT_PAGE: write_content(path, make())})
     except (OSError, StorageError):
         raise
     except Exception as error:

@@ -112,7 +112,7 @@ export interface components {
             url: string;
         };
         ExportRequest: {
-            formats: ("colmap" | "nerfstudio" | "nuscenes" | "mcap" | "copc" | "kitti" | "geojson")[];
+            formats: ("colmap" | "nerfstudio" | "nuscenes" | "mcap" | "copc" | "geopackage" | "geotiff" | "kitti" | "geojson")[];
             image_size_px?: number | null;
             crs?: string | null;
         };

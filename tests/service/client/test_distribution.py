@@ -33,6 +33,17 @@ def test_it_needs_few_modules_of_others(assembled: Path) -> None:
             assert others <= allowed, path
 
 
+def test_it_replaces_an_earlier_build_and_nothing_else(assembled: Path, tmp_path: Path) -> None:
+    command = [sys.executable, REPOSITORY / ".ci" / "build_client.py"]
+    (tmp_path / "mine").write_text("mine")
+    refused = subprocess.run([*command, tmp_path], check=False, capture_output=True, text=True)
+    assert "holds no earlier build" in refused.stderr
+    assert (tmp_path / "mine").read_text() == "mine"
+    (assembled / "mrasfm_client" / "left.py").touch()
+    subprocess.run([*command, assembled], check=True, capture_output=True)
+    assert not (assembled / "mrasfm_client" / "left.py").exists()
+
+
 def test_it_works_beside_folders_of_the_same_names(assembled: Path, tmp_path: Path) -> None:
     """And takes nothing from the product, which is not there."""
     for name in ("service", "schemas", "worker", "mrasfm_engine"):

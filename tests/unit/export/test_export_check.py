@@ -47,9 +47,10 @@ def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
 
 
-def text_without_end(original: Any, binary: Path, folder: Path) -> None:
-    original(binary, folder)
+def text_without_end(original: Any, binary: Path, folder: Path) -> Any:
+    digests = original(binary, folder)
     truncate(folder / "images.txt")
+    return digests
 
 
 def with_moved_rig(original: Any, scene: Scene) -> Any:
@@ -74,19 +75,20 @@ def with_moved_camera(original: Any, scene: Scene) -> Any:
     return original(replace(scene, calibration=[wrong, *scene.calibration[1:]]))
 
 
-def without_a_pair(original: Any, scene: Scene, path: Path) -> None:
-    original(replace(scene, pairs=scene.pairs[:-1]), path)
+def without_a_pair(original: Any, scene: Scene, path: Path) -> Any:
+    return original(replace(scene, pairs=scene.pairs[:-1]), path)
 
 
-def with_wrong_descriptor(original: Any, scene: Scene, path: Path) -> None:
+def with_wrong_descriptor(original: Any, scene: Scene, path: Path) -> Any:
     first = scene.features[0]
     wrong = replace(first, descriptors=first.descriptors[::-1].copy())
-    original(replace(scene, features=[wrong, *scene.features[1:]]), path)
+    return original(replace(scene, features=[wrong, *scene.features[1:]]), path)
 
 
-def ply_without_end(original: Any, scene: Scene, path: Path) -> None:
-    original(scene, path)
+def ply_without_end(original: Any, scene: Scene, path: Path) -> Any:
+    digest = original(scene, path)
     truncate(path)
+    return digest
 
 
 def tum_with_gap(original: Any, scene: Scene) -> str:
@@ -143,9 +145,9 @@ def test_a_file_that_says_something_else_is_refused(
 
 
 def test_a_file_that_no_check_covers_is_refused(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def with_another_file(original: Any, scene: Scene, path: Path) -> None:
-        original(scene, path)
+    def with_another_file(original: Any, scene: Scene, path: Path) -> Any:
         path.with_name("added.json").write_text("{}")
+        return original(scene, path)
 
     corrupt(monkeypatch, ply, "write_ply", with_another_file)
     with pytest.raises(MrasfmError, match=r"added.json .*no check covers it"):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +13,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrasfm_engine.errors import CancelledError, InputError, MrasfmError
+from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, StorageError
 from mrasfm_engine.export import run_export as exports
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import nothing
 from mrasfm_engine.export.contract import ExportOptions, ExportWork, Written
 from mrasfm_engine.export.formats import WRITERS
 from mrasfm_engine.export.geojson import _cut
+from mrasfm_engine.export.publishing import publishing
 from mrasfm_engine.export.run_export import ExportRequest, run_export
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.export.stored_scene import read_source
+from mrasfm_engine.preflight.drive_reader import write_manifest
 from schemas.exports import EXPORT_FORMATS
 from tests.helpers.export_example import MISSING_UNIT, UNITS, make_scene
+from tests.helpers.export_images import USUAL, written
 
 SMALL = ("kitti", "geojson")
 
@@ -115,10 +120,11 @@ def _changed(path: Path) -> Iterator[bytes]:
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_changed_digit_withholds_the_format_and_names_the_file(name: str, scene_folder: Path) -> None:
+    """By what the file says: digests, which would find it first, are left out."""
     source = read_source(scene_folder)
     work = ExportWork(source=source, options=ExportOptions(), folder=scene_folder.parent / "one", step=_nothing)
     work.folder.mkdir()
-    written = WRITERS[name](work)
+    written = replace(WRITERS[name](work), digests={})
     for path in [path for path in work.folder.rglob("*") if path.is_file()]:
         content = path.read_bytes()
         refused = total = 0
@@ -153,7 +159,7 @@ def test_a_defect_withholds_one_format_and_leaves_the_others(
         raise ZeroDivisionError("of nothing")
 
     for writer, said in (
-        (damaged, "kitti is withheld: 00/times.txt was written but does not read back: a time"),
+        (damaged, "kitti is withheld: 00/times.txt was written but does not read back: it is not what was written"),
         (unread, "kitti is withheld: surplus was written but does not read back: no check covers it"),
         (broken, "kitti is withheld: it cannot be written: ZeroDivisionError: of nothing"),
     ):
@@ -208,6 +214,139 @@ def test_what_a_scene_does_not_have_is_refused_by_name(scene_folder: Path, tmp_p
     points = scene_folder / "model" / "points3D.bin"
     points.write_bytes(points.read_bytes()[:-9])
     assert not (tmp_path / "out").exists()
+
+
+def test_an_export_removes_nothing_that_no_export_has_made(scene_folder: Path, tmp_path: Path) -> None:
+    """Files that somebody put into its folders, changed there, or keeps beside them under a format's name."""
+    out = tmp_path / "out"
+    _exported(scene_folder, "kitti", "geojson")
+    _exported(scene_folder, "kitti")
+    assert not (out / "geojson").exists(), "the earlier export's own"
+    kept = {
+        "kitti/00/evaluation.txt": "in its folder",
+        "kitti/00/times.txt": "changed",
+        "geojson/map.geojson": "of a format that is asked for",
+    }
+    for name, text in kept.items():
+        before = (out / name).read_bytes() if (out / name).exists() else None
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text(text)
+        with pytest.raises(InputError, match=r"is no file of the export in .* would be removed") as found:
+            _exported(scene_folder, "kitti", "geojson")
+        assert found.value.code == "bad-out-folder"
+        assert (out / name).read_text() == text
+        if before is None:
+            (out / name).unlink()
+        else:
+            (out / name).write_bytes(before)
+    elsewhere = tmp_path / "elsewhere"
+    (out / "kitti").rename(elsewhere)
+    (out / "kitti").symlink_to(elsewhere)
+    with pytest.raises(InputError, match="would be removed"):
+        _exported(scene_folder, "kitti")
+    (out / "kitti").unlink()
+    # Of a format that neither export has: it stays.
+    (out / "nuscenes").mkdir()
+    (out / "nuscenes" / "mine").touch()
+    _exported(scene_folder, "kitti")
+    assert (out / "nuscenes" / "mine").is_file()
+    assert (elsewhere / "00" / "poses.txt").is_file()
+
+
+def test_what_comes_while_an_export_is_made_stays(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = scene_folder.parent / "out"
+
+    def slow(work: ExportWork) -> Written:
+        (out / "kitti").mkdir(parents=True)
+        (out / "kitti" / "notes.txt").write_text("mine")
+        return write(work)
+
+    write = WRITERS["kitti"]
+    monkeypatch.setitem(WRITERS, "kitti", slow)
+    with pytest.raises(InputError, match="holds no earlier export"):
+        _exported(scene_folder, "kitti")
+    assert (out / "kitti" / "notes.txt").read_text() == "mine"
+    assert [path.name for path in scene_folder.parent.iterdir() if "partial" in path.name] == []
+
+
+def test_two_exports_at_once_leave_one_of_them_whole(scene_folder: Path) -> None:
+    out = scene_folder.parent / "out"
+    _exported(scene_folder, "geojson")
+    with ThreadPoolExecutor(4) as pool:
+        names = [("kitti", "geojson"), ("kitti",), ("geojson",), ("kitti", "geojson")]
+        reports = list(pool.map(lambda formats: _exported(scene_folder, *formats), names))
+    report = json.loads((out / "report.json").read_text())
+    assert report in reports
+    assert {path.name for path in out.iterdir()} == {*report["formats"], "report.json"}
+    listed = [file["path"] for result in report["formats"].values() for file in result["files"]]
+    assert sorted(listed) == sorted(p.relative_to(out).as_posix() for p in out.glob("*/**/*") if p.is_file())
+
+
+def _publish(out: Path, *names: str) -> None:
+    with publishing(out, 0, replaced=names) as work:
+        for name in names:
+            (work / name).mkdir()
+            (work / name / "new").touch()
+        (work / "report.json").write_text("new")
+
+
+def test_what_was_there_is_there_again_where_moving_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    for name in ("a", "b"):
+        (out / name).mkdir(parents=True)
+        (out / name / "old").touch()
+    (out / "report.json").write_text("old")
+    rename = Path.rename
+
+    def failing(path: Path, target: Path) -> Path:
+        if path.name == "b" and target.parent == out and path.parent.name.startswith(".out.partial"):
+            raise OSError(28, "No space left on device")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(StorageError, match="No space left"):
+        _publish(out, "a", "b")
+    assert (out / "report.json").read_text() == "old"
+    found = sorted(path.relative_to(out).as_posix() for path in out.rglob("*"))
+    assert found == ["a", "a/old", "b", "b/old", "report.json"]
+
+
+def test_a_run_that_lives_keeps_its_folder_however_long_it_takes(tmp_path: Path) -> None:
+    with publishing(tmp_path / "out", 0) as work:
+        os.utime(work, (0.0, 0.0))
+        with publishing(tmp_path / "out", 0) as other:
+            (other / "report.json").touch()
+        assert work.is_dir()
+    killed = tmp_path / ".a[1].partial-1"
+    killed.mkdir()
+    os.utime(killed, (0.0, 0.0))
+    with publishing(tmp_path / "a[1]", 0):
+        assert not killed.exists()
+
+
+def test_another_drive_with_the_same_names_is_refused(tmp_path: Path) -> None:
+    """All imported drives of a vehicle have files of the same names: only their times tell them apart."""
+    scene = written(tmp_path, USUAL)
+    frames = [
+        frame.model_copy(update={"timestamp_us": frame.timestamp_us + 60_000_000})
+        for frame in scene.drive.manifest.frames
+    ]
+    write_manifest(scene.drive.manifest.model_copy(update={"frames": frames}), tmp_path / "drive")
+    drives = {"": tmp_path / "drive"}
+    request = ExportRequest(folder=tmp_path / "scene", out=tmp_path / "out", formats=["mcap"], drives=drives)
+    with pytest.raises(
+        InputError, match=r"drive .*/drive has image left/0.png at \d+ us, the scene at \d+ us"
+    ) as found:
+        run_export(request, progress=_nothing, cancel=_never)
+    assert found.value.code == "other-drive"
+
+
+def test_components_that_are_scenes_of_their_own_are_said(tmp_path: Path) -> None:
+    scene = make_scene()
+    write_scene(scene, tmp_path / "scene", {}, components=[(make_scene(georeferenced=False), {"component": 1})])
+    notes = _exported(tmp_path / "scene", "kitti")["formats"]["kitti"]["notes"]
+    assert notes == ["components/1 is a scene of its own, and not in it"]
+    assert _exported(tmp_path / "scene" / "components" / "1", "kitti")["formats"]["kitti"]["notes"] == []
 
 
 def test_checks_can_be_given_for_folders(tmp_path: Path) -> None:

@@ -16,16 +16,18 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mrasfm_engine.errors import MrasfmError, StorageError
+from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import InputError, MrasfmError, StorageError
 from mrasfm_engine.export import comparisons, feature_database, picture_files, ply, publishing, readers
 from mrasfm_engine.export.calibration import calibration_document, document_in_map
 from mrasfm_engine.export.colmap import approximations, colmap_models
 from mrasfm_engine.export.feature_database import write_features, write_matches
 from mrasfm_engine.export.pose_files import poses_document
-from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.export.scene import require_free_folder, write_scene
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
+from mrasfm_engine.pipeline import reconstruct
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.scene.scene import CalibrationObservability, ImageFeatures, Scene
 from schemas import Pose
@@ -411,7 +413,7 @@ def test_an_interrupted_run_leaves_the_old_scene(
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
 
-def test_a_run_that_dies_while_files_move_leaves_no_complete_scene(
+def test_a_run_that_fails_while_files_move_leaves_the_scene_that_was_there(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "scene"
@@ -419,14 +421,15 @@ def test_a_run_that_dies_while_files_move_leaves_no_complete_scene(
     original = Path.rename
 
     def stop_at_ply(self: Path, target: Any) -> Path:
-        if self.name == "points.ply":
+        if self.name == "points.ply" and Path(target).parent == out:
             raise KeyboardInterrupt
         return original(self, target)
 
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     monkeypatch.setattr(Path, "rename", stop_at_ply)
     with pytest.raises(KeyboardInterrupt):
         write_scene(scene, out, {"run": 2})
-    assert not (out / "report.json").exists()
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
 
 def test_leftovers_of_killed_runs_are_cleared(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -590,3 +593,19 @@ def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
     rows = rows.copy()
     rows["component"][0] += 1
     assert [row.agrees for row in comparisons.ply(split, rows) if row.what == "a component"] == [False]
+
+
+def test_a_folder_with_files_that_no_scene_has_made_is_refused(scene: Scene, tmp_path: Path) -> None:
+    """Somebody's own pictures, say, would be replaced; other files are kept beside a scene."""
+    (tmp_path / "notes.txt").touch()
+    require_free_folder(tmp_path, ".stages")
+    require_free_folder(tmp_path / "new", ".stages")
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "mine.jpg").touch()
+    with pytest.raises(InputError, match=r"pictures was made by no scene") as found:
+        reconstruct(tmp_path / "no drive", tmp_path, EngineConfig())
+    assert found.value.code == "bad-out-folder"
+    (tmp_path / ".stages").mkdir()
+    require_free_folder(tmp_path, ".stages")  # of a run that was interrupted
+    write_scene(scene, tmp_path / "scene", {})
+    require_free_folder(tmp_path / "scene", ".stages")

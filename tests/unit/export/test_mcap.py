@@ -20,10 +20,12 @@ from mrasfm_engine.export.contract import DriveFiles, ExportOptions, ExportWork,
 from mrasfm_engine.export.formats import WRITERS
 from mrasfm_engine.export.mcap import FILE
 from mrasfm_engine.export.mcap_cameras import sent_cameras
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.export.stored_scene import read_source
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points
 from mrasfm_engine.importers.layouts import import_recording
+from mrasfm_engine.preflight.drive_reader import write_manifest
 from mrasfm_engine.scene.scene import Scene
 from tests.helpers.export_example import MODELS, POINTS, UNITS
 from tests.helpers.export_images import FISHEYES, USUAL, written
@@ -58,7 +60,7 @@ def pose_of(transform: Any) -> np.ndarray:
 
 
 def test_content(tmp_path: Path) -> None:
-    scene = written(tmp_path, MODELS, kind="jpg")
+    scene = written(tmp_path, MODELS, kind="jpg", moving=False)
     _, folder = exported(tmp_path)
     found = messages(folder)
     images = [image for i, image in enumerate(scene.drive.images) if scene.image_registered[i]]
@@ -124,6 +126,22 @@ def test_a_camera_that_foxglove_has_no_model_for(tmp_path: Path) -> None:
     assert made.notes == ["Foxglove has no model for left: no calibration"]
     assert "/left/calibration" not in messages(folder)
     assert len(messages(folder)["/left/image"]) == 4
+
+
+def test_images_of_refined_time_offsets_are_where_they_were_taken(tmp_path: Path) -> None:
+    """Both cameras of a unit have one stamp, but were not taken at one time: the rig has two poses at that stamp."""
+    scene = written(tmp_path, MODELS)
+    assert scene.unit_from_image is not None
+    _, folder = exported(tmp_path)
+    poses = {(m.child_frame_id, time_ns): pose_of(m) for time_ns, m in messages(folder)["/tf"]}
+    off = []
+    for i in np.flatnonzero(scene.image_registered).tolist():
+        image = scene.drive.images[i]
+        name, time_ns = scene.drive.cameras[image.camera].name, image.timestamp_us * 1000
+        off.append(np.abs(poses["rig", time_ns] @ poses[name, time_ns] - scene.world_from_cam[i]).max())
+    assert len(off) == 7
+    assert 0 <= max(off) < 1e-6
+    assert np.abs(scene.unit_from_image[scene.image_registered] - np.eye(4)).max() > 0.1
 
 
 def test_every_changed_byte_withholds_the_file(tmp_path: Path) -> None:
@@ -193,3 +211,18 @@ def test_the_importer_of_bags_says_what_it_is_not(tmp_path: Path) -> None:
     _, folder = exported(tmp_path)
     with pytest.raises(InputError, match=r"bag .*scene\.mcap cannot be read: Profile is not ros2"):
         import_recording(folder, tmp_path / "drive-of-it")
+
+
+def test_a_camera_that_is_called_as_a_frame(tmp_path: Path) -> None:
+    scene = written(tmp_path, MODELS)
+    camera = scene.drive.cameras[0].model_copy(update={"name": "map"})
+    rig = scene.drive.manifest.rig.model_copy(update={"cameras": [camera, *scene.drive.cameras[1:]]})
+    frames = [
+        frame.model_copy(update={"images": {"map" if k == "left" else k: image for k, image in frame.images.items()}})
+        for frame in scene.drive.manifest.frames
+    ]
+    manifest = scene.drive.manifest.model_copy(update={"rig": rig, "frames": frames})
+    write_manifest(manifest, tmp_path / "drive")
+    write_scene(replace(scene, drive=replace(scene.drive, manifest=manifest)), tmp_path / "scene", {})
+    with pytest.raises(ValueError, match="camera map has the name of a frame"):
+        exported(tmp_path)

@@ -146,7 +146,9 @@ def written_work(tmp_path: Path) -> tuple[Any, Path]:
 
 
 def test_a_changed_character_withholds_the_format_and_names_the_file(tmp_path: Path) -> None:
+    """By what the tables say: digests, which would find it first, are left out."""
     made, folder = written_work(tmp_path)
+    made = replace(made, digests={})
     assert exports._fault(made, folder) is None
     rng = np.random.default_rng(1)
     for path in sorted((folder / "v1.0-mrasfm").glob("*.json")):

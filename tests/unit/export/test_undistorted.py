@@ -21,6 +21,7 @@ from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.export.stored_scene import read_source
 from mrasfm_engine.export.undistorted import reprojection_errors_px
 from mrasfm_engine.preflight.drive_reader import write_manifest
+from tests.helpers import splatting_rule
 from tests.helpers.export_example import make_scene
 from tests.helpers.export_images import FISHEYES, HEIGHT, USUAL, WIDTH, camera_of, seen_along, written
 
@@ -83,6 +84,25 @@ def test_pinhole_images_show_the_rays_of_their_pixels(models: dict[str, list[flo
     assert 0.9 < shown_points <= 1.0
 
 
+@pytest.mark.parametrize("models", [USUAL, FISHEYES], ids=["usual", "fisheyes"])
+def test_by_the_rule_of_3dgs_points_are_as_near_as_in_the_scene(models: dict[str, list[float]], tmp_path: Path) -> None:
+    """Keypoints are half a pixel off, as real ones: a principal point or a pixel's centre that is off would show."""
+    scene, rng = written(tmp_path, models), np.random.default_rng(8)
+    features = [
+        replace(f, xy_px=(f.xy_px + rng.normal(0, 0.4, f.xy_px.shape)).astype(np.float32)) for f in scene.features
+    ]
+    write_scene(replace(scene, features=features), tmp_path / "scene", {})
+    exported(tmp_path, "colmap")
+    images, points = splatting_rule.load(tmp_path / "out" / "colmap")
+    errors = splatting_rule.errors_px(images, points)
+    own = float(np.median(reprojection_errors_px(read_source(tmp_path / "scene").scene)))
+    assert len(images) == int(scene.image_registered.sum()) * (1 if models is USUAL else 2)
+    assert len(errors) > 0.9 * len(scene.observation_point)
+    assert 0.3 < np.median(errors) <= 1.1 * own < 0.6
+    moved = [image._replace(xy_px=image.xy_px + 0.5) for image in images]
+    assert np.median(splatting_rule.errors_px(moved, points)) > 1.3 * own
+
+
 def test_views_of_a_usual_camera_lose_little_and_have_no_blank_pixels() -> None:
     for model, params in USUAL.items():
         camera = camera_of(model, params)
@@ -131,6 +151,17 @@ def test_masks_leave_out_what_moves_the_own_car_and_blank_pixels(tmp_path: Path)
             assert 85 <= unused[100].sum() <= 115
             assert unused[100].nonzero()[0].mean() == pytest.approx(550 - (WIDTH - mask.shape[1]) / 2, abs=15)
             assert unused[-5].all() == of_car
+
+
+def test_masks_that_are_not_kept_are_said(tmp_path: Path) -> None:
+    scene = written(tmp_path, USUAL)
+    stages = [{"stage": "features", "images_with_mask": {"given": 0, "made_by_model": 7}}]
+    write_scene(scene, tmp_path / "scene", {"stages": stages})
+    notes = exported(tmp_path, "colmap", image_size_px=64)["formats"]["colmap"]["notes"]
+    assert [note for note in notes if "no mask has the moving objects of 7 images" in note]
+    write_scene(scene, tmp_path / "scene", {"stages": [{"stage": "features"}]})
+    notes = exported(tmp_path, "colmap", image_size_px=64)["formats"]["colmap"]["notes"]
+    assert [note for note in notes if "no mask" in note] == []
 
 
 def test_flipped_bits_withhold_the_format_and_name_the_file(tmp_path: Path) -> None:

@@ -45,3 +45,16 @@ def test_cameras_of_different_rates() -> None:
 
 def test_one_image() -> None:
     assert grouped_by_time({"a": times(1), "b": times(1)}) == [{"a": 0, "b": 0}]
+
+
+def test_cameras_that_are_not_there_at_one_time_make_no_frame() -> None:
+    """One ends before the other begins: the time between them is no delay."""
+    frames = grouped_by_time({"early": times(20), "late": times(10, late_us=20 * PERIOD_US + 30_000)})
+    assert [len(frame) for frame in frames] == [1] * 30
+    assert [len(frame) for frame in grouped_by_time({"a": times(20), "b": times(1, late_us=5_000_000)})] == [1] * 21
+    frames = grouped_by_time({"a": times(20), "b": times(8, late_us=15 * PERIOD_US + 40_000)})
+    assert [frame for frame in frames if len(frame) == 2] == [{"a": 15 + i, "b": i} for i in range(5)]
+
+
+def test_one_image_of_each_camera_is_one_frame_where_it_is_of_one_time() -> None:
+    assert len(grouped_by_time({"a": times(1), "b": times(1, late_us=3_000_000)})) == 2

@@ -9,12 +9,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags import rosbag1
 
 from mrasfm_engine.cli import main
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
-from mrasfm_engine.importers import bags
+from mrasfm_engine.importers import bag_reader, bags
+from mrasfm_engine.importers.bag_cameras import is_rectified
 from mrasfm_engine.importers.drive_writer import ImportSummary
 from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.io.images import read_image_gray, read_image_rgb
@@ -51,6 +55,26 @@ def stereo(*, is_ros1: bool = False, frames: int = 4, late_us: int = 0, **info: 
             made.image(f"/{name}/image_raw", time_us + i * late_us, name, picture(2 * f + i))
         made.fix("/fix", time_us, "antenna", (PLACE[0] + f * 1e-5, *PLACE[1:]), variances=[0.25, 0.25, 1.0])
     return made
+
+
+def compressed_mcap(made: Messages, folder: Path, compression: str) -> Path:
+    """The messages with their chunks compressed, which rosbags itself does not write."""
+    source, target = made.write(folder / "plain", "mcap") / "plain.mcap", folder / "compressed.mcap"
+    with source.open("rb") as stream, target.open("wb") as sink:
+        writer = Writer(sink, compression=CompressionType[compression.upper()])
+        writer.start(profile="ros2")
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                schemas.setdefault(schema.id, writer.register_schema(schema.name, schema.encoding, schema.data))
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return target
 
 
 def without(topic: str) -> Edit:
@@ -285,10 +309,35 @@ def test_an_unknown_topic_is_named(tmp_path: Path) -> None:
     assert "Choose among /left/image_raw, /right/image_raw, /fix" in text
 
 
-def test_a_calibration_that_changes_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"K": 2 * np.array(K)},
+        {"model": "rational_polynomial"},
+        {"roi": {"x_offset": 8, "y_offset": 0, "width": SIZE[0], "height": SIZE[1]}},
+    ],
+)
+def test_a_calibration_that_changes_is_refused(tmp_path: Path, change: dict[str, Any]) -> None:
+    """Also where a part of the sensor of the same size is read out elsewhere."""
     made = stereo()
-    made.info("/left/camera_info", START_US + 350_000, "left", size=SIZE, K=2 * np.array(K))
+    made.info("/left/camera_info", START_US + 350_000, "left", **({"size": SIZE, "K": K} | change))
     assert "/left/camera_info: the calibration changes within the bag" in refused(made, tmp_path)
+
+
+def test_topics_whose_last_part_names_the_camera(tmp_path: Path) -> None:
+    """As /stereo/image_left; "direct" does not say that images are rectified."""
+    made = Messages(False)
+    for i, (name, pose) in enumerate((("left", LEFT), ("right", RIGHT))):
+        made.transform(STATIC, START_US, "base_link", name, pose)
+        for f in range(3):
+            topic, time_us = f"/direct/image_{name}", START_US + f * PERIOD_US
+            made.info(f"{topic}/camera_info", time_us, name, size=SIZE, K=K, D=[0.1] * 5, P=np.zeros((3, 4)))
+            made.image(topic, time_us, name, picture(2 * f + i))
+    drive, _ = imported(made, tmp_path)
+    assert [camera.name for camera in drive.cameras] == ["direct_image_left", "direct_image_right"]
+    assert drive.cameras[0].model == "FULL_OPENCV"
+    assert [is_rectified(t) for t in ("/a/image_rect", "/a/image_rect_color", "/a/rectified/compressed")] == [True] * 3
+    assert [is_rectified(t) for t in ("/a/direct", "/rect/image_raw", "/a/rectangle")] == [False] * 3
 
 
 # Transforms
@@ -326,6 +375,22 @@ def test_frames_that_nothing_links_and_two_parents(tmp_path: Path) -> None:
     made.transform(STATIC, START_US, "chassis", "left", LEFT)
     (tmp_path / "second").mkdir()
     assert "frame left has two parents, base_link and chassis" in refused(made, tmp_path / "second")
+
+
+def test_defects_of_frames_that_no_camera_needs_do_no_harm(tmp_path: Path) -> None:
+    """Two localisers place the vehicle in their own worlds, and an arm that is off has no rotation."""
+    made = stereo()
+    for world in ("odom", "map"):
+        made.transform(MOVING, START_US, world, "base_link", np.eye(4))
+    made.transform(STATIC, START_US, "base_link", "arm", np.eye(4))
+    made.kept[-1][2].transforms[0].transform.rotation.w = 0.0
+    assert imported(made, tmp_path)[1].images == 8
+    for number, (frame, message) in enumerate(
+        (("map", "frame base_link has two parents, odom and map"), ("arm", "transform from arm to base_link: rotation"))
+    ):
+        (tmp_path / str(number)).mkdir()
+        options = {"world_frame": frame} if frame == "map" else {"rig_frame": frame}
+        assert message in refused(made, tmp_path / str(number), **options)
 
 
 def test_poses_in_a_world_frame_become_rough_poses(tmp_path: Path) -> None:
@@ -466,10 +531,31 @@ def test_padded_rows_and_big_endian_values(tmp_path: Path) -> None:
     assert np.array_equal(found, values.astype(np.uint16))
 
 
+@pytest.mark.parametrize(("bits", "encoding"), [(12, "mono16"), (10, "bayer_rggb16"), (14, "rgb16")])
+def test_sensors_of_fewer_bits_in_16(tmp_path: Path, bits: int, encoding: str) -> None:
+    """As they are, pictures of 12 bits would be all but black in 8."""
+    shape = (SIZE[1], SIZE[0], 3) if encoding == "rgb16" else (SIZE[1], SIZE[0])
+    values = np.random.default_rng(1).integers(2 ** (bits - 1), 2**bits, shape).astype("<u2")
+    made = stereo()
+    packed(values, encoding)(made)
+    drive, summary = imported(made, tmp_path)
+    note = f"Images of /left/image_raw use {bits} of 16 bits: all values are taken times {2 ** (16 - bits)}."
+    assert note in summary.notes
+    found = cv2.imread(str(drive.root / drive.images[0].file), cv2.IMREAD_UNCHANGED)
+    if encoding == "mono16":
+        assert np.array_equal(found, values << 4)
+    assert 100 < read_image_gray(drive.root / drive.images[0].file).mean() < 230
+    assert len(summary.notes) == 2  # of the right camera's images of 8 bits there is nothing to say
+
+
 def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     made = stereo()
     packed(RGB, "nv21")(made)
     assert "/left/image_raw: images are encoded as 'nv21', which is not known" in refused(made, tmp_path)
+    made = stereo()
+    packed(RGB[:, :-1, :2], "yuv422")(made)
+    (tmp_path / "odd").mkdir()
+    assert "/left/image_raw: an image of 47 columns as yuv422" in refused(made, tmp_path / "odd")
     made = stereo()
     made.image("/left/image_raw", START_US + 30_000, "left", picture(1)[:16])
     (tmp_path / "second").mkdir()
@@ -488,8 +574,11 @@ def test_distances_are_no_pictures_and_repeated_stamps_are_counted(tmp_path: Pat
     made = stereo()
     made.image("/depth/image_raw", START_US, "left", picture(0).astype("<u2"), "16UC1")
     made.image("/left/image_raw", START_US, "left", picture(77))
+    png = cv2.imencode(".png", np.full((SIZE[1], SIZE[0]), 1200, np.uint16))[1].tobytes()
+    made.compressed("/depth_b/image_raw/compressed", START_US, "left", png, "16UC1; png compressed ")
     drive, summary = imported(made, tmp_path)
     assert "Left out: /depth/image_raw, which holds distances." in summary.notes
+    assert "Left out: /depth_b/image_raw/compressed, which holds distances." in summary.notes
     assert "Left out: 1 images of /left/image_raw with a stamp that an earlier one has." in summary.notes
     assert np.array_equal(read_image_gray(drive.root / drive.images[0].file), picture(0))
 
@@ -581,6 +670,34 @@ def test_a_rig_file_replaces_camera_info_and_transforms(tmp_path: Path) -> None:
 
 
 # Damage and commands
+
+
+@pytest.mark.parametrize(("kind", "compression"), [("mcap", "lz4"), ("mcap", "zstd"), ("ros1", "lz4"), ("ros1", "bz2")])
+def test_a_chunk_is_not_taken_to_the_end_of_the_memory(
+    tmp_path: Path, kind: str, compression: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few kilobytes decompress to 16 MB: they are refused, whatever the chunk says of its size."""
+    made = stereo(is_ros1=kind == "ros1")
+    blank = np.zeros((4000, 4000), np.uint8)
+    made.image("/left/image_raw", START_US + 350_000, "left", blank)
+    if kind == "ros1":
+        path = tmp_path / "bag.bag"
+        writer = rosbag1.Writer(path)
+        writer.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
+        with writer as bag:
+            made.write_into(bag)
+    else:
+        path = compressed_mcap(made, tmp_path, compression)
+    assert path.stat().st_size < 1e6
+    assert import_recording(path, tmp_path / "drive").images == 8
+    monkeypatch.setattr(bag_reader, "MAX_CHUNK_BYTES", 4_000_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"bag .* cannot be read: .*holds over 4 MB"):
+            import_recording(path, tmp_path / "none")
+        assert tracemalloc.get_traced_memory()[1] < 14e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -218,6 +218,33 @@ def test_malformed_positions_are_named(tmp_path: Path, text: str, message: str) 
     assert "geo.txt" in caught.value.what
 
 
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        ("EPSG:25832+7837", "has heights of its own"),
+        ("EPSG:2227+6360", "has heights of its own"),  # feet
+        ("EPSG:27700", "needs uk_os_OSTN15"),  # without the grid 2 m off
+        ("WGS84 UTM 61N", "WGS84 UTM 61N"),  # 32661 is no zone, but the system of the pole
+    ],
+)
+def test_systems_that_would_be_metres_off_are_refused(tmp_path: Path, system: str, message: str) -> None:
+    (tmp_path / "geo.txt").write_text(f"{system}\na.jpg 530000 180000 40\n")
+    with pytest.raises(InputError, match=message):
+        read_geo_txt(tmp_path / "geo.txt")
+
+
+def test_a_prefix_that_another_one_begins_with(rig: Path, tmp_path: Path) -> None:
+    """Images of cam10 begin with cam1, too."""
+    write_images(rig, geotagged)
+    for old, new in (("front", "cam1"), ("left", "cam10")):
+        (rig / "images" / "rig1" / old).rename(rig / "images" / "rig1" / new)
+    document = config()
+    for camera, new in zip(document[0]["cameras"], ("cam1", "cam10"), strict=True):
+        camera["image_prefix"] = f"rig1/{new}"
+    (rig / "rig_config.json").write_text(json.dumps(document))
+    assert import_recording(rig, tmp_path / "drive").images == 2 * FRAMES
+
+
 def test_positions_of_images_that_are_not_there(rig: Path, tmp_path: Path) -> None:
     write_images(rig)
     (rig / "geo.txt").write_text("EPSG:4326\nimage99.jpg 8.4 49 100\n")

@@ -246,6 +246,7 @@ def put(table: str, index: int, field: str, value: Any) -> Callable[[Tables], No
         (put("sample", 3, "next", "scene-0061-0"), "sample"),  # runs in a circle
         (put("calibrated_sensor", 1, "camera_intrinsic", [[1.0]]), "no 3x3 camera_intrinsic"),
         (put("calibrated_sensor", 1, "rotation", [1.0, 0.0]), "1.rotation"),
+        (put("ego_pose", 0, "rotation", [0.0, 0.0, 0.0, 0.0]), "0.rotation"),
         (put("sample_data", 2, "filename", "../../etc/passwd"), "2.filename"),
         (lambda tables: tables["sample_data"].clear(), "no camera keyframes"),
         (lambda tables: tables.update(ego_pose=[{"token": 1}]), "ego_pose.json"),
