@@ -116,7 +116,7 @@ def get(session: Session, project_id: str, drive_id: str, upload_id: str) -> Upl
     return upload
 
 
-def unfinished(drive_id: str, *, sha256: str | None) -> Select[tuple[Upload]]:
+def unfinished(drive_id: str, *, sha256: str | None) -> Select[Upload]:
     """Statement for the uploads of a drive that take bytes still, of one digest or of any."""
     statement = select(Upload).where(Upload.drive_id == drive_id, ~Upload.is_done, Upload.expires_us > now_us())
     return statement if sha256 is None else statement.where(Upload.sha256 == sha256)

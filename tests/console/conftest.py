@@ -39,10 +39,15 @@ ARGUMENTS = [
 DEADLINE_MS = 20_000
 
 
+def chromium() -> str | None:
+    """The system's chromium; None where there is none."""
+    return next(filter(None, map(shutil.which, CHROMIUM)), None)
+
+
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """The system's chromium; skips where there is none, fails if MRASFM_REQUIRE_BROWSER is 1."""
-    found = next(filter(None, map(shutil.which, CHROMIUM)), None)
+    found = chromium()
     if found is None:
         message = "no chromium in PATH: apt install chromium"
         if os.environ.get("MRASFM_REQUIRE_BROWSER") == "1":
