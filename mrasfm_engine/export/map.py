@@ -98,7 +98,8 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
         for name, (key, arrays, documents) in kept.items():
             store.save(name, key, arrays, documents)
     written = {**report, "summary": figures}
-    figures["notes"] += write_page(work, partial(map_page, content.document, work, written), read_back)
+    make_page = partial(map_page, content.document, work, written, content.calibrations)
+    figures["notes"] += write_page(work, make_page, read_back, content.calibrations)
     write_json(work / COMPLETE_MARK, written)
     read_back.check(_checks(content))
     read_back.require_all()

@@ -164,7 +164,8 @@ def _write(
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     (work / MANIFEST_FILE).write_text(manifest + "\n", encoding="utf-8")
     document = {**report, "summary": figures}
-    figures["notes"] += write_page(work, partial(scene_page, scene, work, document, calibrated), read_back, calibrated)
+    make_page = partial(scene_page, scene, work, document, calibrated)
+    figures["notes"] += write_page(work, make_page, read_back, {"": calibrated})
     write_json(work / COMPLETE_MARK, document)
     read_back.check(_checks(scene, pictures))
     read_back.require_all()

@@ -47,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
         for name in SIZES if options.look else ("light",):
             folder = options.look / name if options.look else options.out
-            for page, size_bytes in pictures(browser, url, key, folder, name, whole=bool(options.look), only=options.only):
+            for page, size_bytes in pictures(
+                browser, url, key, folder, name, whole=bool(options.look), only=options.only
+            ):
                 print(f"{folder / page}.png: {size_bytes / 1000:.0f} kB")
         browser.close()
     return 0

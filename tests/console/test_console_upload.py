@@ -111,7 +111,9 @@ def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
         return page
 
     first = page_of_a_new_browser()
-    first.route("**/uploads/*", lambda route: route.continue_() if len(pieces) < 2 else None)  # the second is on its way
+    first.route(
+        "**/uploads/*", lambda route: route.continue_() if len(pieces) < 2 else None
+    )  # the second is on its way
     go(first, world.api.url, "upload")
     choose(first, folder)
     while len(pieces) < 2:
