@@ -151,7 +151,6 @@ def test_archives_are_uploaded_once(open_console: Open, world: World, tmp_path: 
     log_in(page, world.api.url, client.key)
     for number, suffix in enumerate((".zip", ".tar", ".tar.gz"), 1):
         drive = tiny_drive(f"as {suffix}", seed=f"as {suffix}")
-        drive = TinyDrive(drive.manifest, drive.files)
         path = archive_of(drive, tmp_path / f"drive{suffix}", **{"my drive__.DS_Store": b"litter"})
         assert sorted(upload(page, world.api.url, path)) == sorted(drive.files), suffix
         assert upload(page, world.api.url, path) == [], suffix

@@ -20,7 +20,7 @@ from mrasfm_engine.export.report_page._html import (
 )
 from mrasfm_engine.export.report_page._read_back import MOST_BYTES
 
-# A picture of 240 px, the smallest, has some 8 kB; the pictures of more seams than have room are named.
+# Below this nothing is seen on it; the pictures of seams for which there is no room are named.
 SMALLEST_PICTURE_BYTES = 12_000
 BASE64 = 4 / 3
 MARGIN_BYTES = 60_000  # of the page: style, script, headings
@@ -59,7 +59,7 @@ def map_page(
     lines = list(_verdicts(document, report["summary"], calibrations))
     begin = [heading("Map", "Map", report.get("engine_version", ""), lines, report["summary"]), _scenes(document)]
     room = MOST_BYTES - MARGIN_BYTES - sum(len(part.encode()) for part in (*begin, *others, *_seams(document)))
-    return page("Map", [*begin, *_seams(document, folder, int(room / BASE64)), *others])
+    return page("Map", [*begin, *_seams(document, folder, room), *others])
 
 
 def _verdicts(
@@ -102,25 +102,29 @@ def _scenes(document: Mapping[str, Any]) -> str:
     return section("Scenes", table(["Scene", "Verdict", "Units", "Points", "Moved from its positions"], rows))
 
 
-def _seams(document: Mapping[str, Any], folder: Path | None = None, picture_bytes: int = 0) -> Iterator[str]:
-    """A section of each seam; with a folder also its pictures, which have so many bytes together."""
-    pictured = sum("pictures" in seam for seam in document["seams"])
-    shown = min(pictured, max(picture_bytes, 0) // (2 * SMALLEST_PICTURE_BYTES))
-    each = min(PREVIEW_BYTES, picture_bytes // (2 * shown)) if shown else 0
+def _seams(document: Mapping[str, Any], folder: Path | None = None, room_bytes: int = 0) -> Iterator[str]:
+    """A section of each seam; with a folder also its pictures, which take so many bytes of the page together."""
+    left = sum("pictures" in seam for seam in document["seams"])
     for seam in document["seams"]:
         accepted, reason = seam["accepted"], text(seam.get("reason", "the evidence does not suffice"))
         state = "accepted" if accepted else f"rejected: {reason}"
         figures = {label: number(seam[name], unit) for name, label, unit in SEAM_FIGURES if seam.get(name) is not None}
-        pictures = seam.get("pictures")
-        if folder is None:
-            drawn = ""
-        elif pictures is None:
-            drawn = "" if not accepted else "<p>There are no pictures: they were switched off.</p>\n"
-        elif shown > 0:
-            caption = "Points of both scenes from above"
-            drawn, shown = pair(folder, pictures["before"], pictures["after"], caption, each), shown - 1
-        else:
-            drawn = f"<p>Its pictures: {text(pictures['before'])}, {text(pictures['after'])}.</p>\n"
+        drawn = ""
+        if folder is not None and "pictures" in seam:
+            each = int(room_bytes / BASE64 / 2 / left)
+            drawn, left = _pictures(seam["pictures"], folder, max(each, SMALLEST_PICTURE_BYTES), room_bytes), left - 1
+            room_bytes -= len(drawn)
+        elif folder is not None and accepted:
+            drawn = "<p>There are no pictures: they were switched off.</p>\n"
         yield section(f"Seam of {seam['a']} and {seam['b']}", f"<p>{state}</p>\n", facts(figures), drawn)
     if not document["seams"]:
         yield section("Seams", "<p>No two scenes are close enough to one another to look for a seam.</p>\n")
+
+
+def _pictures(names: Mapping[str, str], folder: Path, each_bytes: int, room_bytes: int) -> str:
+    """A seam's pictures, or their names where the page has no room for them."""
+    caption = "Points of both scenes from above"
+    drawn = pair(folder, names["before"], names["after"], caption, min(each_bytes, PREVIEW_BYTES))
+    if drawn and len(drawn) <= room_bytes:
+        return drawn
+    return f"<p>Its pictures: {text(names['before'])}, {text(names['after'])}.</p>\n"

@@ -219,11 +219,11 @@ def test_a_map_names_its_seams_and_shows_the_calibration_of_each_drive(written: 
     assert faults == ["the rotation of left about x is another in two"]
 
 
-@pytest.mark.parametrize(("seams", "drawn"), [(12, 12), (120, 50)])
+@pytest.mark.parametrize(("seams", "drawn"), [(12, 12), (120, 20)])
 def test_all_seams_of_a_map_show_their_pictures_while_the_page_has_room(tmp_path: Path, seams: int, drawn: int) -> None:
     rng = np.random.default_rng(0)
     image = cv2.resize(rng.integers(0, 256, (60, 60, 3), dtype=np.uint8), (500, 500))
     found = page_of_map(tmp_path, seams, {}, image)
     assert drawn <= found.count("data:image/jpeg;base64,") / 2 <= seams
     assert found.count("Its pictures: pictures/") == seams - found.count("data:image/jpeg;base64,") // 2
-    assert 300_000 < len(found.encode()) < MOST_BYTES
+    assert 100_000 < len(found.encode()) < MOST_BYTES

@@ -35,7 +35,7 @@ function Parts({ status }: { status: Status }): Shown {
       : html`<div class="scroll" tabindex="0" role="region" aria-label="Workers"><table>
           <thead><tr><th scope="col">Worker</th><th scope="col">Online</th><th scope="col">Queues</th><th scope="col" class="number">Jobs at one time</th><th scope="col">Last report</th></tr></thead>
           <tbody>${status.workers.map(
-            (worker) => html`<tr><td><code>${worker.name}</code></td><td><span class=${`badge ${worker.online ? "good" : "bad"}`}>${worker.online ? "online" : "offline"}</span></td>
+            (worker) => html`<tr><td><code>${worker.name}</code></td><td><span class=${`badge ${worker.online ? "good" : "plain"}`}>${worker.online ? "online" : "offline"}</span></td>
               <td>${worker.queues.join(", ")}</td><td class="number">${worker.concurrency}</td><td><${Time} at=${worker.seen_at} /></td></tr>`,
           )}</tbody></table></div>`}
     <p><a href="docs">Description of the API</a></p>`;

@@ -49,6 +49,7 @@ export class Scene3D {
   private nodes: Node[] = [];
   private asked = 0;
   private frame = 0;
+  private isFitted = false; // to the canvas, whose size is known late
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -89,9 +90,11 @@ export class Scene3D {
       return [values.reduce((a, b) => Math.min(a, b), Infinity), values.reduce((a, b) => Math.max(a, b), -Infinity)];
     };
     const [x, y, z] = [axis(0), axis(1), axis(2)];
-    const reach = Math.max(x[1] - x[0], y[1] - y[0], 20);
+    const radius = Math.max(0.5 * Math.hypot(x[1] - x[0], y[1] - y[0], z[1] - z[0]), 8) + 4; // with the frusta around it
+    const half = MathUtils.degToRad(this.camera.fov) / 2;
+    const narrower = Math.min(half, Math.atan(Math.tan(half) * this.camera.aspect));
     this.controls.target.set((x[0] + x[1]) / 2, (y[0] + y[1]) / 2, (z[0] + z[1]) / 2);
-    this.camera.position.copy(this.controls.target).add(new Vector3(-0.35 * reach, -0.8 * reach, 0.75 * reach));
+    this.camera.position.copy(this.controls.target).add(new Vector3(-0.3, -0.68, 0.67).setLength(radius / Math.sin(narrower)));
     this.controls.update();
     this.draw();
   }
@@ -263,6 +266,8 @@ export class Scene3D {
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
+    if (!this.isFitted) this.home();
+    this.isFitted = true;
     this.draw();
   }
 
