@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,9 +28,10 @@ from schemas.drive import DriveManifest
 from service.database.tables import MapVersion, Scene
 from service.domain import jobs
 from tests.helpers.export_example import make_scene
-from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, api_in_thread, settings_of
+from tests.helpers.live_api import ONE_ATTEMPT, REPOSITORY, Api, Client, api_in_thread, settings_of
 from tests.helpers.tiny_drive import TinyDrive, png
 
+VIEW = "import sys; from mrasfm_engine.cli import main; sys.exit(main())"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 # Without a graphics card WebGL is computed; QUIC and the network's services are not asked for.
 ARGUMENTS = [
@@ -284,3 +289,21 @@ def wait_for(page: Page, condition: str) -> None:
     while not page.evaluate(condition):
         assert time.monotonic() < end_s, condition
         page.wait_for_timeout(50)
+
+
+@contextmanager
+def viewing(*arguments: str | Path) -> Iterator[str]:
+    """The address that the command prints; Ctrl-C ends it well."""
+    command = [sys.executable, "-P", "-c", VIEW, "view", *map(str, arguments), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert process.stdout is not None
+        found = re.search(r"http://\S+", process.stdout.readline())
+        assert found is not None
+        yield found[0].rstrip(";")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.communicate()
