@@ -145,11 +145,9 @@ class Scene:
             self.unit_component = np.zeros(len(self.unit_registered), np.int64)
 
     def _repr_html_(self) -> str:
-        """Jupyter's picture of a scene: how much of the drive it has, where it is, and what is wrong with its cameras."""
+        """Jupyter's picture of a scene: how much of the drive it has, where it is, which cameras are wrong."""
         wrong = [
-            camera.name
-            for camera, found in zip(self.drive.cameras, self.calibration, strict=False)
-            if found.is_wrong
+            camera.name for camera, found in zip(self.drive.cameras, self.calibration, strict=False) if found.is_wrong
         ]
         place = self.georeference
         on_earth = "none"

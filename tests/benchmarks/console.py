@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import httpx
 import numpy as np
 import psutil
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from mrasfm_engine.export.copc import in_reference_system, offset_of, write_copc
 from mrasfm_engine.export.scene import write_scene
-from schemas.artifacts import COPC_FILE, VIEW_FILE
+from schemas.artifacts import COPC_FILE, REPORT_PAGE, VIEW_FILE
+from tests.benchmarks.commands import CommandFailed, mrasfm
+from tests.benchmarks.export_formats import run_apart
 from tests.benchmarks.table import Figure, exactly, failed
-from tests.console.conftest import ARGUMENTS, chromium, viewing
+from tests.console.conftest import ARGUMENTS, chromium, log_in, viewing
+from tests.console.screenshots import service
 from tests.helpers.export_example import make_scene, street_of_points
+from tests.helpers.live_api import REPOSITORY
 
 LINE = "38"
+STATIC = "service/console/static/"
 POINTS = 5_000_000
 STREET_M, BEGIN_M = 600.0, -80.0
 FIRST_MS, FIRST_BYTES = 3000.0, 2e6
 MOST_SHARE, MOST_MEMORY_BYTES, MOST_DELAY_MS = 0.4, 1e9, 100.0
+CAMERAS, UNITS, SIZE = 6, 20, ("--width", 640, "--height", 360)
+TURNED, TURNED_BY_DEG = "front_left", 3.0
 INPUT_EVERY_MS, MIN_INPUTS = 20, 20
 LOADED_WITHIN_S = 120.0
 
@@ -65,9 +76,95 @@ def console(data: Path, work: Path) -> Iterator[Figure]:
         return
     folder = street(work / "street")
     with viewing(folder) as address, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
-        for part, ends in PARTS.items():
+        for part, ends in PARTS.items():  # in a browser of its own: the end of another's page takes the same cores
+            browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
             yield from _streaming(browser, address, folder, part, ends)
+            browser.close()
+
+
+def turned_camera(data: Path, work: Path) -> Iterator[Figure]:
+    """A drive rendered with one camera turned: page and report flag this camera and no other."""
+    found = chromium()
+    if found is None:
+        yield failed(LINE, "a turned camera in the browser", "no chromium in PATH: apt install chromium")
+        return
+    drive, scene = work / "turned", work / "turned, scene"
+    mrasfm(
+        "synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", 1, "--no-masks", *SIZE,
+        "--miscalibrated-camera", TURNED, "--miscalibrated-by-deg", TURNED_BY_DEG, "--out", drive,
+    )  # fmt: skip
+    mrasfm("reconstruct", drive, "--out", scene)
+    with viewing(scene) as address, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
+        page = browser.new_page()
+        for what, target in (
+            ("page", address.replace("/3d", "/calibration")),
+            ("report", (scene / REPORT_PAGE).as_uri()),
+        ):
+            page.goto(target)
+            page.locator("[data-corrections=rotation]").wait_for()
+            title = f"{TURNED} turned by {TURNED_BY_DEG:g} deg, {what}"
+            flagged = page.locator("[data-corrections=rotation] tr[data-wrong=true]")
+            names = flagged.evaluate_all("rows => rows.map(row => row.dataset.camera)")
+            yield exactly(LINE, f"{title}: flagged", int(TURNED in names), 1)
+            yield exactly(LINE, f"{title}: others flagged + 1", 1 + len(set(names) - {TURNED}), 1)
+            said = page.get_by_text(re.compile(f"not mounted as given: {TURNED}$", re.IGNORECASE))
+            yield exactly(LINE, f"{title}: said in words", int(said.count() > 0), 1)
+            values = flagged.first.locator("[data-value]").evaluate_all("all => all.map(one => +one.dataset.value)")
+            turned_deg = float(np.linalg.norm(values))
+            yield Figure(
+                line=LINE, what=f"{title}: correction shown", value=turned_deg, unit="deg",
+                above=TURNED_BY_DEG - 0.3, most=TURNED_BY_DEG + 0.3,
+            )  # fmt: skip
+        browser.close()
+
+
+def wheel(data: Path, work: Path) -> Iterator[Figure]:
+    """The wheel in an environment of its own, from the lock, far from the sources."""
+    dist, environment, elsewhere = work / "dist", work / "environment", work / "elsewhere"
+    elsewhere.mkdir()
+    try:
+        build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", dist]
+        run_apart([*build, REPOSITORY], elsewhere)
+        (built,) = dist.glob("mrasfm-*.whl")
+        run_apart([sys.executable, "-m", "venv", environment], elsewhere)
+        pip = [environment / "bin" / "python", "-m", "pip", "install", "--quiet"]
+        run_apart([*pip, "--require-hashes", "-r", REPOSITORY / "requirements-runtime.lock"], elsewhere)
+        run_apart([*pip, "--no-deps", built], elsewhere)
+    except CommandFailed as error:
+        yield failed(LINE, "the wheel in an environment of its own", str(error))
+        return
+    python, folder = environment / "bin" / "python", elsewhere / "data"
+    keys = [python, "-P", "-m", "service", "keys", "--data", folder, "create", "--name", "wheel"]
+    key = run_apart(keys, elsewhere).strip()
+    with service(folder, python=python, cwd=elsewhere) as url:
+        with zipfile.ZipFile(built) as archive:
+            shipped = [name for name in archive.namelist() if name.startswith(STATIC)]
+            static = {name.removeprefix(STATIC): archive.read(name) for name in shipped}
+        page = httpx.get(url, trust_env=False)
+        yield exactly(LINE, "wheel: status of /", page.status_code, 200)
+        got = {name: httpx.get(f"{url}/console/files/{name}", trust_env=False) for name in static}
+        same = [name for name, answer in got.items() if answer.status_code == 200 and answer.content == static[name]]
+        yield exactly(LINE, "wheel: files of the console that are served as they were packed", len(same), len(static))
+        yield Figure(line=LINE, what="wheel: files of the console", value=len(static), above=10, most=100)
+        yield from _logged_in(url, key)
+
+
+def _logged_in(url: str, key: str) -> Iterator[Figure]:
+    found = chromium()
+    if found is None:
+        yield failed(LINE, "wheel: the console in a browser", "no chromium in PATH: apt install chromium")
+        return
+    faults: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
+        page = browser.new_page()
+        page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("requestfailed", lambda request: faults.append(request.url))
+        log_in(page, url, key)
+        page.get_by_text("No drive yet.").wait_for()
+        yield exactly(LINE, "wheel: the page of drives is there, without a fault", 1 + len(faults), 1)
         browser.close()
 
 
@@ -85,9 +182,7 @@ def street(folder: Path) -> Path:
     return folder
 
 
-def _streaming(
-    browser: Browser, address: str, folder: Path, part: str, ends: tuple[float, float]
-) -> Iterator[Figure]:
+def _streaming(browser: Browser, address: str, folder: Path, part: str, ends: tuple[float, float]) -> Iterator[Figure]:
     """Open the scene, look at all of it, then at a tenth of the street from above."""
     figure, file_bytes = partial(Figure, line=LINE), (folder / COPC_FILE).stat().st_size
     context = browser.new_context(viewport={"width": 1280, "height": 900})
@@ -112,7 +207,13 @@ def _streaming(
     yield figure(what=f"{what}: share of the file that was read", value=near["bytes"] / file_bytes, most=MOST_SHARE)
     notes = page.evaluate("window.notes")
     yield figure(what=f"{what}: inputs that were measured", value=notes["inputs"], above=MIN_INPUTS - 1, most=1e6)
-    yield figure(what=f"{what}: longest wait of an input", value=notes["waited_ms"], unit="ms", most=MOST_DELAY_MS, remark=f"at {notes['waited_at_ms']:.0f} ms")
+    yield figure(
+        what=f"{what}: longest wait of an input",
+        value=notes["waited_ms"],
+        unit="ms",
+        most=MOST_DELAY_MS,
+        remark=f"at {notes['waited_at_ms']:.0f} ms",
+    )
     yield figure(what=f"{what}: longest task of the page", value=notes["longest_ms"], unit="ms", above=-1)
     page_bytes, card_bytes = _memory_bytes()
     most = MOST_MEMORY_BYTES / 1e6

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import socket
 import subprocess
 import sys
@@ -22,8 +23,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.console.conftest import ARGUMENTS, chromium, go, log_in
+from tests.helpers.live_api import REPOSITORY
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 KEPT = REPOSITORY / "docs" / "images" / "console"
 MOST_BYTES = 150_000
 COLORS = (256, 128, 64, 32)
@@ -56,13 +57,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def service(data: Path) -> Iterator[str]:
+def service(data: Path, *, python: str | Path = sys.executable, cwd: Path | None = None) -> Iterator[str]:
     """The service over a data folder, on a free port; its address."""
     with closing(socket.socket()) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    argv = [sys.executable, "-P", "-m", "service", "standalone", "--data", str(data), "--port", str(port)]
-    process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    argv = [python, "-P", "-m", "service", "standalone", "--data", data, "--port", str(port)]
+    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    if cwd is not None:  # an installation: nothing of these sources
+        del environment["PYTHONPATH"]
+    process = subprocess.Popen(argv, cwd=cwd, env=environment, **quiet)
     url = f"http://127.0.0.1:{port}"
     try:
         until_s = time.monotonic() + READY_WITHIN_S
@@ -86,21 +91,23 @@ def _is_ready(url: str) -> bool:
 def addresses(url: str, key: str) -> dict[str, str]:
     """All pages by name, of the newest scene and map."""
 
-    def newest(what: str) -> dict[str, Any]:
+    def newest(what: str, **fields: str) -> dict[str, Any]:
         headers = {"Authorization": f"Bearer {key}"}
         items = httpx.get(f"{url}/v1/{what}", headers=headers, trust_env=False).json()["items"]
-        if not items:
-            raise SystemExit(f"the service has none of: {what}. Give the folder of a finished 'mrasfm demo'.")
-        return dict(items[0])
+        for item in items:
+            if fields.items() <= item.items():
+                return dict(item)
+        raise SystemExit(f"the service has none of: {what}. Give the folder of a finished 'mrasfm demo'.")
 
     scene, of_map, drive = newest("scenes"), newest("maps"), newest("drives")
+    aggregation = newest("jobs", kind="AGGREGATION")
     scene_page, map_page = f"scenes/{scene['id']}", f"maps/{of_map['id']}"
     return {
         "drives": "drives",
         "drive": f"drives/{drive['id']}",
         "upload": "upload",
         "jobs": "jobs",
-        "job": f"jobs/{newest('jobs?kind=AGGREGATION')['id']}",
+        "job": f"jobs/{aggregation['id']}",
         "scenes": "scenes",
         "scene": scene_page,
         "scene-3d": f"{scene_page}/3d",

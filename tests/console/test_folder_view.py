@@ -11,6 +11,7 @@ from playwright.sync_api import expect
 from service.api.folder_view import FolderViewError, create_view
 from tests.console.conftest import Open, World, example_drive, viewing, wait_for
 
+
 @pytest.fixture(scope="module")
 def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     drive, folder = example_drive("example"), tmp_path_factory.mktemp("drive")
