@@ -100,17 +100,17 @@ def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
 ) -> None:
     client, drive = world.api.client(), tiny_drive("large", seed="large")
     name = next(iter(drive.files))
-    drive.files[name] += bytes(3 * PIECE_BYTES - 1000)  # after the picture's end
+    drive.files[name] += bytes(2 * PIECE_BYTES + PIECE_BYTES // 2)  # after the picture's end
     folder = folder_of(drive, tmp_path / "drive")
     pieces: list[int] = []
 
-    def page_of_a_new_browser() -> Page:
-        page = open_console(world.api.url).new_page()
-        log_in(page, world.api.url, client.key)
+    def page_of_a_new_browser(url: str) -> Page:
+        page = open_console(url).new_page()
+        log_in(page, url, client.key)
         page.on("request", lambda r: pieces.append(int(r.headers["upload-offset"])) if r.method == "PATCH" else None)
         return page
 
-    first = page_of_a_new_browser()
+    first = page_of_a_new_browser(world.api.url)
     first.route(
         "**/uploads/*", lambda route: route.continue_() if len(pieces) < 2 else None
     )  # the second is on its way
@@ -120,8 +120,10 @@ def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
         first.wait_for_timeout(20)
     first.close()
     assert pieces == [0, PIECE_BYTES]
-    upload(page_of_a_new_browser(), world.api.url, folder)
-    assert pieces == [0, PIECE_BYTES, PIECE_BYTES, 2 * PIECE_BYTES], "one piece at most came twice"
+    insecure = world.api.url.replace("127.0.0.1", "mrasfm.test")
+    upload(page_of_a_new_browser(insecure), insecure, folder)
+    assert pieces[2] >= PIECE_BYTES, "it goes on where the first ended: at most the piece that was cut comes twice"
+    assert len(pieces) == 4
     stored = client.get(f"/v1/drives/{drive_of(client)}/files/{name}")
     assert stored.content == drive.files[name]
 
@@ -161,9 +163,8 @@ def test_archives_are_uploaded_once(open_console: Open, world: World, tmp_path: 
         assert client.get(f"/v1/drives/{drives[0]['id']}/files/{name}").content == data
 
 
-@pytest.mark.parametrize("suffix", [".zip", ".tar", ".tar.gz"])
 def test_an_archive_with_a_wrong_name_is_refused_before_its_bytes_are_sent(
-    open_console: Open, world: World, tmp_path: Path, suffix: str
+    open_console: Open, world: World, tmp_path: Path
 ) -> None:
     page, client = open_console(world.api.url).new_page(), world.api.client()
     log_in(page, world.api.url, client.key)
@@ -176,10 +177,11 @@ def test_an_archive_with_a_wrong_name_is_refused_before_its_bytes_are_sent(
         "outside": ({"..__..__etc__passwd": b""}, "'../../etc/passwd' leaves the drive's folder", "relative names"),
         "absolute": ({"__etc__passwd": b""}, "'/etc/passwd' has an absolute name", "relative names"),
     }
-    for name, (others, says, remedy) in wrong.items():
-        choose(page, archive_of(tiny_drive("wrong", seed="wrong"), tmp_path / f"{name}{suffix}", **others))
-        expect(alert).to_contain_text(says)
-        expect(alert).to_contain_text(remedy)
+    for suffix in (".zip", ".tar", ".tar.gz"):
+        for name, (others, says, remedy) in wrong.items():
+            choose(page, archive_of(tiny_drive("wrong", seed="wrong"), tmp_path / f"{name}{suffix}", **others))
+            expect(alert).to_contain_text(says)
+            expect(alert).to_contain_text(remedy)
     (tmp_path / "drive.7z").write_bytes(b"7z\xbc\xaf\x27\x1c" + bytes(600))
     choose(page, tmp_path / "drive.7z")
     expect(alert).to_contain_text("packed with 7z")

@@ -1,5 +1,5 @@
 // The upload of a drive. What the service has is asked, not remembered: another browser goes on where this one stopped.
-import { fileUrl, getAll, ProblemError, send, type Drive } from "../client";
+import { fileUrl, getAll, ProblemError, send, type Drive, type Upload } from "../client";
 import { Hasher } from "./hashing";
 import { requireExpected } from "./archive";
 import { composed, MANIFEST, type Entry, type Folder } from "./folder";
@@ -21,10 +21,6 @@ interface DriveFile {
   path: string;
   sha256?: string | null;
   size_bytes?: number | null;
-}
-interface UploadResource {
-  id: string;
-  path?: string | null;
 }
 interface Sent extends Entry {
   sha256: string;
@@ -149,7 +145,7 @@ async function inPieces(drive: Drive, { path, file, sha256 }: Sent, sent: (bytes
 
 /** The upload of this file that another page, or another browser, has begun. */
 async function begun(drive: Drive, path: string, sha256: string, abort: AbortSignal): Promise<string | null> {
-  const found = (await getAll<UploadResource>(`v1/drives/${drive.id}/uploads?sha256=${sha256}`, abort)).find((upload) => upload.path === path);
+  const found = (await getAll<Upload>(`v1/drives/${drive.id}/uploads?sha256=${sha256}`, abort)).find((upload) => upload.path === path);
   return found ? `v1/drives/${drive.id}/uploads/${found.id}` : null;
 }
 
