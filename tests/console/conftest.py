@@ -42,6 +42,7 @@ ARGUMENTS = [
     "--ignore-gpu-blocklist",
 ]
 DEADLINE_MS = 20_000
+VEHICLE = "test-car-7"
 
 
 def chromium() -> str | None:
@@ -128,6 +129,7 @@ class World:
             "map in 3D": f"{of_map}/3d",
             "map on the map": f"{of_map}/place",
             "seams": f"{of_map}/seams",
+            "map's calibration": f"{of_map}/calibration",
             "versions": f"{of_map}/versions",
             "map's files": f"{of_map}/files",
             "status": "status",
@@ -145,7 +147,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 def example_drive(name: str) -> TinyDrive:
     """The drive that the example's scene is of, with gray images."""
-    document = make_scene().drive.manifest.model_copy(update={"name": name}).model_dump(mode="json", exclude_none=True)
+    named = {"version": 2, "name": name, "vehicle": VEHICLE}
+    document = make_scene().drive.manifest.model_copy(update=named).model_dump(mode="json", exclude_none=True)
     files = [image["file"] for frame in document["frames"] for image in frame["images"].values()]
     DriveManifest.model_validate(document)
     return TinyDrive(document, {path: png(960, 600, seed=f"{name} {path}") for path in files})
@@ -172,6 +175,7 @@ def _filled(api: Api, client: Client, folder: Path) -> World:
         "map.json": json.dumps(_map_document()).encode(),
         "pictures/a.png": png_of(noise),
         "pictures/b.png": png_of(noise),
+        "calibration/example.json": files["calibration.json"],
     }
     job = client.aggregate(scenes=scene_ids, name="crossing")
     client.publish_map(client.claim(job["id"]), map_files)

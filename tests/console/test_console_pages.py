@@ -30,7 +30,7 @@ def test_every_page_is_whole(open_console: Open, world: World) -> None:
     for name, address in world.pages.items():
         go(page, world.api.url, address)
         expect(page.locator("main h1")).not_to_be_empty()
-        alerts = {"failed job": 1, "calibration": 1}.get(name, 0)
+        alerts = {"failed job": 1, "calibration": 1, "map's calibration": 1}.get(name, 0)
         assert page.locator(".box.bad[role=alert]").count() == alerts, name
         assert page.evaluate("document.documentElement.scrollWidth") <= WIDE["width"], name
         findings[name] = serious(page)
@@ -166,6 +166,13 @@ def test_calibration_shows_what_the_file_says(open_console: Open, world: World) 
         for param, given in zip(camera["param_names"], camera["refined"]["params"], strict=True):
             cell = page.locator(f"[data-intrinsics] tr[data-camera={name}][data-param={param}] td[data-value]").last
             assert float(cell.get_attribute("data-value") or "nan") == given
+    # Three drives of the vehicle have a scene: two of one calibration from the fixture's file, and the map's third.
+    charts = page.locator(".chart")
+    expect(charts).to_have_count(3)
+    for index in range(3):
+        drawn = charts.nth(index).locator("[data-value]").evaluate_all("all => all.map(one => +one.dataset.value)")
+        values = [camera["difference"]["rotation_vector_deg"][index] for camera in document["cameras"].values()]
+        assert drawn == [value for value in values for _ in range(3)]
 
 
 def test_versions_are_compared_and_rolled_back(open_console: Open, world: World) -> None:
