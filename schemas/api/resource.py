@@ -31,7 +31,7 @@ class Resource(BaseModel):
 
     def _repr_html_(self) -> str:
         """Jupyter's picture of a resource: its fields; of lists and of what holds more, how much there is."""
-        return notebook_table(type(self).__name__.removesuffix("Resource"), dict(_rows(self)))
+        return notebook_table(type(self).__name__.removesuffix("Resource"), dict(_named_values(self)))
 
 
 class ArtifactResource(Resource):
@@ -44,11 +44,11 @@ class ArtifactResource(Resource):
     url: str = Field(description="where to get it, relative to the server")
 
 
-def _rows(resource: BaseModel, within: str = "") -> Iterator[tuple[str, object]]:
+def _named_values(resource: BaseModel, within: str = "") -> Iterator[tuple[str, object]]:
     for name in type(resource).model_fields:
         value = getattr(resource, name)
         if isinstance(value, BaseModel):
-            yield from _rows(value, f"{within}{name}.")
+            yield from _named_values(value, f"{within}{name}.")
         elif isinstance(value, list | dict):
             yield f"{within}{name}", f"{len(value)} entries"
         elif value is not None:

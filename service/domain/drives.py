@@ -165,7 +165,7 @@ def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) ->
 
 
 def named_files(session: Session, drive_id: str, paths: Sequence[str]) -> set[str]:
-    """Those of some paths that the drive's manifest names, however the characters of a path are composed."""
+    """Select the paths that the drive's manifest names, however the characters of a path are composed."""
     found = {MANIFEST_NAME} & set(paths)
     mine = select(DriveFile.path).where(DriveFile.drive_id == drive_id)
     for i in range(0, len(paths), _BATCH):

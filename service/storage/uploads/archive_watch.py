@@ -49,7 +49,7 @@ class _Read:
 
 @dataclass(frozen=True)
 class _ReadSome:
-    """At least one byte, and at most so many."""
+    """Read at least one byte, and at most so many."""
 
     size_bytes: int
 
@@ -77,7 +77,7 @@ class ArchiveWatch:
     Parameters
     ----------
     known
-        Those of some paths that the drive's manifest names.
+        Selects the paths that the drive's manifest names.
     files_expected
         How many it names.
     max_ratio
@@ -158,7 +158,7 @@ class ArchiveWatch:
             self._is_over = True
 
     def _fulfil(self, step: _Step | None) -> bytes | None:
-        """What a step asks for; None where it has not come yet."""
+        """Bytes that a step asks for; None where they have not come yet."""
         assert self._source is not None
         match step:
             case _Read(size_bytes):
