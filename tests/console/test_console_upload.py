@@ -122,8 +122,8 @@ def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
     assert pieces == [0, PIECE_BYTES]
     insecure = world.api.url.replace("127.0.0.1", "mrasfm.test")
     upload(page_of_a_new_browser(insecure), insecure, folder)
-    assert pieces[2] >= PIECE_BYTES, "it goes on where the first ended: at most the piece that was cut comes twice"
-    assert len(pieces) == 4
+    # Of the piece that was cut the service may have a part; that piece at most comes twice.
+    assert PIECE_BYTES <= pieces[2] < len(drive.files[name])
     stored = client.get(f"/v1/drives/{drive_of(client)}/files/{name}")
     assert stored.content == drive.files[name]
 
