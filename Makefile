@@ -54,6 +54,7 @@ lock: ## renew the locks: of pyproject.toml all, and what the container image ne
 	  -o tests/foreign_readers/$$readers.lock || exit 1; done
 
 wheels: setup ## the wheels of mrasfm and of mrasfm-client, in dist/
+	rm -rf build/lib build/bdist.*
 	$(BIN)/python .ci/build_client.py build/client
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./build/client
 

@@ -101,7 +101,8 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
             store.save(name, key, arrays, documents)
             digests[f"{folder}/{checkpoint_file(name)}"] = sha256(work / folder / checkpoint_file(name))
     written = {**report, "summary": figures}
-    figures["notes"] += write_page(work, partial(map_page, content.document, work, written), read_back)
+    make_page = partial(map_page, content.document, work, written, content.calibrations)
+    figures["notes"] += write_page(work, make_page, read_back, content.calibrations)
     digests[COMPLETE_MARK] = write_json(work / COMPLETE_MARK, written)
     read_back.expect(digests)
     read_back.check(_checks(content))

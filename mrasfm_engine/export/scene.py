@@ -200,7 +200,8 @@ def _write(
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     digests[MANIFEST_FILE] = write_content(work / MANIFEST_FILE, manifest + "\n")
     document = {**report, "summary": figures}
-    figures["notes"] += write_page(work, partial(scene_page, scene, work, document, calibrated), read_back, calibrated)
+    make_page = partial(scene_page, scene, work, document, calibrated)
+    figures["notes"] += write_page(work, make_page, read_back, {"": calibrated})
     digests[COMPLETE_MARK] = write_json(work / COMPLETE_MARK, document)
     read_back.expect(digests)
     read_back.check(_checks(scene, pictures))

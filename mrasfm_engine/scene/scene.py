@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.scene.drive import Drive, Incomplete
 from mrasfm_engine.scene.road import Road
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
+from schemas.notebook_table import notebook_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +156,29 @@ class Scene:
             self.rig_of_camera = np.zeros(len(self.calibration), np.int64)
         if not len(self.unit_component):
             self.unit_component = np.zeros(len(self.unit_registered), np.int64)
+
+    def _repr_html_(self) -> str:
+        """Jupyter's picture of a scene: how much of the drive it has, where it is, which cameras are wrong."""
+        wrong = [
+            camera.name for camera, found in zip(self.drive.cameras, self.calibration, strict=False) if found.is_wrong
+        ]
+        place = self.georeference
+        on_earth = "none"
+        if place is not None:
+            on_earth = f"{place.origin_latitude_deg:.6f}°, {place.origin_longitude_deg:.6f}°"
+        error_px = f"{self.point_error_px.mean():.3f} px" if len(self.point_error_px) else "no points"
+        return notebook_table(
+            f"Scene of {self.drive.manifest.name}",
+            {
+                "units with a pose": f"{int(self.unit_registered.sum())} of {len(self.unit_registered)}",
+                "images with a pose": f"{int(self.image_registered.sum())} of {len(self.image_registered)}",
+                "points": len(self.points_m),
+                "observations": len(self.observation_point),
+                "mean reprojection error": error_px,
+                "place on the earth": on_earth,
+                "cameras not mounted as given": ", ".join(wrong) or "none",
+            },
+        )
 
     @property
     def image_unit(self) -> Ints:

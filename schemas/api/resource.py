@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from pydantic.config import JsonDict
+
+from schemas.notebook_table import notebook_table
 
 # Examples tell of the same things throughout: an answer shows what the request before it made.
 EXAMPLE_DRIVE = "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
@@ -26,6 +29,10 @@ class Resource(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
+    def _repr_html_(self) -> str:
+        """Jupyter's picture of a resource: its fields; of lists and of what holds more, how much there is."""
+        return notebook_table(type(self).__name__.removesuffix("Resource"), dict(_named_values(self)))
+
 
 class ArtifactResource(Resource):
     """One file of a scene or of a map's version."""
@@ -35,6 +42,17 @@ class ArtifactResource(Resource):
     sha256: Sha256 = Field(description="in hexadecimal")
     media_type: str = Field(description="what the download says as Content-Type")
     url: str = Field(description="where to get it, relative to the server")
+
+
+def _named_values(resource: BaseModel, within: str = "") -> Iterator[tuple[str, object]]:
+    for name in type(resource).model_fields:
+        value = getattr(resource, name)
+        if isinstance(value, BaseModel):
+            yield from _named_values(value, f"{within}{name}.")
+        elif isinstance(value, list | dict):
+            yield f"{within}{name}", f"{len(value)} entries"
+        elif value is not None:
+            yield f"{within}{name}", value
 
 
 class RequestBody(BaseModel):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import anyio
 
@@ -13,6 +13,7 @@ from service.domain.request_holds import HoldKeeper
 from service.job_queue import JobQueue
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
+from service.storage.uploads.archive_watch import KeptWatches
 
 _LARGE_BODIES = 4
 _LARGE_BODIES_WAITING = 16  # of one project; the beginning of each is in memory
@@ -37,6 +38,7 @@ class Context:
     # Of their own, so that what takes minutes leaves the threads of all other requests alone.
     commits: anyio.CapacityLimiter
     unpacking: anyio.CapacityLimiter
+    archive_watches: KeptWatches = field(default_factory=KeptWatches)
 
     @classmethod
     def open(cls, settings: Settings) -> Context:

@@ -23,7 +23,7 @@ for (const folder of [console_, report]) {
 const metafiles = [
   // Chunks are named by their content, so that no browser mixes two versions.
   await bundle({ console: "src/main.ts" }, console_, { format: "esm", splitting: true, chunkNames: "[name]-[hash]" }),
-  await bundle({ events: "src/events.worker.ts", points: "src/viewer/points.worker.ts", hash: "src/upload/hash.worker.ts" }, console_, { format: "iife" }),
+  await bundle({ events: "src/events.worker.ts", points: "src/viewer/points.worker.ts", render: "src/viewer/render.worker.ts", hash: "src/upload/hash.worker.ts" }, console_, { format: "iife" }),
   await bundle({ console: "src/style.css", place: "src/place/place.css" }, console_, { loader: { ".svg": "dataurl" } }),
   await bundle({ report: "src/report/report.ts" }, report, { format: "iife" }),
   await bundle({ report: "src/report/report.css" }, report, {}),

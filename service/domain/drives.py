@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from schemas.api.drives import DriveState, FileDeclaration, PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.problems import ProblemItem
+from schemas.file_names import MANIFEST_NAME, composed
 from service.database import bulk
 from service.database.tables import Blob, Drive, DriveFile, Job, Project, new_id, now_us
 from service.domain import drive_files, jobs
@@ -161,6 +162,19 @@ def declare(session: Session, drive: Drive, files: Iterable[FileDeclaration]) ->
             to_send.append(path)
     drive_files.set_all(session, drive.id, taken)
     return stored, to_send
+
+
+def named_files(session: Session, drive_id: str, paths: Sequence[str]) -> set[str]:
+    """Select the paths that the drive's manifest names, however the characters of a path are composed."""
+    found = {MANIFEST_NAME} & set(paths)
+    mine = select(DriveFile.path).where(DriveFile.drive_id == drive_id)
+    for i in range(0, len(paths), _BATCH):
+        found.update(session.scalars(mine.where(DriveFile.path.in_(paths[i : i + _BATCH]))))
+    accented = [path for path in paths if path not in found and not path.isascii()]
+    if accented:  # macOS stores 'ü' as two characters, and which the manifest has no query says
+        named = {composed(path) for path in session.scalars(mine)}
+        found.update(path for path in accented if composed(path) in named)
+    return found
 
 
 def _identities(session: Session, drive: Drive, paths: Sequence[str]) -> dict[str, str | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import Select, delete, func, select
 from sqlalchemy.orm import Session
 
 from schemas.api.drives import DriveState
@@ -114,6 +114,12 @@ def get(session: Session, project_id: str, drive_id: str, upload_id: str) -> Upl
             remedy="Create a new upload and send the file from its beginning.",
         )
     return upload
+
+
+def unfinished(drive_id: str, *, sha256: str | None) -> Select[Upload]:
+    """Statement for the uploads of a drive that take bytes still, of one digest or of any."""
+    statement = select(Upload).where(Upload.drive_id == drive_id, ~Upload.is_done, Upload.expires_us > now_us())
+    return statement if sha256 is None else statement.where(Upload.sha256 == sha256)
 
 
 def forget(session: Session, upload_id: str) -> None:

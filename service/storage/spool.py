@@ -10,7 +10,7 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,7 @@ from service.errors import DiskFull, ServiceError, WrongDigest, WrongLength, req
 Result = TypeVar("Result")
 Written = TypeVar("Written", covariant=True)
 Part = bytes | bytearray | memoryview
+Look = Callable[[Path], None]
 DiskLimiter = asyncio.Semaphore | anyio.CapacityLimiter
 
 BATCH_BYTES = 1 << 20  # written and hashed at a time: large enough that the switch to a thread costs nothing
@@ -72,15 +73,18 @@ class SpoolWriter:
         Made, for us alone, where it is missing.
     min_free_bytes
         How much of the disk must stay free.
+    look
+        Called with the file's path after each write.
 
     Raises
     ------
     ServiceError
-        507 `disk-full`, here or while writing.
+        507 `disk-full`, here or while writing; what `look` raises.
     """
 
-    def __init__(self, folder: Path, *, min_free_bytes: int) -> None:
+    def __init__(self, folder: Path, *, min_free_bytes: int, look: Look | None = None) -> None:
         self._folder = folder
+        self._look = look
         self._min_free_bytes = min_free_bytes
         self._hash = hashlib.sha256()
         self._size_bytes = 0
@@ -101,22 +105,29 @@ class SpoolWriter:
 
     def write(self, *parts: Part) -> None:
         """Append; nothing happens after `discard`."""
-        with self._lock, full_disk_is_507():
+        with self._lock:
             if self._descriptor is None:
                 return
+            self._append(self._descriptor, parts)
+            if self._look is not None:
+                self._look(self.path)
+
+    def _append(self, descriptor: int, parts: Sequence[Part]) -> None:
+        with full_disk_is_507():
             # In one piece: each call to write and hash hands Python's lock over and has to get it back.
             data = parts[0] if len(parts) == 1 else b"".join(parts)
             require_space(self._folder, len(data), min_free_bytes=self._min_free_bytes)
             rest = memoryview(data)
             while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
+                rest = rest[os.write(descriptor, rest) :]
             self._hash.update(data)
             self._size_bytes += len(data)
 
     def finish(self, *parts: Part) -> Spooled:
         """Append the last bytes. Whoever keeps the file for good sees to it that it survives a power cut."""
-        self.write(*parts)
         with self._lock, full_disk_is_507():
+            if self._descriptor is not None:
+                self._append(self._descriptor, parts)
             self._close()
         return Spooled(self.path, self._size_bytes, self._hash.hexdigest())
 
@@ -141,6 +152,7 @@ async def receive(
     expected_sha256: str | None,
     min_free_bytes: int,
     on_disk: DiskLimiter,
+    look: Look | None = None,
 ) -> Spooled:
     """As `receive_into`; the file itself."""
     return await receive_into(
@@ -152,6 +164,7 @@ async def receive(
         expected_sha256=expected_sha256,
         min_free_bytes=min_free_bytes,
         on_disk=on_disk,
+        look=look,
     )
 
 
@@ -165,6 +178,7 @@ async def receive_into(
     expected_sha256: str | None,
     min_free_bytes: int,
     on_disk: DiskLimiter,
+    look: Look | None = None,
 ) -> Result:
     """Write a request's body to a file of the spool folder, in constant memory and off the event loop.
 
@@ -182,6 +196,8 @@ async def receive_into(
     on_disk
         Bounds how many uploads write at one time. It is held for each batch, not for the whole upload: slow clients
         hold nobody up.
+    look
+        Called with the file's path after each batch but the last; it may raise to refuse the rest.
 
     Raises
     ------
@@ -189,7 +205,7 @@ async def receive_into(
         413 `too-large`, 400 `wrong-length`, 422 `wrong-digest` or 507 `disk-full`.
     """
     require_size(expected_bytes or 0, max_bytes)
-    writer = BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes), on_disk)
+    writer = BatchWriter(SpoolWriter(folder, min_free_bytes=min_free_bytes, look=look), on_disk)
     try:
         if expected_bytes is not None:
             require_space(folder, expected_bytes, min_free_bytes=min_free_bytes)

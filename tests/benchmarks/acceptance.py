@@ -39,6 +39,7 @@
 | 35 | the whole command on real drives beside COLMAP's extraction, matching and global mapper |
 | 36 | simulated routes whose descriptors lie on disk: memory and time of matching and mapping |
 | 37 | maps of 15 and of 60 simulated scenes: time and memory of a scene |
+| 38 | the web console: five million points as they stream, a camera turned by 3 deg, the wheel in a fresh environment |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -67,6 +68,7 @@ from tests.benchmarks.adjustment import adjustment
 from tests.benchmarks.aggregation import crossing, kitti, loop, repeated, speed_of_aggregation
 from tests.benchmarks.birds_eye import birds_eye
 from tests.benchmarks.commands import CommandFailed
+from tests.benchmarks.console import console, turned_camera, wheel
 from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.export_formats import client_wheel, exports_of_images
 from tests.benchmarks.fisheyes import fisheyes
@@ -152,6 +154,7 @@ LINES = {
     "35": Line(timed=(whole_command,)),
     "36": Line(timed=(from_descriptors,)),
     "37": Line(timed=(many_scenes,)),
+    "38": Line(timed=(console,), untimed=(turned_camera, wheel)),
 }
 
 

@@ -82,7 +82,7 @@ def _of_nerfstudio(title: str, out: Path, own_px: float, images: int) -> Iterato
     if not python:
         yield Figure(line=LINE, what=f"{title}: nerfstudio: skipped", value=0, remark=f"{NERFSTUDIO} names none")
         return
-    said = json.loads(_run([python, READER, out], out).strip().splitlines()[-1])
+    said = json.loads(run_apart([python, READER, out], out).strip().splitlines()[-1])
     yield exactly(LINE, f"{title}: nerfstudio, images of both formats", said["images"], images)
     yield exactly(LINE, f"{title}: nerfstudio, images of transforms.json", said["images_of_transforms"], images)
     yield exactly(LINE, f"{title}: nerfstudio, all cameras are perspective", int(said["all_perspective"]), 1)
@@ -114,33 +114,33 @@ def _frames(out: Path) -> int:
 def client_wheel(data: Path, work: Path) -> Iterator[Figure]:
     """The wheel of `mrasfm-client`: what it installs, and that it works beside folders of the product's names."""
     sources, dist = work / "client sources", work / "dist"
-    _run([sys.executable, REPOSITORY / ".ci" / "build_client.py", sources], work)
+    run_apart([sys.executable, REPOSITORY / ".ci" / "build_client.py", sources], work)
     build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", dist]
-    _run([*build, sources], work)
-    _run([*build, REPOSITORY], work)
+    run_apart([*build, sources], work)
+    run_apart([*build, REPOSITORY], work)
     (own,), (product,) = (sorted(dist.glob(f"{name}-*.whl")) for name in ("mrasfm_client", "mrasfm"))
     common = _installed(own) & _installed(product)
     yield exactly(LINE, "files that both wheels install + 1", len(common) + 1, 1)
     yield exactly(LINE, "top-level names that the client installs", len({n.split("/")[0] for n in _installed(own)}), 1)
     environment, bare = work / "client environment", work / "bare environment"
     for folder in (environment, bare):
-        _run([sys.executable, "-m", "venv", folder], work)
+        run_apart([sys.executable, "-m", "venv", folder], work)
     python = environment / "bin" / "python"
     try:
-        _run([python, "-m", "pip", "install", "--quiet", own], work)
+        run_apart([python, "-m", "pip", "install", "--quiet", own], work)
     except CommandFailed as error:
         yield Figure(line=LINE, what="the client: skipped, cannot be installed here", value=0, remark=str(error))
         return
     size = (_size_bytes(environment) - _size_bytes(bare)) / 1e6
     yield Figure(line=LINE, what="the client with all that it needs", value=size, unit="MB", above=1.0, most=MOST_MB)
-    listed = _run([python, "-m", "pip", "list", "--format", "freeze"], work).lower()
+    listed = run_apart([python, "-m", "pip", "list", "--format", "freeze"], work).lower()
     heavy = [name for name in ("numba", "pycolmap", "numpy", "opencv", "sqlalchemy", "fastapi") if name in listed]
     yield exactly(LINE, "packages of the engine or the service beside it + 1", len(heavy) + 1, 1)
     trap = work / "somebody's project"
     for name in ("service", "schemas"):
         (trap / name).mkdir(parents=True)
         (trap / name / "__init__.py").write_text("raise SystemExit('another one')")
-    help_text = _run([environment / "bin" / "mrasfm-client", "--help"], trap)
+    help_text = run_apart([environment / "bin" / "mrasfm-client", "--help"], trap)
     yield exactly(LINE, "the client works beside such folders", int("download" in help_text), 1)
 
 
@@ -153,7 +153,8 @@ def _size_bytes(folder: Path) -> int:
     return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
 
 
-def _run(command: list[str | Path], folder: Path) -> str:
+def run_apart(command: list[str | Path], folder: Path) -> str:
+    """Run a program that sees nothing of this checkout; its output."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MRASFM_API_KEY")}
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if result.returncode != 0:

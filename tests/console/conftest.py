@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,9 +28,10 @@ from schemas.drive import DriveManifest
 from service.database.tables import MapVersion, Scene
 from service.domain import jobs
 from tests.helpers.export_example import make_scene
-from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, api_in_thread, settings_of
+from tests.helpers.live_api import ONE_ATTEMPT, REPOSITORY, Api, Client, api_in_thread, settings_of
 from tests.helpers.tiny_drive import TinyDrive, png
 
+VIEW = "import sys; from mrasfm_engine.cli import main; sys.exit(main())"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 # Without a graphics card WebGL is computed; QUIC and the network's services are not asked for.
 ARGUMENTS = [
@@ -37,12 +42,18 @@ ARGUMENTS = [
     "--ignore-gpu-blocklist",
 ]
 DEADLINE_MS = 20_000
+VEHICLE = "test-car-7"
+
+
+def chromium() -> str | None:
+    """The system's chromium; None where there is none."""
+    return next(filter(None, map(shutil.which, CHROMIUM)), None)
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """The system's chromium; skips where there is none, fails if MRASFM_REQUIRE_BROWSER is 1."""
-    found = next(filter(None, map(shutil.which, CHROMIUM)), None)
+    found = chromium()
     if found is None:
         message = "no chromium in PATH: apt install chromium"
         if os.environ.get("MRASFM_REQUIRE_BROWSER") == "1":
@@ -118,6 +129,7 @@ class World:
             "map in 3D": f"{of_map}/3d",
             "map on the map": f"{of_map}/place",
             "seams": f"{of_map}/seams",
+            "map's calibration": f"{of_map}/calibration",
             "versions": f"{of_map}/versions",
             "map's files": f"{of_map}/files",
             "status": "status",
@@ -135,7 +147,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 def example_drive(name: str) -> TinyDrive:
     """The drive that the example's scene is of, with gray images."""
-    document = make_scene().drive.manifest.model_copy(update={"name": name}).model_dump(mode="json", exclude_none=True)
+    named = {"version": 2, "name": name, "vehicle": VEHICLE}
+    document = make_scene().drive.manifest.model_copy(update=named).model_dump(mode="json", exclude_none=True)
     files = [image["file"] for frame in document["frames"] for image in frame["images"].values()]
     DriveManifest.model_validate(document)
     return TinyDrive(document, {path: png(960, 600, seed=f"{name} {path}") for path in files})
@@ -162,6 +175,7 @@ def _filled(api: Api, client: Client, folder: Path) -> World:
         "map.json": json.dumps(_map_document()).encode(),
         "pictures/a.png": png_of(noise),
         "pictures/b.png": png_of(noise),
+        "calibration/example.json": files["calibration.json"],
     }
     job = client.aggregate(scenes=scene_ids, name="crossing")
     client.publish_map(client.claim(job["id"]), map_files)
@@ -279,3 +293,21 @@ def wait_for(page: Page, condition: str) -> None:
     while not page.evaluate(condition):
         assert time.monotonic() < end_s, condition
         page.wait_for_timeout(50)
+
+
+@contextmanager
+def viewing(*arguments: str | Path) -> Iterator[str]:
+    """The address that the command prints; Ctrl-C ends it well."""
+    command = [sys.executable, "-P", "-c", VIEW, "view", *map(str, arguments), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert process.stdout is not None
+        found = re.search(r"http://\S+", process.stdout.readline())
+        assert found is not None
+        yield found[0].rstrip(";")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.communicate()

@@ -2,13 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import re
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -16,28 +9,7 @@ import pytest
 from playwright.sync_api import expect
 
 from service.api.folder_view import FolderViewError, create_view
-from tests.console.conftest import Open, World, example_drive, wait_for
-from tests.helpers.live_api import REPOSITORY
-
-VIEW = "import sys; from mrasfm_engine.cli import main; sys.exit(main())"
-
-
-@contextmanager
-def viewing(*arguments: str | Path) -> Iterator[str]:
-    """The address that the command prints; Ctrl-C ends it well."""
-    command = [sys.executable, "-P", "-c", VIEW, "view", *map(str, arguments), "--no-browser"]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-    try:
-        assert process.stdout is not None
-        found = re.search(r"http://\S+", process.stdout.readline())
-        assert found is not None
-        yield found[0].rstrip(";")
-        process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
-    finally:
-        process.kill()
-        process.communicate()
+from tests.console.conftest import Open, World, example_drive, viewing, wait_for
 
 
 @pytest.fixture(scope="module")

@@ -107,6 +107,7 @@ def _send_in_pieces(said: Conversation) -> None:
     said.ask("get_upload_protocol", "OPTIONS", url, 204)
     said.ask("get_upload_protocol", "OPTIONS", "/v1/drives/none/uploads", 404)
     said.ask("create_upload", "POST", url, 412)
+    said.ask("list_uploads", "GET", url, 200)
     assert said.note("create_upload", create(client, drive_id, 10**17, path=path)).status_code == 413
     announced = {**VERSION, "Upload-Length": str(len(data)), "Upload-Metadata": metadata(path=path)}
     upload = f"{url}/{said.post('create_upload', url, 201, headers=announced)['id']}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import socket
 import threading
 from collections.abc import Sequence
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import httpx
 import pytest
@@ -341,3 +342,18 @@ def test_the_very_bytes_of_a_large_manifest_are_the_manifest(client: Client, dri
     raw = drive.raw + b" " * client.api.settings.max_json_bytes
     drive_id = client.post("/v1/drives", content=raw).json()["id"]
     assert client.put(f"/v1/drives/{drive_id}/archive", content=drive.zipped(**{"drive.json": raw})).is_success
+
+
+def test_an_archive_with_a_strange_file_is_refused_while_it_comes(api: Api, client: Client) -> None:
+    drive = tiny_drive("watched", seed="watched")
+    archive = zip_of({"../../etc/passwd": b"", **{path: data + bytes(5 << 20) for path, data in drive.files.items()}})
+    drive_id = client.create(drive)
+    with socket.create_connection((urlsplit(api.url).hostname, urlsplit(api.url).port), timeout=30) as connection:
+        head = f"PUT /v1/drives/{drive_id}/archive HTTP/1.1\r\nHost: {urlsplit(api.url).netloc}\r\n"
+        head += f"Authorization: Bearer {client.key}\r\nContent-Length: {len(archive)}\r\n\r\n"
+        connection.sendall(head.encode() + archive[: 3 << 20])  # of thirty megabytes
+        answer = connection.recv(1 << 16).decode()
+    assert answer.startswith("HTTP/1.1 422")
+    assert "leaves the drive's folder with '..'" in answer
+    assert "passwd" in answer
+    assert api.spooled() == []

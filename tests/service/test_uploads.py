@@ -24,7 +24,7 @@ from service.domain import uploads as upload_records
 from service.storage import durability
 from service.storage.uploads.resumable import PartialFile, sweep
 from tests.helpers.live_api import Api, Client, problem_of, wait_until
-from tests.helpers.tiny_drive import TinyDrive, png_of, tiny_drive
+from tests.helpers.tiny_drive import TinyDrive, png_of, tiny_drive, zip_of
 from tests.helpers.tus_client import OFFSET_TYPE, VERSION, begin, checksum, create, head, offset_of, patch
 from tests.service.conftest import StartApi
 
@@ -348,7 +348,7 @@ def test_a_drive_that_was_committed_meanwhile_is_told_before_the_bytes_come(
     drive_id, size_bytes = client.filled(drive), 10_000_000
     announced = {"archive": ""} if what == "archive" else {"path": PATH, "replace": "true"}
     url = create(client, drive_id, size_bytes, **announced).headers["location"]
-    assert patch(client, url, 0, b"x" * 1000).status_code == 204
+    assert patch(client, url, 0, drive.zipped()[:1000]).status_code == 204
     commit(api, drive_id)
     headers = {} if method == "HEAD" else {"Upload_Offset": "1000", "Content_Length": str(size_bytes - 1000)}
     status, body = begun(client, method, url, Tus_Resumable="1.0.0", Content_Type=OFFSET_TYPE, **headers)
@@ -557,3 +557,44 @@ def test_a_deleted_drive_takes_its_uploads_along(client: Client, api: Api) -> No
     assert head(client, url).status_code == 404
     sweep_uploads(api.context)
     assert not any(name.startswith(url.rsplit("/", 1)[1]) for name in bytes_left(api))
+
+
+def test_an_archive_with_a_strange_file_is_refused_before_the_rest_comes(api: Api, client: Client) -> None:
+    drive = tiny_drive("watched", seed="watched", frames=6)
+    files = {path: data + os.urandom(100_000) for path, data in drive.files.items()}
+    (first, content), *others = files.items()
+    archive = zip_of({first: content, "notes/mine.txt": b"mine", **dict(others)})
+    answer = create(client, client.create(drive), len(archive), archive="")
+    url = answer.headers["location"]
+    assert patch(client, url, 0, archive[:50_000]).status_code == 204
+    problem = problem_of(patch(client, url, 50_000, archive[50_000:250_000]), 422, "unexpected-file")
+    assert "'notes/mine.txt'" in problem["detail"]
+    assert "Leave them out" in problem["remedy"]
+    assert head(client, url).status_code == 404, "nothing more is waited for"
+    assert not [name for name in bytes_left(api) if name.startswith(url.rsplit("/", 1)[1])]
+
+
+def test_an_archive_goes_on_in_another_process(client: Client, api: Api) -> None:
+    """What one request knew of the names is read again where it is gone."""
+    drive = tiny_drive("watched on", seed="watched on")
+    archive = drive.zipped()
+    drive_id = client.create(drive)
+    url = create(client, drive_id, len(archive), archive="").headers["location"]
+    for start in range(0, len(archive), 700):
+        assert patch(client, url, start, archive[start : start + 700]).status_code == 204
+        api.context.archive_watches.take(url.rsplit("/", 1)[1])
+    assert stored(client, drive_id) == sha256_of(drive.files[PATH])
+
+
+def test_a_client_that_lost_an_uploads_url_finds_it_by_its_digest(client: Client) -> None:
+    drive_id, data = client.create(), image(3000)
+    url = begin(client, drive_id, PATH, data, sha256=sha256_of(data))
+    begin(client, drive_id, "front/000001.png", data[:2000], sha256=sha256_of(data[:2000]))
+    assert patch(client, url, 0, data[:1000]).status_code == 204
+    listed = client.get(f"/v1/drives/{drive_id}/uploads", params={"sha256": sha256_of(data)}).json()["items"]
+    assert [(one["id"], one["offset_bytes"]) for one in listed] == [(url.rsplit("/", 1)[1], 1000)]
+    assert len(client.get(f"/v1/drives/{drive_id}/uploads").json()["items"]) == 2
+    assert patch(client, url, 1000, data[1000:]).status_code == 204
+    assert client.get(f"/v1/drives/{drive_id}/uploads", params={"sha256": sha256_of(data)}).json()["items"] == []
+    problem_of(client.get(f"/v1/drives/{drive_id}/uploads", params={"sha256": "x"}), 422, "invalid-request")
+    problem_of(client.get("/v1/drives/drv_none/uploads"), 404, "not-found")

@@ -9,25 +9,73 @@ from mrasfm_engine.export.report_page._html import decimals_of, exact, section, 
 
 AXES = ("x", "y", "z")
 SIGMA_DIGITS, INTRINSIC_DIGITS = 3, 6
+MOST_SCENES = 40  # of a map whose tables are on the page: each has some 10 kB
 
 
 def calibration_sections(document: Mapping[str, Any]) -> str:
-    """Both corrections and the intrinsics of all cameras."""
+    """Both corrections, the intrinsics and what is known of time offsets of all cameras."""
     cameras = document["cameras"]
-    why = f"<p>{'Refined' if document.get('adjusted') else 'Kept as given'}: {text(document.get('why', ''))}.</p>\n"
     return section(
         "Calibration",
-        why,
-        "<h3>Correction of the rotation about the rig's axes</h3>",
-        _corrections(cameras, "rotation", "rotation_vector_deg", "deg"),
-        "<h3>Correction of the position along the rig's axes</h3>",
-        _corrections(cameras, "translation", "translation_m", "m"),
+        _why(document),
+        _tables(cameras, ""),
         "<h3>Intrinsics</h3>",
         _intrinsics(cameras),
+        _time_offsets(cameras),
     )
 
 
-def _corrections(cameras: Mapping[str, Any], what: str, field: str, unit: str) -> str:
+def map_calibration_sections(calibrations: Mapping[str, Mapping[str, Any]]) -> str:
+    """Corrections of all drives of a map, by scene; those with a camera that is not mounted as given come first."""
+    order = sorted(calibrations, key=lambda name: not wrong_cameras(calibrations[name]))
+    parts = [
+        f"<h3>{text(name)}</h3>\n{_why(calibrations[name])}{_tables(calibrations[name]['cameras'], name)}"
+        for name in order[:MOST_SCENES]
+    ]
+    rest = order[MOST_SCENES:]
+    more = f"<p>In the folder calibration/: {text(', '.join(rest))}.</p>\n" if rest else ""
+    return section("Calibration of each drive, after the map's adjustment", *parts, more)
+
+
+def wrong_cameras(document: Mapping[str, Any]) -> list[str]:
+    """Cameras that the images contradict."""
+    return [name for name, camera in document["cameras"].items() if camera["wrong"]]
+
+
+def _why(document: Mapping[str, Any]) -> str:
+    if "why" not in document:
+        return "<p>The calibration is used as given.</p>\n"
+    return f"<p>{'Refined' if document.get('adjusted') else 'Kept as given'}: {text(document['why'])}.</p>\n"
+
+
+def _tables(cameras: Mapping[str, Any], scene: str) -> str:
+    return (
+        "<h4>Correction of the rotation about the rig's axes, ± sigma</h4>"
+        + _corrections(cameras, "rotation", "rotation_vector_deg", "deg", scene)
+        + "<h4>Correction of the position along the rig's axes, ± sigma</h4>"
+        + _corrections(cameras, "translation", "translation_m", "m", scene)
+    )
+
+
+def _time_offsets(cameras: Mapping[str, Any]) -> str:
+    rows = [
+        (
+            [
+                text(name),
+                _value(camera["refined"]["time_offset_us"], camera["sigma"].get("time_offset_us"), "time_offset"),
+                text(camera["verdict"].get("time_offset", "")),
+            ],
+            f'data-camera="{text(name)}"',
+        )
+        for name, camera in cameras.items()
+        if "time_offset_us" in camera["refined"]
+    ]
+    if not rows:
+        return ""
+    return "<h3>Time offsets</h3>" + table(["Camera", "Offset [µs]", "Verdict"], rows, attributes="data-time-offsets")
+
+
+def _corrections(cameras: Mapping[str, Any], what: str, field: str, unit: str, scene: str) -> str:
     sigma_field = "rotation_deg" if what == "rotation" else "translation_m"
     rows = []
     for name, camera in cameras.items():
@@ -42,7 +90,7 @@ def _corrections(cameras: Mapping[str, Any], what: str, field: str, unit: str) -
         )
         rows.append(([label, *cells, text(_verdicts(camera["verdict"][what]))], own))
     head = ["Camera", *(f"{axis} [{unit}]" for axis in AXES), "Verdict"]
-    return table(head, rows, attributes=f'data-corrections="{what}"')
+    return table(head, rows, attributes=f'data-corrections="{what}" data-scene="{text(scene)}"')
 
 
 def _value(value: float, sigma: float | None, axis: str) -> str:

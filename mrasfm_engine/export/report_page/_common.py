@@ -8,19 +8,18 @@ from typing import Any
 from mrasfm_engine.export.report_page._html import bars, facts, items, number, section, text
 from schemas.findings import Finding
 
-COUNTS = {
-    "registered_units": "Units registered",
-    "total_units": "of units",
-    "registered_images": "Images registered",
-    "total_images": "of images",
-    "points": "Points",
-    "observations": "Observations",
-}
+SHARES = {"units": "Units registered", "images": "Images registered"}
+COUNTS = {"points": "Points", "observations": "Observations"}
 
 
 def summary_facts(summary: Mapping[str, Any]) -> dict[str, str]:
     """Figures of a result."""
-    found = {label: number(summary[name]) for name, label in COUNTS.items() if name in summary}
+    found = {
+        label: f"{number(summary[f'registered_{name}'])} of {number(summary[f'total_{name}'])}"
+        for name, label in SHARES.items()
+        if f"total_{name}" in summary
+    }
+    found |= {label: number(summary[name]) for name, label in COUNTS.items() if name in summary}
     for name, label, unit in (
         ("mean_track_length", "Mean track length", "images"),
         ("mean_reprojection_error_px", "Mean reprojection error", "px"),

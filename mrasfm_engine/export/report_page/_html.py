@@ -17,10 +17,9 @@ import numpy as np
 from mrasfm_engine.types import Floats
 
 _STATIC = files("mrasfm_engine.visualization") / "static"
-PREVIEW_PX, PREVIEW_BYTES = (
-    1600,
-    550_000,
-)  # longest side, and what two pictures may have so that a page stays below 2 MB
+# Longest side, and what each of two pictures may have so that a page stays below 2 MB.
+PREVIEW_PX, PREVIEW_BYTES = 1600, 550_000
+SMALLEST_PX = 240
 SERIES = ("#0b8a8a", "#c25e00", "#7a4fc4")
 
 
@@ -108,23 +107,26 @@ def items(lines: Iterable[str], kind: str = "") -> str:
     return f'<ul class="{kind}">' + "".join(f"<li>{line}</li>\n" for line in lines) + "</ul>\n"
 
 
-def preview(path: Path) -> str | None:
-    """A picture, made smaller where it is large, as a data URI; None where there is none."""
+def preview(path: Path, most_bytes: int = PREVIEW_BYTES) -> str | None:
+    """A picture, made smaller until it has at most so many bytes, as a data URI; None where there is none."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if picture is None:
         return None
-    for side in (PREVIEW_PX, 1200, 900, 600):
+    side = float(min(PREVIEW_PX, max(picture.shape[:2])))
+    while True:
         factor = min(1.0, side / max(picture.shape[:2]))
         small = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else picture
         data = bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])[1])
-        if len(data) <= PREVIEW_BYTES:
+        if len(data) <= most_bytes or side <= SMALLEST_PX:
             break
+        # Bytes go with the area; somewhat less, so that the next try fits.
+        side = max(SMALLEST_PX, min(0.95 * side * math.sqrt(most_bytes / len(data)), 0.8 * side))
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
-def pair(folder: Path, before: str, after: str, caption: str) -> str:
-    """Two pictures of one place; without a script one below the other."""
-    pictures = [preview(folder / before), preview(folder / after)]
+def pair(folder: Path, before: str, after: str, caption: str, most_bytes: int = PREVIEW_BYTES) -> str:
+    """Two pictures of one place, of so many bytes each; without a script one below the other."""
+    pictures = [preview(folder / name, most_bytes) for name in (before, after)]
     if None in pictures:
         return ""
     images = "".join(

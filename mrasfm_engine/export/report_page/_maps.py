@@ -6,47 +6,77 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mrasfm_engine.export.report_page._calibration import map_calibration_sections, wrong_cameras
 from mrasfm_engine.export.report_page._common import findings_section, heading, share_verdict, stages_section, verdict
-from mrasfm_engine.export.report_page._html import facts, number, page, pair, section, table, text
+from mrasfm_engine.export.report_page._html import (
+    PREVIEW_BYTES,
+    facts,
+    number,
+    page,
+    pair,
+    section,
+    table,
+    text,
+)
+from mrasfm_engine.export.report_page._read_back import MOST_BYTES
 
-PICTURED = 2  # seams whose pictures are on the page: each has up to a megabyte
+# Below this nothing is seen on it; the pictures of seams for which there is no room are named.
+SMALLEST_PICTURE_BYTES = 12_000
+BASE64 = 4 / 3
+MARGIN_BYTES = 60_000  # of the page: style, script, headings
 SEAM_FIGURES = (
     ("inliers", "Shared points", ""),
     ("residual_before_px", "Residual before", "px"),
     ("residual_after_px", "Residual after", "px"),
     ("sigma_translation_m", "Sigma of the translation", "m"),
     ("sigma_rotation_deg", "Sigma of the rotation", "deg"),
-    ("scale", "Scale", ""),
+    ("scale", "Scale of the second scene against the first", ""),
 )
 
 
-def map_page(document: Mapping[str, Any], folder: Path, report: Mapping[str, Any]) -> str:
-    """The page; `document` is `map.json`, `folder` the map's, whose `pictures/` are written already."""
-    return page(
-        "Map",
-        [
-            heading(
-                "Map",
-                "Map",
-                report.get("engine_version", ""),
-                list(_verdicts(document, report["summary"])),
-                report["summary"],
-            ),
-            _scenes(document),
-            *_seams(document, folder),
-            findings_section(report.get("findings", ())),
-            stages_section(report.get("stages", ())),
-        ],
-    )
+def map_page(
+    document: Mapping[str, Any],
+    folder: Path,
+    report: Mapping[str, Any],
+    calibrations: Mapping[str, Mapping[str, Any]],
+) -> str:
+    """The page.
+
+    Parameters
+    ----------
+    document
+        `map.json`.
+    folder
+        The map's, whose `pictures/` are written already.
+    calibrations
+        `calibration/NAME.json` by scene.
+    """
+    others = [
+        map_calibration_sections(calibrations),
+        findings_section(report.get("findings", ())),
+        stages_section(report.get("stages", ())),
+    ]
+    lines = list(_verdicts(document, report["summary"], calibrations))
+    begin = [heading("Map", "Map", report.get("engine_version", ""), lines, report["summary"]), _scenes(document)]
+    room = MOST_BYTES - MARGIN_BYTES - sum(len(part.encode()) for part in (*begin, *others, *_seams(document)))
+    return page("Map", [*begin, *_seams(document, folder, room), *others])
 
 
-def _verdicts(document: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[str]:
+def _verdicts(
+    document: Mapping[str, Any], summary: Mapping[str, Any], calibrations: Mapping[str, Mapping[str, Any]]
+) -> Iterator[str]:
     scenes, unconnected = document["scenes"], document["unconnected"]
     connected = len(scenes) - len(unconnected)
     yield verdict(
         "warn" if unconnected else "good", f"{number(connected)} of {number(len(scenes))} scenes are connected"
     )
     yield share_verdict(summary, "images")
+    wrong = {name: cameras for name, one in calibrations.items() if (cameras := wrong_cameras(one))}
+    if wrong:
+        named = "; ".join(f"{', '.join(cameras)} in {name}" for name, cameras in wrong.items())
+        yield verdict("bad", f"not mounted as given: {text(named)}")
+    elif calibrations:
+        yield verdict("good", "no camera contradicts its calibration")
     if document["left_out"]:
         yield verdict("bad", f"{number(len(document['left_out']))} scenes are left out: nothing places them")
     if document["loops"]:
@@ -72,20 +102,29 @@ def _scenes(document: Mapping[str, Any]) -> str:
     return section("Scenes", table(["Scene", "Verdict", "Units", "Points", "Moved from its positions"], rows))
 
 
-def _seams(document: Mapping[str, Any], folder: Path) -> Iterator[str]:
-    pictured = 0
+def _seams(document: Mapping[str, Any], folder: Path | None = None, room_bytes: int = 0) -> Iterator[str]:
+    """A section of each seam; with a folder also its pictures, which take so many bytes of the page together."""
+    left = sum("pictures" in seam for seam in document["seams"])
     for seam in document["seams"]:
-        state = (
-            "accepted" if seam["accepted"] else f"rejected: {text(seam.get('reason', 'the evidence does not suffice'))}"
-        )
+        accepted, reason = seam["accepted"], text(seam.get("reason", "the evidence does not suffice"))
+        state = "accepted" if accepted else f"rejected: {reason}"
         figures = {label: number(seam[name], unit) for name, label, unit in SEAM_FIGURES if seam.get(name) is not None}
-        pictures = seam.get("pictures")
-        shown = ""
-        if pictures and pictured < PICTURED:
-            shown, pictured = (
-                pair(folder, pictures["before"], pictures["after"], "Points of both scenes from above"),
-                pictured + 1,
-            )
-        elif pictures:
-            shown = f"<p>Its pictures: {text(pictures['before'])}, {text(pictures['after'])}.</p>\n"
-        yield section(f"Seam of {seam['a']} and {seam['b']}", f"<p>{state}</p>\n", facts(figures), shown)
+        drawn = ""
+        if folder is not None and "pictures" in seam:
+            each = int(room_bytes / BASE64 / 2 / left)
+            drawn, left = _pictures(seam["pictures"], folder, max(each, SMALLEST_PICTURE_BYTES), room_bytes), left - 1
+            room_bytes -= len(drawn)
+        elif folder is not None and accepted:
+            drawn = "<p>There are no pictures: they were switched off.</p>\n"
+        yield section(f"Seam of {seam['a']} and {seam['b']}", f"<p>{state}</p>\n", facts(figures), drawn)
+    if not document["seams"]:
+        yield section("Seams", "<p>No two scenes are close enough to one another to look for a seam.</p>\n")
+
+
+def _pictures(names: Mapping[str, str], folder: Path, each_bytes: int, room_bytes: int) -> str:
+    """A seam's pictures, or their names where the page has no room for them."""
+    caption = "Points of both scenes from above"
+    drawn = pair(folder, names["before"], names["after"], caption, min(each_bytes, PREVIEW_BYTES))
+    if drawn and len(drawn) <= room_bytes:
+        return drawn
+    return f"<p>Its pictures: {text(names['before'])}, {text(names['after'])}.</p>\n"

@@ -84,7 +84,7 @@ def _verdicts(
     if sigma is not None:
         yield verdict("good" if sigma < 0.02 else "warn", f"sigma of the scale {number(100 * sigma, '%')}")
     if findings:
-        yield verdict("warn", f"{number(len(findings))} findings, see below")
+        yield verdict("warn", f"{number(len(findings))} finding{'s' if len(findings) > 1 else ''}, see below")
 
 
 def _pictures(folder: Path) -> str:

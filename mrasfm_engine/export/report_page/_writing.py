@@ -16,9 +16,11 @@ from schemas.artifacts import REPORT_PAGE
 
 
 def write_page(
-    folder: Path, make: Callable[[], str], read_back: ReadBack, calibration: Mapping[str, Any] | None = None
+    folder: Path, make: Callable[[], str], read_back: ReadBack, calibrations: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """Write `report.html` and read it back; why it is withheld, or nothing.
+
+    `calibrations` are as `faults_of` takes them.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def write_page(
         return [f"{REPORT_PAGE} is withheld: it cannot be written: {type(error).__name__}: {error}"]
 
     def read(written: Path) -> list[str]:
-        return list(faults_of(written, calibration))
+        return list(faults_of(written, calibrations))
 
     fault = read_back.fault(Check(REPORT_PAGE, read, partial(comparisons.content, [])))
     if fault is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
 import anyio.from_thread
@@ -22,6 +22,7 @@ from service.storage.blob_writer import BlobWriter
 from service.storage.spool import Spooled
 from service.storage.uploads.archive import unpack
 from service.storage.uploads.archive_limits import ArchiveLimits
+from service.storage.uploads.archive_watch import ArchiveWatch
 from service.storage.uploads.images import check_image
 
 _ENTRY_BYTES = 4096  # of an archive, around each file: headers, names twice, padding
@@ -69,6 +70,19 @@ def require_room(context: Context, project_id: str, drive_id: str, size_bytes: i
     if size_bytes is not None and left_bytes < size_bytes <= bound:
         raise blobs.quota_full(project, size_bytes)
     return min(bound, left_bytes)
+
+
+def archive_watch(context: Context, project_id: str, drive_id: str) -> ArchiveWatch:
+    """Watch over the names of an archive of a drive's files, to refuse a wrong one before all bytes came."""
+    with context.database.read() as session:
+        drive = drives.get(session, project_id, drive_id)
+        files_expected = drive.files_expected
+
+    def known(paths: Sequence[str]) -> set[str]:
+        with context.database.read() as session:
+            return drives.named_files(session, drive_id, paths)
+
+    return ArchiveWatch(known, files_expected, max_ratio=context.settings.max_compression_ratio)
 
 
 def keep_file(

@@ -23,7 +23,7 @@ from service.api.http.body_reading import json_body
 from service.api.http.paging import page_of
 from service.api.http.request_bodies import Body, describe, describe_bytes
 from service.api.http.responses import gives, problems
-from service.api.routes.file_ingest import keep_archive, keep_file, require_room, require_wanted
+from service.api.routes.file_ingest import archive_watch, keep_archive, keep_file, require_room, require_wanted
 from service.database.tables import Blob, DriveFile
 from service.digests import parse_digest
 from service.domain import drive_files, drives
@@ -168,16 +168,21 @@ async def put_archive(
     content_digest: ContentDigest = None,
     replace: Replace = False,
 ) -> StoredFiles:
-    """Store all files of an archive in an open drive, or none of them. One folder around them is taken off."""
+    """Store all files of an archive in an open drive, or none of them. One folder around them is taken off.
+
+    A name that is none of the drive's is refused as soon as it comes, where the kind of archive shows it.
+    """
     stream = request.stream()
     try:
         announced = _announced(request, context)
         room = partial(require_room, context, caller.project_id, drive_id, announced["expected_bytes"])
         max_bytes = await run_in_threadpool(room)
+        watch = await run_in_threadpool(archive_watch, context, caller.project_id, drive_id)
         archive = await receive(
             stream,
             context.settings.spool_dir,
             max_bytes=max_bytes,
+            look=watch.look,
             **announced,
         )
     except ServiceError:

@@ -7,19 +7,21 @@ import secrets
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 
 import anyio.to_thread
 from sqlalchemy import update
 
 from service.api.context import Context
 from service.api.http.tus import Checksum
-from service.api.routes.file_ingest import keep_archive, keep_file, require_open, require_wanted
+from service.api.routes.file_ingest import archive_watch, keep_archive, keep_file, require_open, require_wanted
 from service.database.tables import Upload, now_us
 from service.domain import uploads
 from service.errors import ChecksumMismatch, ServiceError, WrongDigest, WrongOffset
 from service.storage.blob_writer import file_sha256
 from service.storage.durability import boot_id
 from service.storage.spool import Spooled, require_space
+from service.storage.uploads.archive_watch import ArchiveWatch
 from service.storage.uploads.resumable import Appender, Hash, PartialFile, append, new_hash, require_length
 
 # What may pass, or be made room for: the bytes wait. Anything else would be answered the same way again.
@@ -102,8 +104,14 @@ class UploadWriting:
         settings = self._context.settings
         compared: Hash | None = None if checksum is None else new_hash(checksum.algorithm)
         whole: Hash | None = new_hash("sha256") if offset == 0 else None
+        watch = held.watch
         appender = Appender(
-            held.file, offset=offset, min_free_bytes=settings.min_free_disk_bytes, checksum=compared, whole=whole
+            held.file,
+            offset=offset,
+            min_free_bytes=settings.min_free_disk_bytes,
+            checksum=compared,
+            whole=whole,
+            look=None if checksum is not None else held.look,  # a byte that was sent wrong must not end the upload
         )
         try:
             try:
@@ -121,7 +129,10 @@ class UploadWriting:
             with anyio.CancelScope(shield=True):  # also for a client that does not wait for the answer
                 taking = partial(held.take, offset, appender.offset, checksum, compared)
                 await anyio.to_thread.run_sync(taking)
+                await anyio.to_thread.run_sync(held.look)
                 await held.complete(None if whole is None else whole.digest().hex())
+            if watch is not None and not held.upload.is_done:
+                self._context.archive_watches.put(held.upload.id, watch)
             return held.upload, held.offset
         finally:
             held.file.close()
@@ -145,6 +156,7 @@ class UploadWriting:
             held = _Held(context, *self._of, file)
             held.require_wanted()
             held.begin(offset, length, counts_at_once=checksum is None)
+            held.watch_names()
         except BaseException:
             file.close()
             raise
@@ -157,6 +169,7 @@ class _Held:
     def __init__(self, context: Context, project_id: str, drive_id: str, upload_id: str, file: PartialFile) -> None:
         self._context = context
         self.file = file
+        self.watch: ArchiveWatch | None = None
         with context.database.read() as session:  # after the lock: another request may just have ended
             self.upload = uploads.get(session, project_id, drive_id, upload_id)
         kept_bytes, tail_boot = self.upload.kept_bytes, self.upload.tail_boot
@@ -183,6 +196,20 @@ class _Held:
         else:  # bytes that were not compared must not count where this process is killed
             self.secure()
             self._record(durable=False, tail_boot=None)
+
+    def watch_names(self) -> None:
+        """Watch the names of an archive that comes: with what the request before this one knew of them, or anew."""
+        upload, context = self.upload, self._context
+        if upload.path is None and not upload.is_done:
+            kept = context.archive_watches.take(upload.id)
+            self.watch = kept or archive_watch(context, upload.project_id, upload.drive_id)
+
+    def look(self, path: Path | None = None) -> None:
+        """Refuse an archive whose names are wrong as far as it has come. At its end all of it is checked."""
+        path = path or self.file.path
+        if self.watch is not None and self.file.size() < self.upload.size_bytes:
+            with self._dropped_where_refused():
+                self.watch.look(path)
 
     def secure(self) -> None:
         """Put all bytes that count on the disk, and record so."""

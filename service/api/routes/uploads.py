@@ -6,13 +6,15 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Header, Request, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.routing import APIRoute
 from sqlalchemy.orm import Session
 
+from schemas.api.resource import Page
 from schemas.api.uploads import UploadResource
-from service.api.dependencies import CallerDep, ContextDep, IdempotentDep, answer, moment
+from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, moment
 from service.api.http import tus
+from service.api.http.paging import page_of
 from service.api.http.responses import gives, problems
 from service.api.routes.upload_writing import UploadWriting, current_offset, discard
 from service.database.tables import Upload, now_us
@@ -66,6 +68,28 @@ def get_upload_protocol(drive_id: str, caller: CallerDep, context: ContextDep, r
     response.headers["Tus-Extension"] = tus.EXTENSIONS
     response.headers["Tus-Checksum-Algorithm"] = ",".join(tus.ALGORITHMS)
     response.headers["Tus-Max-Size"] = str(context.settings.max_archive_bytes)
+
+
+@router.get("", summary="List uploads", responses={**gives(200, "A page of uploads"), **problems(401, 404, 422)})
+def list_uploads(
+    drive_id: str,
+    caller: CallerDep,
+    context: ContextDep,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+    sha256: Annotated[
+        str | None, Query(pattern="^[0-9a-f]{64}$", description="only uploads announced with this digest")
+    ] = None,
+) -> Page[UploadResource]:
+    """Uploads of the drive that take bytes still. A client that has lost an upload's URL finds it by its digest.
+
+    `offset_bytes` is what survives a power cut; HEAD of the upload says where to go on.
+    """
+    with context.database.read() as session:
+        drives.get(session, caller.project_id, drive_id)
+        statement = uploads.unfinished(drive_id, sha256=sha256)
+        rows, following = page_of(session, statement, Upload.id, cursor=cursor, limit=limit)
+    return Page(items=[_shown(upload) for (upload,) in rows], next=following)
 
 
 @router.post(

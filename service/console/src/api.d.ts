@@ -343,6 +343,10 @@ export interface components {
             items: components["schemas"]["SceneResource"][];
             next?: string | null;
         };
+        Page_UploadResource_: {
+            items: components["schemas"]["UploadResource"][];
+            next?: string | null;
+        };
         Page_WebhookResource_: {
             items: components["schemas"]["WebhookResource"][];
             next?: string | null;

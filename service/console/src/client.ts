@@ -13,6 +13,7 @@ export type Status = Schemas["ServiceStatus"];
 export type Preflight = Schemas["PreflightResource"];
 export type Problem = Pick<Schemas["Problem"], "title" | "detail" | "remedy"> & Partial<Schemas["Problem"]>;
 export type Finding = Schemas["Finding"];
+export type Upload = Schemas["UploadResource"];
 export type FileResource = Schemas["SceneFileResource"];
 export interface Page<Item> {
   items: Item[];

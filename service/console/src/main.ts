@@ -45,7 +45,7 @@ function Shell(): Shown {
     <header>
       <a class="brand" href=${link("drives")}>MRASfM</a>
       <nav aria-label="Pages">${PAGES.filter(([name]) => !isOpen() || name === "scenes" || name === "maps").map(([name, label]) => html`<a href=${link(name)} aria-current=${here === name ? "page" : undefined}>${label}</a>`)}</nav>
-      <div class="session"><span class=${`connection ${connection.value}`} role="status" data-connection=${connection.value}>${CONNECTIONS[connection.value]}</span>
+      <div class="session">${!isOpen() && html`<span class=${`connection ${connection.value}`} role="status" data-connection=${connection.value}>${CONNECTIONS[connection.value]}</span>`}
         <span class="muted project">${session.value?.project}</span>
         ${!isOpen() && html`<button type="button" onClick=${() => void logOut()}>Log out</button>`}</div>
     </header>

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from schemas.file_names import MANIFEST_NAME, composed, portable_key
 from service.errors import EmptyArchive, ServiceError, UnexpectedFile, UnsafeArchive
@@ -84,7 +84,7 @@ class EntryNames:
             remedy = "Make the archive again with each file once, under names that differ in more than case."
             raise UnsafeArchive(f"entry {shown(name)} is in the archive {how}", remedy=remedy)
         self._names.append(name)
-        return self._file(name) is not None or self._file(_without_top(name)) is not None
+        return self._file(name) is not None or self._file(without_top(name)) is not None
 
     def resolve(self) -> dict[str, str]:
         """The drive's file for each name that was added: one common top folder does not count.
@@ -98,12 +98,12 @@ class EntryNames:
             raise EmptyArchive("the archive holds no file", remedy="Put the drive's images into it.")
         found = {name: self._file(name) for name in self._names}
         if None in found.values() and self._has_common_top():
-            stripped = {name: self._file(_without_top(name)) for name in self._names}
+            stripped = {name: self._file(without_top(name)) for name in self._names}
             if any(stripped.values()):
                 found = stripped
         files = {name: file for name, file in found.items() if file is not None}
         if len(files) < len(found):
-            raise _unexpected([name for name, file in found.items() if file is None], len(self._exact))
+            raise unexpected_files([name for name, file in found.items() if file is None], len(self._exact))
         return files
 
     def _file(self, name: str) -> str | None:
@@ -118,10 +118,11 @@ class EntryNames:
 
 def may_be_manifest(name: str) -> bool:
     """Return whether the entry can be the drive's manifest, at the root or in one top folder."""
-    return MANIFEST_NAME in (name, _without_top(name))
+    return MANIFEST_NAME in (name, without_top(name))
 
 
-def _without_top(name: str) -> str:
+def without_top(name: str) -> str:
+    """The name without its first folder; empty where it has none."""
     return name.partition("/")[2]
 
 
@@ -143,10 +144,20 @@ def _unsafe(name: bytes, problem: str, remedy: str) -> ServiceError:
     return UnsafeArchive(f"entry {shown(name)} of the archive {problem}", remedy=remedy)
 
 
-def _unexpected(names: list[str], expected: int) -> ServiceError:
+def unexpected_files(names: Sequence[str], expected: int, *, is_whole: bool = True) -> ServiceError:
+    """The archive holds files that the manifest does not name.
+
+    Parameters
+    ----------
+    expected
+        How many files the manifest names.
+    is_whole
+        Whether the archive was read to its end, so that these are all.
+    """
     more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
     listed = ", ".join(shown(name) for name in names[:_SHOWN_NAMES])
+    count = f"{len(names)} files" if is_whole else "files"
     return UnexpectedFile(
-        f"{len(names)} files of the archive are none of the {expected} files of the drive's manifest: {listed}{more}",
+        f"{count} of the archive are none of the {expected} files of the drive's manifest: {listed}{more}",
         remedy="Leave them out, or name them as the manifest does; one top folder around all files is fine.",
     )

@@ -21,7 +21,7 @@ from typing import Protocol
 import anyio
 
 from service.errors import ServiceError, UploadLocked, require_size
-from service.storage.spool import BATCH_BYTES, BatchWriter, DiskLimiter, Part, full_disk_is_507, require_space
+from service.storage.spool import BATCH_BYTES, BatchWriter, DiskLimiter, Look, Part, full_disk_is_507, require_space
 
 _FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC
 _OURS = re.compile(r"(upl_[0-9a-f]{30})\.bytes")
@@ -123,11 +123,21 @@ class Appender:
         Where the bytes go: the file's end.
     checksum
         Takes in what is appended, and so does `whole`, which is None where the file does not begin with it.
+    look
+        Called with the file's path after each write.
     """
 
     def __init__(
-        self, file: PartialFile, *, offset: int, min_free_bytes: int, checksum: Hash | None, whole: Hash | None
+        self,
+        file: PartialFile,
+        *,
+        offset: int,
+        min_free_bytes: int,
+        checksum: Hash | None,
+        whole: Hash | None,
+        look: Look | None = None,
     ) -> None:
+        self._look = look
         self._file = file
         self._min_free_bytes = min_free_bytes
         self._hashes = [taken for taken in (checksum, whole) if taken is not None]
@@ -145,6 +155,8 @@ class Appender:
             for taken in self._hashes:
                 taken.update(data)
             self.offset += len(data)
+            if self._look is not None:
+                self._look(self._file.path)
 
     def finish(self, *parts: Part) -> int:
         """Append the last bytes; where the file then ends."""

@@ -22,7 +22,7 @@ from service.storage.uploads.decompress import ERRORS, MAX_XZ_MEMORY_BYTES, Pack
 
 _CHUNK_BYTES = 1 << 18
 _READ_AHEAD_BYTES = 1 << 16
-_MAX_HEADER_BYTES = 8 << 10  # of one entry: names, times and extended attributes
+MAX_HEADER_BYTES = 8 << 10  # of one entry: names, times and extended attributes
 _PADDING_BYTES = 1 << 20  # of the archive's end, at most
 
 _FILES = frozenset({tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.CONTTYPE})
@@ -58,7 +58,7 @@ def read_tar(
     blocks = _Stream(stream, compression, limits)
     budget = Budget(limits)
     for archive, member in _members(blocks):
-        name = _checked_name(member)
+        name = checked_name(member)
         budget.entry(name, member.size)
         blocks.begin(f"entry {shown(name)}", member.size)
         if not member.isdir():
@@ -80,8 +80,8 @@ class _Stream(io.BufferedIOBase):
         self._content = unpacked(self._packed, compression)
         self._compression = compression
         self._max_ratio = limits.max_ratio
-        self._max_bytes = limits.max_bytes + limits.max_entries * _MAX_HEADER_BYTES + _PADDING_BYTES
-        self._left_bytes = _MAX_HEADER_BYTES
+        self._max_bytes = limits.max_bytes + limits.max_entries * MAX_HEADER_BYTES + _PADDING_BYTES
+        self._left_bytes = MAX_HEADER_BYTES
         self._entry_start = (0, 0)
         self.where = "its beginning"
         self.latest = b""
@@ -94,7 +94,7 @@ class _Stream(io.BufferedIOBase):
 
     def allow_headers(self) -> None:
         """The next entry's headers may be read."""
-        self._left_bytes = _MAX_HEADER_BYTES
+        self._left_bytes = MAX_HEADER_BYTES
 
     def tell(self) -> int:
         return self._packed.unpacked_bytes
@@ -105,7 +105,7 @@ class _Stream(io.BufferedIOBase):
         self._left_bytes -= size
         if self._left_bytes < 0:
             raise ArchiveTooLarge(
-                f"the archive has headers of over {_MAX_HEADER_BYTES} bytes for one entry, behind {self.where}",
+                f"the archive has headers of over {MAX_HEADER_BYTES} bytes for one entry, behind {self.where}",
                 remedy="Make the archive without extended attributes (tar --no-xattrs).",
             )
         self.latest = self._whole(size)
@@ -161,10 +161,15 @@ def _require_tar(stream: _Stream) -> None:
         if block != bytes(tarfile.BLOCKSIZE):
             tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
     except tarfile.HeaderError:
-        raise NotAnArchive(
-            "the file is neither a zip nor a tar archive",
-            remedy="Send a zip, or a tar that is plain or compressed with gzip, bzip2 or xz.",
-        ) from None
+        raise not_an_archive() from None
+
+
+def not_an_archive() -> ServiceError:
+    """The file is none of the kinds of archive that are taken."""
+    return NotAnArchive(
+        "the file is neither a zip nor a tar archive",
+        remedy="Send a zip, or a tar that is plain or compressed with gzip, bzip2 or xz.",
+    )
 
 
 def _members(blocks: _Stream) -> Iterator[tuple[tarfile.TarFile, tarfile.TarInfo]]:
@@ -194,7 +199,14 @@ def _forget(archive: Any) -> None:
     archive.members.clear()
 
 
-def _checked_name(member: tarfile.TarInfo) -> str:
+def checked_name(member: tarfile.TarInfo) -> str:
+    """An entry's safe name.
+
+    Raises
+    ------
+    ServiceError
+        422, if the entry is a link or another thing that is no file, or its name or size is refused.
+    """
     raw_name = member.name.encode("utf-8", "surrogateescape")
     kind = _REFUSED.get(member.type)
     if any(key.startswith(_SPARSE_KEY) for key in member.pax_headers):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from html.parser import HTMLParser
@@ -11,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.export.report_page._figures import camera_residuals, gnss_residuals
@@ -151,9 +153,9 @@ def test_previews_are_bounded(tmp_path: Path) -> None:
 
 def test_a_page_that_says_something_else_is_noticed(written: Path, tmp_path: Path, page: str) -> None:
     calibration = json.loads((written / "calibration.json").read_text())
-    assert list(faults_of(written / REPORT_PAGE, calibration)) == []
+    assert list(faults_of(written / REPORT_PAGE, {"": calibration})) == []
     calibration["cameras"]["left"]["difference"]["rotation_vector_deg"][1] += 1e-9
-    assert list(faults_of(written / REPORT_PAGE, calibration)) == ["the rotation of left about y is another"]
+    assert list(faults_of(written / REPORT_PAGE, {"": calibration})) == ["the rotation of left about y is another"]
     other = tmp_path / "other.html"
     other.write_text(page.replace("</main>", '<img src="https://example.org/a.png"></main>'))
     assert list(faults_of(other)) == ["it would load something"]
@@ -170,26 +172,58 @@ def test_what_cannot_be_made_is_withheld(tmp_path: Path, monkeypatch: pytest.Mon
     assert "report.html is withheld: it cannot be written: ValueError: no page" in notes
 
 
-def test_a_map_names_its_seams(tmp_path: Path) -> None:
-    folder = tmp_path / "pictures"
-    folder.mkdir()
-    for name, data in pictures().items():
-        (folder / name).write_bytes(data)
+def map_document(seams: int) -> dict[str, Any]:
+    """Of two scenes; all seams have the same pictures."""
+    shown = {"pictures": {"before": "pictures/birds_eye_before.png", "after": "pictures/birds_eye_after.png"}}
     seam = {"a": "one", "b": "two", "accepted": True, "inliers": 12, "residual_after_px": 0.7316933881054083}
-    document = {
+    return {
         "scenes": [
             {"name": name, "verdict": "connected", "registered_units": 2, "total_units": 2, "points": 5}
             for name in ("one", "two")
         ],
-        "seams": [
-            seam | {"pictures": {"before": "pictures/birds_eye_before.png", "after": "pictures/birds_eye_after.png"}},
-            {"a": "one", "b": "three", "accepted": False, "reason": "two hypotheses"},
-        ],
+        "seams": [seam | shown] * seams
+        + [{"a": "one", "b": "three", "accepted": False, "reason": "two hypotheses"}, seam | {"b": "four"}],
         "unconnected": [], "left_out": [], "loops": [],
     }  # fmt: skip
+
+
+def page_of_map(folder: Path, seams: int, calibrations: dict[str, Any], image: NDArray[np.uint8] | None = None) -> str:
+    (folder / "pictures").mkdir()
+    for name, data in pictures().items():
+        if image is None:
+            (folder / "pictures" / name).write_bytes(data)
+        else:
+            cv2.imwrite(str(folder / "pictures" / name), image)
     summary = {"registered_images": 4, "total_images": 4, "georeferenced": True}
-    found = map_page(document, tmp_path, REPORT | {"summary": summary})
+    return map_page(map_document(seams), folder, REPORT | {"summary": summary}, calibrations)
+
+
+def test_a_map_names_its_seams_and_shows_the_calibration_of_each_drive(written: Path, tmp_path: Path) -> None:
+    calibration = json.loads((written / "calibration.json").read_text())
+    other = copy.deepcopy(calibration)
+    other["cameras"]["left"]["wrong"] = True
+    other["cameras"]["left"]["difference"]["rotation_vector_deg"][0] = 3.0001
+    calibrations = {"one": calibration, "two": other}
+    found = page_of_map(tmp_path, 1, calibrations)
     assert "Seam of one and two" in found
     assert 'data-value="0.7316933881054083">0.732</span> px' in found
     assert found.count("data:image/jpeg;base64,") == 2
     assert "rejected: two hypotheses" in found
+    assert "There are no pictures: they were switched off." in found
+    assert "not mounted as given: left in two" in found
+    assert found.index("<h3>two</h3>") < found.index("<h3>one</h3>"), "what needs a look comes first"
+    (tmp_path / "report.html").write_text(found)
+    assert list(faults_of(tmp_path / "report.html", calibrations)) == []
+    other["cameras"]["left"]["difference"]["rotation_vector_deg"][0] = 3.0
+    faults = list(faults_of(tmp_path / "report.html", calibrations))
+    assert faults == ["the rotation of left about x is another in two"]
+
+
+@pytest.mark.parametrize(("seams", "drawn"), [(12, 12), (120, 20)])
+def test_all_seams_of_a_map_show_their_pictures_while_the_page_has_room(tmp_path: Path, seams: int, drawn: int) -> None:
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.integers(0, 256, (60, 60, 3), dtype=np.uint8), (500, 500))
+    found = page_of_map(tmp_path, seams, {}, image)
+    assert drawn <= found.count("data:image/jpeg;base64,") / 2 <= seams
+    assert found.count("Its pictures: pictures/") == seams - found.count("data:image/jpeg;base64,") // 2
+    assert 100_000 < len(found.encode()) < MOST_BYTES

@@ -9,17 +9,16 @@ export interface CameraCalibration {
   height: number;
   param_names: string[];
   given: { rig_from_cam: Pose; params: number[] };
-  refined: { rig_from_cam: Pose; params: number[] };
+  refined: { rig_from_cam: Pose; params: number[]; time_offset_us?: number };
   difference: { rotation_vector_deg: number[]; rotation_deg: number; translation_m: number[]; focal_px: number };
-  sigma?: { rotation_deg?: (number | null)[]; translation_m?: (number | null)[] };
+  sigma?: { rotation_deg?: (number | null)[]; translation_m?: (number | null)[]; time_offset_us?: number };
   observed?: { rotation: boolean[]; translation: boolean[] };
-  verdict?: { rotation: string[]; translation: string[] };
+  verdict?: { rotation: string[]; translation: string[]; time_offset?: string };
   wrong: boolean;
-  time_offset_us?: number;
 }
 export interface Calibration {
-  adjusted: boolean;
-  why: string;
+  adjusted?: boolean;
+  why?: string;
   cameras: Record<string, CameraCalibration>;
 }
 export const AXES = ["x", "y", "z"] as const;

@@ -13,6 +13,12 @@ interface Props {
   hasPictures: boolean;
 }
 
+/** The calibrations of a map's drives, as its adjustment left them. */
+export function MapCalibration({ base, files }: { base: string; files: readonly string[] }): Shown {
+  const loaded = useLoad((abort) => Promise.all(files.map(async (file) => ({ name: file.replace(/^calibration\/|\.json$/g, ""), document: await get<Calibration>(fileUrl(base, file), abort) }))), `calibrations ${base}`, false);
+  return html`<${Content} of=${loaded}>${(found: { name: string; document: Calibration }[]) => found.map(({ name, document }) => html`<section class="box" data-scene=${name}><h2>${name}</h2><${Cameras} document=${document} /></section>`)}<//>`;
+}
+
 export function CalibrationPage({ base, driveId, hasPictures }: Props): Shown {
   const loaded = useLoad((abort) => get<Calibration>(fileUrl(base, "calibration.json"), abort), `calibration ${base}`, false);
   return html`<${Content} of=${loaded}>${(document: Calibration) => html`<${Cameras} document=${document} />`}<//>
@@ -22,12 +28,15 @@ export function CalibrationPage({ base, driveId, hasPictures }: Props): Shown {
 
 export function Cameras({ document }: { document: Calibration }): Shown {
   const wrong = Object.entries(document.cameras).filter(([, camera]) => camera.wrong).map(([name]) => name);
-  return html`<p>${document.adjusted ? "The calibration was refined" : "The calibration was kept as given"}: ${document.why}.</p>
+  const state = document.why === undefined ? "The calibration is used as given" : `${document.adjusted ? "The calibration was refined" : "The calibration was kept as given"}: ${document.why}`;
+  return html`<p>${state}.</p>
     ${wrong.length > 0
       ? html`<div class="box bad" role="alert"><strong>Not mounted as given: ${wrong.join(", ")}</strong><p>The images contradict the calibration of ${wrong.length === 1 ? "this camera" : "these cameras"}. Calibrate anew, or use the refined values where their sigma suffices.</p></div>`
       : html`<p><span class="badge good">no camera contradicts its calibration</span></p>`}
     <${Corrections} document=${document} what="rotation" unit="deg" title="Correction of the rotation about the rig's axes" />
     <${Corrections} document=${document} what="translation" unit="m" title="Correction of the position along the rig's axes" />
+    <p class="muted small">± is one sigma. Observed: the drive's images and positions determine this direction. Only the prior: they do not, and the value is the given one within its uncertainty.</p>
+    <${TimeOffsets} document=${document} />
     <${Intrinsics} document=${document} />`;
 }
 
@@ -51,7 +60,10 @@ function Corrections({ document, what, unit, title }: CorrectionProps): Shown {
 function value(camera: CameraCalibration, what: "rotation" | "translation", index: number, axis: string): Shown {
   const unit = what === "rotation" ? "rotation_deg" : "translation_m";
   const correction = (what === "rotation" ? camera.difference.rotation_vector_deg : camera.difference.translation_m)[index]!;
-  const sigma = camera.sigma?.[unit]?.[index];
+  return withSigma(correction, camera.sigma?.[unit]?.[index], axis);
+}
+
+function withSigma(correction: number, sigma: number | null | undefined, axis: string): Shown {
   if (sigma === null || sigma === undefined) return html`<span data-axis=${axis} data-value=${correction}>${significant(correction, 3)}</span>`;
   // As many decimals as three significant digits of the sigma have: more say nothing.
   const decimals = Math.min(9, Math.max(0, 2 - Math.floor(Math.log10(sigma))));
@@ -65,8 +77,20 @@ function verdicts(camera: CameraCalibration, what: "rotation" | "translation"): 
   return found.map((verdict, index) => `${AXES[index]}: ${verdict}`).join("; ");
 }
 
+function TimeOffsets({ document }: { document: Calibration }): Shown {
+  const rows = Object.entries(document.cameras).filter(([, camera]) => camera.refined.time_offset_us !== undefined);
+  if (rows.length === 0) return null;
+  return html`<h2>Time offset of the cameras</h2>
+    <div class="scroll" tabindex="0" role="region" aria-label="Time offsets"><table data-time-offsets>
+      <thead><tr><th scope="col">Camera</th><th scope="col" class="number">Offset [µs]</th><th scope="col">Verdict</th></tr></thead>
+      <tbody>${rows.map(([name, camera]) => html`<tr data-camera=${name}><th scope="row">${name}</th>
+        <td class="number">${withSigma(camera.refined.time_offset_us!, camera.sigma?.time_offset_us, "time_offset")}</td><td>${camera.verdict?.time_offset ?? ""}</td></tr>`)}</tbody></table></div>`;
+}
+
 function Intrinsics({ document }: { document: Calibration }): Shown {
+  const isRefined = Object.values(document.cameras).some((camera) => camera.given.params.some((given, index) => given !== camera.refined.params[index]));
   return html`<h2>Intrinsics</h2>
+    ${!isRefined && html`<p class="muted">They were used as given: no setting asks to refine them.</p>`}
     <div class="scroll" tabindex="0" role="region" aria-label="Intrinsics"><table data-intrinsics>
       <thead><tr><th scope="col">Camera</th><th scope="col">Model</th><th scope="col">Parameter</th><th scope="col" class="number">Given</th><th scope="col" class="number">Refined</th></tr></thead>
       <tbody>${Object.entries(document.cameras).flatMap(([name, camera]) => camera.param_names.map((param, index) => html`<tr data-camera=${name} data-param=${param}>

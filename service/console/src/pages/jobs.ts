@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { get, send, type Job } from "../client";
+import { get, getAll, send, type Drive, type Job } from "../client";
 import { Badge, Bar, Confirm, Content, Empty, eta, Heading, KINDS, ProblemBox, stageOf, Tile, Time, useLoad } from "../components";
 import { duration } from "../format";
 import { html, type Children, type Shown } from "../html";
@@ -32,12 +32,13 @@ export function Jobs(): Shown {
 }
 
 export function JobTable({ jobs: shown }: { jobs: readonly Job[] }): Shown {
+  const drives = useLoad((abort) => getAll<Drive>("v1/drives", abort), "names of drives");
   return html`<div class="scroll" tabindex="0" role="region" aria-label="Jobs"><table>
     <thead><tr><th scope="col">Job</th><th scope="col">State</th><th scope="col">Progress</th><th scope="col">Stage</th><th scope="col">Time left</th><th scope="col">Created</th></tr></thead>
     <tbody>
       ${shown.map(
         (job) => html`<tr key=${job.id}>
-          <td><a href=${link("jobs", job.id)}>${KINDS[job.kind]}</a><div class="muted small">${nameOf(job)}</div></td>
+          <td><a href=${link("jobs", job.id)}>${KINDS[job.kind]}</a><div class="muted small">${nameOf(job, drives.value)}</div></td>
           <td><${Badge} state=${job.state} /></td>
           <td><${Bar} percent=${job.progress.percent} label="done" /></td>
           <td>${hasEnded(job) ? "–" : stageOf(job)}</td>
@@ -49,9 +50,9 @@ export function JobTable({ jobs: shown }: { jobs: readonly Job[] }): Shown {
   </table></div>`;
 }
 
-function nameOf(job: Job): string {
+function nameOf(job: Job, drives: readonly Drive[] | null): string {
   if (job.members && job.members.length > 0) return job.members.map((member) => member.name).join(", ");
-  return job.drive_id ?? job.id;
+  return drives?.find((drive) => drive.id === job.drive_id)?.name ?? job.drive_id ?? job.id;
 }
 
 export function JobPage({ id }: { id: string }): Shown {
@@ -63,7 +64,7 @@ export function JobPage({ id }: { id: string }): Shown {
     <div class="row"><${Badge} state=${job.state} />${job.cancel_requested && !hasEnded(job) && html`<span class="badge warn">stopping</span>`}
       <${Bar} percent=${job.progress.percent} label="done" /></div>
     <dl class="tiles" aria-live="polite">
-      <${Tile} label="Stage">${stageOf(job)}<//>
+      <${Tile} label=${hasEnded(job) ? "Last stage" : "Stage"}>${job.state === "SUCCEEDED" ? "all done" : stageOf(job)}<//>
       <${Tile} label=${hasEnded(job) ? "Took" : "Time left"}>${hasEnded(job) ? took(job) : eta(job)}<//>
       <${Tile} label="Created"><${Time} at=${job.created_at} /><//>
       <${Tile} label="Started"><${Time} at=${job.started_at} /><//>

@@ -30,6 +30,7 @@ const TABS = [
   { name: "3d", label: "3D" },
   { name: "place", label: "Map" },
   { name: "seams", label: "Seams" },
+  { name: "calibration", label: "Calibration" },
   { name: "versions", label: "Versions" },
   { name: "files", label: "Files" },
 ];
@@ -55,6 +56,11 @@ function WithVersion({ map, number, tab }: { map: MapResource; number: number; t
 function versionTab(version: MapVersion, base: string, tab: string): Children {
   if (tab === "files") return html`<${Files} files=${version.files} />`;
   if (tab === "seams") return html`<${Seams} version=${version} base=${base} />`;
+  if (tab === "calibration") {
+    const files = version.files.map((file) => file.path).filter((path) => /^calibration\/[^/]+\.json$/.test(path));
+    if (files.length === 0) return html`<${Empty}>This version has no calibration of its drives. Each scene has its own.<//>`;
+    return html`<${Lazy} load=${() => import("../calibration/page")} name="MapCalibration" of=${{ base, files }} />`;
+  }
   if (tab === "3d") {
     if (!hasFile(version, "view.json")) return html`<${Empty}>This version has no view.json: it was made by an older version of the engine. Make the map again.<//>`;
     const driveOf = Object.fromEntries(version.scenes.map((scene) => [scene.name, scene.drive_id]));
@@ -71,7 +77,8 @@ function versionTab(version: MapVersion, base: string, tab: string): Children {
 function Overview({ version, base }: { version: MapVersion; base: string }): Shown {
   const report = useLoad((abort) => get<Report>(fileUrl(base, "report.json"), abort), `report ${base}`, false);
   const { summary } = version;
-  return html`<dl class="tiles">
+  return html`${hasFile(version, "report.html") && html`<p><a class="button" href=${fileUrl(base, "report.html")} download>Download the report</a></p>`}
+    <dl class="tiles">
       <${Tile} label="Version">${version.number}<//>
       <${Tile} label="Scenes connected">${summary.connected} of ${summary.scenes}<//>
       <${Tile} label="Seams">${summary.seams}<//>
@@ -129,7 +136,7 @@ function SeamBox({ seam, base }: { seam: Seam; base: string; version: MapVersion
   const figure = (label: string, value: number | undefined, unit: string): Shown =>
     value === undefined ? null : html`<${Tile} label=${label}><span data-exact=${value}>${significant(value, 3)} ${unit}</span><//>`;
   return html`<section class="box"><h2>${title}</h2>
-    <p>${seam.accepted ? html`<span class="badge good">accepted</span>` : html`<span class="badge warn">rejected</span> ${seam.reason ?? "The evidence does not suffice."}`}</p>
+    <p>${seam.accepted ? html`<span class="badge good">accepted</span>` : html`<span class="badge warn">rejected</span> ${seam.reason ?? "the evidence does not suffice"}`}</p>
     <dl class="tiles">
       ${seam.units_tried !== undefined && html`<${Tile} label="Units that agree">${seam.units_agreeing ?? 0} of ${seam.units_tried}<//>`}
       ${seam.inliers !== undefined && html`<${Tile} label="Shared points">${count(seam.inliers)}<//>`}
@@ -137,11 +144,11 @@ function SeamBox({ seam, base }: { seam: Seam; base: string; version: MapVersion
       ${figure("Residual after", seam.residual_after_px, "px")}
       ${figure("Sigma of the translation", seam.sigma_translation_m, "m")}
       ${figure("Sigma of the rotation", seam.sigma_rotation_deg, "deg")}
-      ${figure("Scale", seam.scale, "")}
+      ${seam.scale !== undefined && html`<${Tile} label="Difference of scale"><span data-exact=${seam.scale}>${significant(100 * (seam.scale - 1), 3)} %</span><//>`}
     </dl>
     ${seam.pictures
       ? html`<${Slider} before=${fileUrl(base, seam.pictures.before)} after=${fileUrl(base, seam.pictures.after)} label="Points of both scenes from above" />`
-      : html`<p class="muted">${seam.accepted ? "There are no pictures: they were switched off, or no ground of both scenes is seen." : "There are no pictures, because the seam is not used."}</p>`}
+      : html`<p class="muted">${seam.accepted ? "There are no pictures: they were switched off." : "There are no pictures, because the seam is not used."}</p>`}
   </section>`;
 }
 

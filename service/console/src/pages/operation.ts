@@ -1,6 +1,6 @@
 import { get, setSession, type Session, type Status } from "../client";
 import { Badge, Content, Empty, Heading, Tile, Time, useLoad } from "../components";
-import { bytes, count } from "../format";
+import { bytes, count, plural } from "../format";
 import { html, type Shown } from "../html";
 import { link } from "../router";
 import { useEffect } from "preact/hooks";
@@ -17,6 +17,7 @@ export function StatusPage(): Shown {
 }
 
 function Parts({ status }: { status: Status }): Shown {
+  const [online, offline] = [status.workers.filter((worker) => worker.online), status.workers.filter((worker) => !worker.online)];
   const used = 1 - status.disk.free_bytes / status.disk.total_bytes;
   return html`<p><${Badge} state=${status.status} /> Version ${status.version}</p>
     ${status.reasons.length > 0 && html`<ul class="findings">${status.reasons.map((reason) => html`<li class="warn">${reason}</li>`)}</ul>`}
@@ -30,15 +31,20 @@ function Parts({ status }: { status: Status }): Shown {
       <${Tile} label="Uploads">${status.disk.accepts_uploads ? "are taken" : "are refused: the disk is full"}<//>
     </dl>
     <h2>Workers</h2>
-    ${status.workers.length === 0
-      ? html`<${Empty}>No worker has reported within the last day. Jobs are accepted and wait.<//>`
-      : html`<div class="scroll" tabindex="0" role="region" aria-label="Workers"><table>
-          <thead><tr><th scope="col">Worker</th><th scope="col">Online</th><th scope="col">Queues</th><th scope="col" class="number">Jobs at one time</th><th scope="col">Last report</th></tr></thead>
-          <tbody>${status.workers.map(
-            (worker) => html`<tr><td><code>${worker.name}</code></td><td><span class=${`badge ${worker.online ? "good" : "bad"}`}>${worker.online ? "online" : "offline"}</span></td>
-              <td>${worker.queues.join(", ")}</td><td class="number">${worker.concurrency}</td><td><${Time} at=${worker.seen_at} /></td></tr>`,
-          )}</tbody></table></div>`}
+    ${online.length === 0
+      ? html`<${Empty}>No worker is online. Jobs are accepted and wait.<//>`
+      : html`<${WorkerTable} workers=${online} label="Workers" />`}
+    ${offline.length > 0 && html`<details class="box"><summary>${plural(offline.length, "worker")} that ended within the last day</summary><${WorkerTable} workers=${offline} label="Workers that ended" /></details>`}
     <p><a href="docs">Description of the API</a></p>`;
+}
+
+function WorkerTable({ workers, label }: { workers: Status["workers"]; label: string }): Shown {
+  return html`<div class="scroll" tabindex="0" role="region" aria-label=${label}><table>
+    <thead><tr><th scope="col">Worker</th><th scope="col">Online</th><th scope="col">Queues</th><th scope="col" class="number">Jobs at one time</th><th scope="col">Last report</th></tr></thead>
+    <tbody>${workers.map(
+      (worker) => html`<tr><td><code>${worker.name}</code></td><td><span class=${`badge ${worker.online ? "good" : "plain"}`}>${worker.online ? "online" : "offline"}</span></td>
+        <td>${worker.queues.join(", ")}</td><td class="number">${worker.concurrency}</td><td><${Time} at=${worker.seen_at} /></td></tr>`,
+    )}</tbody></table></div>`;
 }
 
 export function Keys(): Shown {

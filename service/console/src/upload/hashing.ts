@@ -13,11 +13,11 @@ export class Hasher {
     };
   }
 
-  sha256(file: Blob): Promise<string> {
+  sha256(file: Blob, crc32?: number): Promise<string> {
     const id = ++this.last;
     return new Promise((done, failed) => {
       this.waiting.set(id, { done, failed });
-      this.worker.postMessage({ id, file });
+      this.worker.postMessage({ id, file, ...(crc32 === undefined ? {} : { crc32 }) });
     });
   }
 

@@ -1,4 +1,4 @@
-// A folder by drag and drop, sent so that it can go on later, here or in another browser.
+// A folder or an archive by drag and drop, sent so that it can go on later, here or in another browser.
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Drive, Problem } from "../client";
 import { Bar, Heading, problemOf, ProblemBox } from "../components";
@@ -9,7 +9,7 @@ import { chosen, dropped, MANIFEST, type Folder } from "./folder";
 import { upload, type Progress } from "./upload";
 
 const STEPS: Record<Progress["step"], string> = {
-  creates: "The manifest is being checked …", hashes: "Finding out what the service has already …", sends: "Sending …",
+  creates: "The names and the manifest are being checked …", hashes: "Finding out what the service has already …", sends: "Sending …",
   commits: "The drive is being checked …", done: "Done.",
 };
 
@@ -22,12 +22,14 @@ export function UploadPage(): Shown {
   const abort = useRef(new AbortController());
   useEffect(() => () => abort.current.abort(), []);
   const isBusy = progress !== null && progress.step !== "done" && problem === null;
-  const begin = async (folder: Folder): Promise<void> => {
+  const begin = async (opening: Promise<Folder>): Promise<void> => {
     setProblem(null);
     setDrive(null);
-    setProgress(null);
+    setProgress({ step: "creates", doneBytes: 0, totalBytes: 0, sentFiles: 0, files: 0 });
+    setExtra(0);
     try {
-      const sent = await upload(folder, (now) => { setProgress(now); setExtra(now.files ? folder.size - now.files - 1 : 0); }, abort.current.signal);
+      const folder = await opening;
+      const sent = await upload(folder, (now) => { setProgress(now); setExtra(now.files ? folder.sizes.size - now.files - 1 : 0); }, abort.current.signal);
       setDrive(sent);
     } catch (error) {
       if (!abort.current.signal.aborted) setProblem(problemOf(error));
@@ -36,17 +38,18 @@ export function UploadPage(): Shown {
   const drop = (event: DragEvent): void => {
     event.preventDefault();
     setOver(false);
-    if (event.dataTransfer && !isBusy) void dropped(event.dataTransfer.items).then(begin);
+    if (event.dataTransfer && !isBusy) void begin(dropped(event.dataTransfer.items));
   };
   const pick = (event: Event): void => {
     const input = event.target as HTMLInputElement;
-    if (input.files && input.files.length > 0) void begin(chosen(input.files));
+    if (input.files && input.files.length > 0) void begin(chosen(input.files).finally(() => (input.value = ""))); // the same again is news
   };
   return html`<${Heading} title="Upload a drive" />
     <div class=${isOver ? "drop over" : "drop"} onDragOver=${(event: DragEvent) => { event.preventDefault(); setOver(true); }} onDragLeave=${() => setOver(false)} onDrop=${drop}>
-      <p>Drop the folder of a drive here: the one with <code>${MANIFEST}</code>.</p>
-      <p><label class="button primary">Choose a folder<input class="hidden" type="file" webkitdirectory multiple disabled=${isBusy} onChange=${pick} /></label></p>
-      <p class="muted small">Files that the service has already are not sent again. Close this page at any time: the same folder goes on where it was, also in another browser.</p>
+      <p>Drop the folder of a drive here, the one with <code>${MANIFEST}</code>, or a zip, tar or tar.gz of it.</p>
+      <p class="inline choices"><label class="button primary">Choose a folder<input class="hidden" type="file" name="folder" webkitdirectory multiple disabled=${isBusy} onChange=${pick} /></label>
+        <label class="button">Choose an archive<input class="hidden" type="file" name="archive" accept=".zip,.tar,.tgz,.gz" disabled=${isBusy} onChange=${pick} /></label></p>
+      <p class="muted small">Files that the service has already are not sent again. Close this page at any time: the same folder or archive goes on where it was, also in another browser. An archive that holds other files than the drive's is refused before anything is sent.</p>
     </div>
     ${problem && html`<${ProblemBox} problem=${problem} />`}
     ${progress && !problem && html`<${Steps} progress=${progress} extra=${extra} />`}

@@ -1,7 +1,8 @@
 // The upload of a drive. What the service has is asked, not remembered: another browser goes on where this one stopped.
-import { fileUrl, getAll, ProblemError, send, type Drive } from "../client";
+import { fileUrl, getAll, ProblemError, send, type Drive, type Upload } from "../client";
 import { Hasher } from "./hashing";
-import { MANIFEST, type Folder } from "./folder";
+import { requireExpected } from "./archive";
+import { composed, MANIFEST, type Entry, type Folder } from "./folder";
 
 const IN_PIECES = 8 << 20; // bytes from which on a file is sent resumably
 const PIECE = 8 << 20;
@@ -21,34 +22,34 @@ interface DriveFile {
   sha256?: string | null;
   size_bytes?: number | null;
 }
-interface Missing {
-  path: string;
-  file: File;
+interface Sent extends Entry {
   sha256: string;
 }
 
-export function refuse(detail: string, remedy: string): ProblemError {
-  return new ProblemError({ title: "The folder is no drive", detail, remedy }, 0);
+function refuse(folder: Folder, detail: string, remedy: string): ProblemError {
+  return new ProblemError({ title: `The ${folder.what} is no drive`, detail, remedy }, 0);
 }
 
 export async function upload(folder: Folder, say: (progress: Progress) => void, abort: AbortSignal): Promise<Drive> {
-  const manifest = folder.get(MANIFEST);
-  if (!manifest) throw refuse(`There is no ${MANIFEST} in it.`, "Choose the folder that drive.json is in; 'mrasfm import' makes one of other recordings.");
+  const manifest = await folder.manifest();
+  if (manifest === null) throw refuse(folder, `There is no ${MANIFEST} in it.`, `Choose the folder that ${MANIFEST} is in, or an archive of it; 'mrasfm import' makes one of other recordings.`);
   const progress: Progress = { step: "creates", doneBytes: 0, totalBytes: 0, sentFiles: 0, files: 0 };
   say({ ...progress });
-  const drive = await openDrive(await manifest.text(), abort);
-  const named = await getAll<DriveFile>(`v1/drives/${drive.id}/files`, abort);
-  const absent = named.filter((one) => !folder.has(one.path));
-  if (absent.length > 0) {
-    const first = absent.slice(0, 5).map((one) => one.path).join(", ");
-    throw refuse(`${absent.length} of ${named.length} files that the manifest names are missing: ${first}${absent.length > 5 ? " …" : ""}.`, "Complete the folder; what is sent already stays.");
+  const { drive, isNew } = await openDrive(manifest, abort);
+  const named = new Map((await getAll<DriveFile>(`v1/drives/${drive.id}/files`, abort)).map(({ path }) => [composed(path), path]));
+  try {
+    requireComplete(folder, named);
+  } catch (error) {
+    if (isNew) await send("DELETE", `v1/drives/${drive.id}`, { signal: abort });
+    throw error;
   }
-  const files = named.map(({ path }) => ({ path, file: folder.get(path)! }));
-  Object.assign(progress, { step: "hashes", files: files.length, totalBytes: files.reduce((sum, { file }) => sum + file.size, 0) });
-  const missing = await declare(drive, files, progress, say, abort);
-  Object.assign(progress, { step: "sends", doneBytes: progress.totalBytes - missing.reduce((sum, { file }) => sum + file.size, 0), sentFiles: files.length - missing.length });
+  const size = (path: string): number => folder.sizes.get(path)!;
+  const total = (paths: Iterable<string>): number => [...paths].reduce((sum, path) => sum + size(path), 0);
+  Object.assign(progress, { step: "hashes", files: named.size, totalBytes: total(named.keys()) });
+  const missing = await declare(drive, folder, named, progress, say, abort);
+  Object.assign(progress, { step: "sends", doneBytes: progress.totalBytes - total(missing.keys()), sentFiles: named.size - missing.size });
   say({ ...progress });
-  await sendAll(drive, missing, (bytes, isWhole) => {
+  await sendAll(drive, folder, named, missing, (bytes, isWhole) => {
     progress.doneBytes += bytes;
     if (isWhole) progress.sentFiles += 1;
     say({ ...progress });
@@ -59,42 +60,54 @@ export async function upload(folder: Folder, say: (progress: Progress) => void, 
   return committed;
 }
 
+function requireComplete(folder: Folder, named: ReadonlyMap<string, string>): void {
+  requireExpected(folder, new Set(named.keys()));
+  const absent = [...named.keys()].filter((path) => !folder.sizes.has(path));
+  if (absent.length === 0) return;
+  const first = absent.slice(0, 5).join(", ");
+  throw refuse(folder, `${absent.length} of ${named.size} files that the manifest names are missing: ${first}${absent.length > 5 ? " …" : ""}.`, `Complete the ${folder.what}; files that were sent before are not sent again.`);
+}
+
 /** The open drive of this manifest, or a new one. */
-async function openDrive(manifest: string, abort: AbortSignal): Promise<Drive> {
+async function openDrive(manifest: string, abort: AbortSignal): Promise<{ drive: Drive; isNew: boolean }> {
   for (const drive of await getAll<Drive>("v1/drives", abort)) {
     if (drive.state !== "OPEN") continue;
     const stored = await (await send("GET", `v1/drives/${drive.id}/manifest`, { signal: abort })).text();
-    if (stored === manifest) return drive;
+    if (stored === manifest) return { drive, isNew: false };
   }
   const answer = await send("POST", "v1/drives", { text: manifest, signal: abort });
-  return (await answer.json()) as Drive;
+  return { drive: (await answer.json()) as Drive, isNew: true };
 }
 
-async function declare(drive: Drive, files: { path: string; file: File }[], progress: Progress, say: (progress: Progress) => void, abort: AbortSignal): Promise<Missing[]> {
+/** SHA-256 of the files that the service does not have, by path. */
+async function declare(drive: Drive, folder: Folder, named: ReadonlyMap<string, string>, progress: Progress, say: (progress: Progress) => void, abort: AbortSignal): Promise<ReadonlyMap<string, string>> {
   const hasher = new Hasher();
-  const hashed: Missing[] = [];
+  const found = new Map<string, string>();
   try {
-    for (const { path, file } of files) {
+    for await (const { path, file, crc32 } of folder.read(new Set(named.keys()))) {
       if (abort.aborted) throw abort.reason;
-      hashed.push({ path, file, sha256: await hasher.sha256(file) });
+      try {
+        found.set(path, await hasher.sha256(file, crc32));
+      } catch (error) {
+        throw refuse(folder, `'${path}' cannot be read: ${error instanceof Error ? error.message : String(error)}.`, `Check the ${folder.what}, then choose it again.`);
+      }
       progress.doneBytes += file.size;
       say({ ...progress });
     }
   } finally {
     hasher.close();
   }
-  const declaration = { files: hashed.map(({ path, file, sha256 }) => ({ path, size_bytes: file.size, sha256 })) };
-  const answer = await send("POST", `v1/drives/${drive.id}/files:declare`, { json: declaration, signal: abort });
-  const { to_send: wanted } = (await answer.json()) as { to_send: string[] };
-  const names = new Set(wanted);
-  return hashed.filter(({ path }) => names.has(path));
+  const files = [...found].map(([path, sha256]) => ({ path: named.get(path)!, size_bytes: folder.sizes.get(path)!, sha256 }));
+  const answer = await send("POST", `v1/drives/${drive.id}/files:declare`, { json: { files }, signal: abort });
+  const wanted = new Set(((await answer.json()) as { to_send: string[] }).to_send);
+  return new Map([...found].filter(([path]) => wanted.has(named.get(path)!)));
 }
 
-async function sendAll(drive: Drive, missing: readonly Missing[], sent: (bytes: number, isWhole: boolean) => void, abort: AbortSignal): Promise<void> {
-  const queue = [...missing];
+async function sendAll(drive: Drive, folder: Folder, named: ReadonlyMap<string, string>, missing: ReadonlyMap<string, string>, sent: (bytes: number, isWhole: boolean) => void, abort: AbortSignal): Promise<void> {
+  const entries = folder.read(new Set(missing.keys())); // shared: each takes the next one
   const work = async (): Promise<void> => {
-    for (let next = queue.shift(); next; next = queue.shift()) {
-      const one = next;
+    for (let next = await entries.next(); !next.done; next = await entries.next()) {
+      const one = { ...next.value, path: named.get(next.value.path)!, sha256: missing.get(next.value.path)! };
       if (one.file.size >= IN_PIECES) await inPieces(drive, one, sent, abort);
       else {
         await again(() => put(drive, one, abort), abort);
@@ -105,21 +118,19 @@ async function sendAll(drive: Drive, missing: readonly Missing[], sent: (bytes: 
   await Promise.all(Array.from({ length: AT_ONE_TIME }, work));
 }
 
-async function put(drive: Drive, { path, file, sha256 }: Missing, abort: AbortSignal): Promise<void> {
+async function put(drive: Drive, { path, file, sha256 }: Sent, abort: AbortSignal): Promise<void> {
   const answer = await fetch(fileUrl(`v1/drives/${drive.id}`, path), { method: "PUT", body: file, headers: { "Content-Digest": `sha-256=:${base64OfHex(sha256)}:` }, signal: abort });
   await require(answer);
 }
 
-async function inPieces(drive: Drive, { path, file, sha256 }: Missing, sent: (bytes: number, isWhole: boolean) => void, abort: AbortSignal): Promise<void> {
-  const remembered = `upload ${drive.id} ${sha256}`;
-  let url = localStorage.getItem(remembered);
+async function inPieces(drive: Drive, { path, file, sha256 }: Sent, sent: (bytes: number, isWhole: boolean) => void, abort: AbortSignal): Promise<void> {
+  let url = await begun(drive, path, sha256, abort);
   let offset = url ? await offsetOf(url, abort) : null;
   if (url === null || offset === null) {
     const metadata = `path ${base64OfText(path)},sha256 ${base64OfText(sha256)}`;
     const answer = await require(await fetch(`v1/drives/${drive.id}/uploads`, { method: "POST", headers: { ...TUS, "Upload-Length": String(file.size), "Upload-Metadata": metadata }, signal: abort }));
     url = answer.headers.get("location")!.replace(/^\//, "");
     offset = 0;
-    localStorage.setItem(remembered, url);
   }
   sent(offset, false);
   while (offset < file.size) {
@@ -130,7 +141,12 @@ async function inPieces(drive: Drive, { path, file, sha256 }: Missing, sent: (by
     offset = Number(answer.headers.get("upload-offset"));
     sent(offset - from, offset >= file.size);
   }
-  localStorage.removeItem(remembered);
+}
+
+/** The upload of this file that another page, or another browser, has begun. */
+async function begun(drive: Drive, path: string, sha256: string, abort: AbortSignal): Promise<string | null> {
+  const found = (await getAll<Upload>(`v1/drives/${drive.id}/uploads?sha256=${sha256}`, abort)).find((upload) => upload.path === path);
+  return found ? `v1/drives/${drive.id}/uploads/${found.id}` : null;
 }
 
 async function offsetOf(url: string, abort: AbortSignal): Promise<number | null> {

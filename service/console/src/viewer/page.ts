@@ -26,18 +26,20 @@ function View({ base, driveOf, onlyDrive, view }: Props & { view: ViewDocument }
   const [picked, setPicked] = useState<Picked | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
   const [size, setSize] = useState(2);
+  const without3d = (detail: string): void => setProblem({ title: "This browser shows no 3D", detail, remedy: "Switch on hardware acceleration or take a newer browser, or open points.copc.laz in another program." });
   useEffect(() => {
     try {
-      const urls = { points: new URL(fileUrl(base, view.points), location.href).href, worker: new URL("points.js", import.meta.url).href, wasm: new URL("laz-perf.wasm", import.meta.url).href };
+      const urls = { points: new URL(fileUrl(base, view.points), location.href).href, worker: new URL("points.js", import.meta.url).href, renderer: new URL("render.js", import.meta.url).href, wasm: new URL("laz-perf.wasm", import.meta.url).href };
       shown.current = new Scene3D(canvas.current!, view, urls, {
         figures: setFigures,
         failed: (detail) => setProblem({ title: "The points cannot be shown", detail, remedy: "Load the page again; the file itself can be downloaded under Files." }),
+        without3d,
         picked: (found) => choose(found, false),
       });
       // Tests and the curious ask where a position is on the screen.
       Object.assign(canvas.current!, { scene3d: shown.current });
-    } catch {
-      setProblem({ title: "This browser shows no 3D", detail: "WebGL 2 is not available.", remedy: "Switch on hardware acceleration, or open points.copc.laz in another program." });
+    } catch (error) {
+      without3d(error instanceof Error ? error.message : String(error));
     }
     return () => shown.current?.close();
   }, []);

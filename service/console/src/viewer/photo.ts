@@ -59,8 +59,8 @@ export function Photo({ base, view, picked, drive, choose }: Props): Shown {
       : html`<div class="photo"><img src=${fileUrl(`v1/drives/${drive}`, image.file)} alt=${`Image ${image.file}`} onError=${() => setMissing(true)} /><canvas ref=${overlay}></canvas></div>`}
     <p data-observations=${points ? points.length / 2 : ""}>${points ? `${count(points.length / 2)} observations` : "reading the observations …"}, ${image.size_px[0]} × ${image.size_px[1]} px</p>
     <div class="inline"><label><input type="checkbox" checked=${isShown} onChange=${(event: Event) => setShown((event.target as HTMLInputElement).checked)} /> Observations</label>
-      <button type="button" disabled=${!before} onClick=${() => before && choose(before)}>Before</button>
-      <button type="button" disabled=${!after} onClick=${() => after && choose(after)}>After</button></div>
+      <button type="button" disabled=${!before} onClick=${() => before && choose(before)}>Previous image</button>
+      <button type="button" disabled=${!after} onClick=${() => after && choose(after)}>Next image</button></div>
   </aside>`;
 }
 

@@ -22,6 +22,9 @@ export type FromPoints =
   | { type: "node"; key: string; positions: Float32Array; colors: Uint8Array; bytes: number }
   | { type: "failed"; detail: string };
 
+/** The renderer computes with linear colours; files hold those of a screen. */
+const LINEAR = Uint8Array.from({ length: 256 }, (_, value) => Math.round(255 * (value / 255) ** 2.2));
+
 const scope = self as unknown as DedicatedWorkerGlobalScope;
 const blocks = new Map<number, Promise<Uint8Array>>();
 let url = "";
@@ -89,7 +92,7 @@ async function load(key: string): Promise<void> {
   for (let point = 0; point < count; point += 1) {
     for (let axis = 0; axis < 3; axis += 1) {
       positions[3 * point + axis] = place[axis]!(point) - offset[axis]!;
-      colors[3 * point + axis] = color[axis]!(point) / 257;
+      colors[3 * point + axis] = LINEAR[color[axis]!(point) >> 8]!;
     }
   }
   const message: FromPoints = { type: "node", key, positions, colors, bytes: read };

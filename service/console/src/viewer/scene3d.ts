@@ -1,18 +1,17 @@
 // The scene in 3D: points by their size on the screen, trajectories, frusta and seams.
-import {
-  BufferAttribute, BufferGeometry, Color, Line, LineBasicMaterial, LineSegments, MathUtils, PerspectiveCamera, Points,
-  PointsMaterial, Scene, Vector3, WebGLRenderer,
-} from "three";
+import { MathUtils, PerspectiveCamera, Vector3 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Point, ViewDocument, ViewImage, ViewScene } from "./document";
 import type { FromPoints, NodeInfo, ToWorker } from "./points.worker";
+import type { FromRenderer, ToRenderer } from "./render.worker";
 
 const MOST_POINTS = 6_000_000;
 const AT_ONE_TIME = 2; // nodes that are being loaded
 const SPACING_PX = 2.2; // a node is loaded while its points are farther apart than this on the screen
 const PICKED_PX = 6;
 const EDGES: [number, number][] = [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]];
-const SELECTED = new Color("#ffffff");
+const DIRECTION = new Vector3(-0.3, -0.68, 0.67); // from which all of the scene is looked at
+const AROUND_M = 4; // the frusta around a trajectory
 
 export interface Figures {
   shown: number;
@@ -37,39 +36,45 @@ interface Node extends NodeInfo {
 export class Scene3D {
   readonly camera: PerspectiveCamera;
   readonly figures: Figures = { shown: 0, total: 0, nodes: 0, bytes: 0, size: 0, firstMs: null, isIdle: false };
-  private readonly renderer: WebGLRenderer;
-  private readonly scene = new Scene();
   private readonly controls: OrbitControls;
-  private readonly worker: Worker;
+  private readonly points: Worker;
+  private readonly renderer: Worker;
   private readonly began = performance.now();
-  private readonly material = new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
-  private readonly frusta: { lines: LineSegments; of: ViewScene }[] = [];
   private readonly resize: ResizeObserver;
-  private marked: LineSegments | null = null;
+  private readonly options = { pointSizePx: 2, hasFrusta: true };
   private nodes: Node[] = [];
+  private drawing: { message: number; node: Node }[] = []; // sent to be drawn
   private asked = 0;
+  private told = 0;
+  private drawn = 0;
   private frame = 0;
+  private isFitted = false; // to the canvas, whose size is known late
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
     private readonly view: ViewDocument,
-    urls: { points: string; worker: string; wasm: string },
-    private readonly say: { figures: (figures: Figures) => void; failed: (detail: string) => void; picked: (picked: Picked) => void },
+    urls: { points: string; worker: string; renderer: string; wasm: string },
+    private readonly say: { figures: (figures: Figures) => void; failed: (detail: string) => void; without3d: (detail: string) => void; picked: (picked: Picked) => void },
   ) {
-    this.renderer = new WebGLRenderer({ canvas, antialias: true });
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-    this.scene.background = new Color("#14181d");
+    this.renderer = new Worker(urls.renderer);
+    this.renderer.onmessage = ({ data }: MessageEvent<FromRenderer>) => this.hearRenderer(data);
+    this.renderer.onerror = (event) => this.say.without3d(event.message);
+    const offscreen = canvas.transferControlToOffscreen();
+    this.show({ type: "start", canvas: offscreen }, [offscreen]);
     this.camera = new PerspectiveCamera(50, 1, 0.2, 20000);
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.draw());
     this.controls.listenToKeyEvents(canvas);
-    for (const scene of view.scenes) this.addScene(scene);
+    for (const scene of view.scenes) {
+      this.addLine(scene.trajectory_m, scene.color, 3);
+      this.show({ type: "frusta", positions: flat(scene.images.flatMap(frustumPoints)), color: scene.color });
+    }
     for (const seam of view.seams) if (seam.line_m && seam.accepted) this.addLine(seam.line_m, "#ffffff", 1);
     this.home();
-    this.worker = new Worker(urls.worker);
-    this.worker.onmessage = ({ data }: MessageEvent<FromPoints>) => this.hear(data);
-    this.worker.onerror = (event) => this.say.failed(event.message);
+    this.points = new Worker(urls.worker);
+    this.points.onmessage = ({ data }: MessageEvent<FromPoints>) => this.hear(data);
+    this.points.onerror = (event) => this.say.failed(event.message);
     this.tell({ type: "start", url: urls.points, wasm: urls.wasm, offset: view.offset_m });
     this.resize = new ResizeObserver(() => this.fit());
     this.resize.observe(canvas);
@@ -80,18 +85,28 @@ export class Scene3D {
     });
   }
 
-  /** Look at everything from the side of the first trajectory. */
+  /** Look at all trajectories, from the side. */
   home(): void {
-    const all = this.view.scenes.flatMap((scene) => scene.trajectory_m);
-    const points = all.length > 0 ? all : [[0, 0, 0] as Point];
-    const axis = (index: 0 | 1 | 2): [number, number] => {
-      const values = points.map((point) => point[index]);
-      return [values.reduce((a, b) => Math.min(a, b), Infinity), values.reduce((a, b) => Math.max(a, b), -Infinity)];
-    };
-    const [x, y, z] = [axis(0), axis(1), axis(2)];
-    const reach = Math.max(x[1] - x[0], y[1] - y[0], 20);
-    this.controls.target.set((x[0] + x[1]) / 2, (y[0] + y[1]) / 2, (z[0] + z[1]) / 2);
-    this.camera.position.copy(this.controls.target).add(new Vector3(-0.35 * reach, -0.8 * reach, 0.75 * reach));
+    this.lookAt(this.view.scenes.flatMap((scene) => scene.trajectory_m), DIRECTION);
+  }
+
+  /** Look at some places, so that they just fit. */
+  lookAt(places: readonly Point[], direction: Vector3): void {
+    const points = (places.length > 0 ? places : [[0, 0, 0] as Point]).map((place) => new Vector3(...place));
+    const low = points.reduce((a, b) => a.min(b), points[0]!.clone());
+    const high = points.reduce((a, b) => a.max(b), points[0]!.clone());
+    this.controls.target.copy(low).add(high).multiplyScalar(0.5);
+    const back = direction.clone().normalize();
+    const right = new Vector3().crossVectors(this.camera.up, back).normalize();
+    const up = new Vector3().crossVectors(back, right);
+    const tangent = Math.tan(MathUtils.degToRad(this.camera.fov) / 2);
+    const distance = points.reduce((most, point) => {
+      const from = point.clone().sub(this.controls.target);
+      const across = (Math.abs(from.dot(right)) + AROUND_M) / (tangent * this.camera.aspect);
+      const along = (Math.abs(from.dot(up)) + AROUND_M) / tangent;
+      return Math.max(most, Math.max(across, along) + from.dot(back));
+    }, 10);
+    this.camera.position.copy(this.controls.target).addScaledVector(back, 1.08 * distance);
     this.controls.update();
     this.draw();
   }
@@ -105,27 +120,24 @@ export class Scene3D {
   }
 
   setPointSize(size: number): void {
-    this.material.size = size;
-    this.draw();
+    this.options.pointSizePx = size;
+    this.show({ type: "options", ...this.options });
   }
 
   showFrusta(isShown: boolean): void {
-    for (const { lines } of this.frusta) lines.visible = isShown;
-    this.draw();
+    this.options.hasFrusta = isShown;
+    this.show({ type: "options", ...this.options });
   }
 
   /** A picture's frustum is marked, and the view moves to it. */
   mark({ image }: Picked, look: boolean): void {
-    if (this.marked) this.scene.remove(this.marked);
-    this.marked = this.lines(frustumPoints(image), SELECTED);
-    this.scene.add(this.marked);
-    if (look) {
-      const centre = new Vector3(...image.frustum_m[0]!);
-      const back = this.camera.position.clone().sub(this.controls.target).setLength(14);
-      this.controls.target.copy(centre);
-      this.camera.position.copy(centre).add(back);
-      this.controls.update();
-    }
+    this.show({ type: "mark", positions: flat(frustumPoints(image)) });
+    if (!look) return;
+    const centre = new Vector3(...image.frustum_m[0]!);
+    const back = this.camera.position.clone().sub(this.controls.target).setLength(14);
+    this.controls.target.copy(centre);
+    this.camera.position.copy(centre).add(back);
+    this.controls.update();
     this.draw();
   }
 
@@ -137,38 +149,38 @@ export class Scene3D {
   }
 
   close(): void {
-    this.worker.terminate();
+    this.points.terminate();
+    this.renderer.terminate();
     this.resize.disconnect();
     this.controls.dispose();
-    this.scene.traverse((part) => {
-      if (part instanceof Points || part instanceof Line) part.geometry.dispose();
-    });
-    this.renderer.dispose();
     cancelAnimationFrame(this.frame);
   }
 
   private tell(message: ToWorker): void {
-    this.worker.postMessage(message);
+    this.points.postMessage(message);
   }
 
-  private addScene(of: ViewScene): void {
-    this.addLine(of.trajectory_m, of.color, 3);
-    const lines = this.lines(of.images.flatMap(frustumPoints), new Color(of.color));
-    this.frusta.push({ lines, of });
-    this.scene.add(lines);
+  /** Give the renderer something to draw; the number of the message. */
+  private show(message: ToRenderer, transferred: Transferable[] = []): number {
+    this.renderer.postMessage(message, transferred);
+    return ++this.told;
+  }
+
+  private hearRenderer(message: FromRenderer): void {
+    if (message.type === "failed") return this.say.without3d(message.detail);
+    this.drawn = message.messages;
+    const seen = this.drawing.filter((one) => one.message <= message.messages);
+    this.drawing = this.drawing.filter((one) => one.message > message.messages);
+    for (const { node } of seen) {
+      this.figures.shown += node.points;
+      this.figures.nodes += 1;
+      this.figures.firstMs ??= performance.now() - this.began;
+    }
+    this.sayFigures();
   }
 
   private addLine(points: readonly Point[], color: string, order: number): void {
-    const geometry = new BufferGeometry().setFromPoints(points.map((point) => new Vector3(...point)));
-    const line = new Line(geometry, new LineBasicMaterial({ color, depthTest: false, transparent: true }));
-    line.renderOrder = order; // over the points: a path is never hidden by what the vehicle saw
-    this.scene.add(line);
-  }
-
-  private lines(points: readonly Point[], color: Color): LineSegments {
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(points.flat()), 3));
-    return new LineSegments(geometry, new LineBasicMaterial({ color, transparent: true, opacity: color === SELECTED ? 1 : 0.55 }));
+    this.show({ type: "line", positions: flat(points), color, order });
   }
 
   private hear(message: FromPoints): void {
@@ -195,15 +207,9 @@ export class Scene3D {
     this.asked -= 1;
     const node = this.nodes.find((one) => one.key === key)!;
     node.state = "shown";
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(positions, 3));
-    geometry.setAttribute("color", new BufferAttribute(linear(colors), 3, true));
-    this.scene.add(new Points(geometry, this.material));
-    this.figures.shown += node.points;
-    this.figures.nodes += 1;
+    this.drawing.push({ message: this.show({ type: "points", positions, colors }, [positions.buffer, colors.buffer]), node });
     this.figures.bytes = bytes;
-    this.figures.firstMs ??= performance.now() - this.began;
-    this.draw();
+    this.request();
   }
 
   /** Nodes of which points would be seen apart, the coarsest on the screen first. */
@@ -215,7 +221,7 @@ export class Scene3D {
       .map((node) => ({ node, px: this.isSeen(node) ? (node.spacing * scale) / Math.max(this.camera.position.distanceTo(node.centre) - node.radius, 0.5) : 0 }))
       .filter(({ node, px }) => px > SPACING_PX || node.key === "0-0-0-0")
       .sort((a, b) => b.px - a.px);
-    let points = this.figures.shown;
+    let points = this.nodes.reduce((sum, node) => sum + (node.state === "known" ? 0 : node.points), 0);
     for (const { node } of wanted) {
       if (this.asked >= AT_ONE_TIME || points + node.points > MOST_POINTS) break;
       node.state = "asked";
@@ -223,7 +229,11 @@ export class Scene3D {
       this.asked += 1;
       this.tell({ type: "load", key: node.key });
     }
-    this.figures.isIdle = this.asked === 0 && this.nodes.length > 0;
+    this.sayFigures();
+  }
+
+  private sayFigures(): void {
+    this.figures.isIdle = this.asked === 0 && this.nodes.length > 0 && this.drawn === this.told && this.frame === 0;
     this.say.figures({ ...this.figures });
   }
 
@@ -236,11 +246,11 @@ export class Scene3D {
 
   /** The image whose frustum is drawn nearest to a place on the screen. */
   private pick(clientX: number, clientY: number): void {
-    if (!this.frusta[0]?.lines.visible) return;
+    if (!this.options.hasFrusta) return;
     const box = this.canvas.getBoundingClientRect();
     const [x, y] = [clientX - box.left, clientY - box.top];
     let nearest: { picked: Picked; px: number } | null = null;
-    for (const { of } of this.frusta) {
+    for (const of of this.view.scenes) {
       for (const image of of.images) {
         const corners = image.frustum_m.map((point) => this.onScreen(point));
         for (const [a, b] of EDGES) {
@@ -260,17 +270,20 @@ export class Scene3D {
   private fit(): void {
     const { clientWidth, clientHeight } = this.canvas;
     if (clientWidth === 0 || clientHeight === 0) return;
-    this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
+    if (!this.isFitted) this.home();
+    this.isFitted = true;
     this.draw();
   }
 
   private draw(): void {
-    if (this.frame) return;
-    this.frame = requestAnimationFrame(() => {
+    this.frame ||= requestAnimationFrame(() => {
       this.frame = 0;
-      this.renderer.render(this.scene, this.camera);
+      const { position, quaternion, fov, near, far } = this.camera;
+      const { clientWidth: width, clientHeight: height } = this.canvas;
+      if (width === 0 || height === 0) return;
+      this.show({ type: "view", view: { position: position.toArray(), quaternion: quaternion.toArray(), fovDeg: fov, near, far, width, height, pixelRatio: Math.min(window.devicePixelRatio, 2) } });
       this.request();
     });
   }
@@ -287,9 +300,6 @@ function frustumPoints(image: ViewImage): Point[] {
   return EDGES.flatMap(([a, b]) => [image.frustum_m[a]!, image.frustum_m[b]!]);
 }
 
-const LINEAR = Uint8Array.from({ length: 256 }, (_, value) => Math.round(255 * (value / 255) ** 2.2));
-
-/** The renderer computes with linear colours; files hold those of a screen. */
-function linear(colors: Uint8Array): Uint8Array {
-  return colors.map((value) => LINEAR[value]!);
+function flat(points: readonly Point[]): Float32Array {
+  return Float32Array.from(points.flat());
 }
