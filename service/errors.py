@@ -394,6 +394,10 @@ class TooManyWebhooks(ServiceError, status=429):
     """The project has as many webhooks as it may."""
 
 
+class TooManyStreams(ServiceError, status=429):
+    """The project has as many event streams open as it may."""
+
+
 class DeliveryPending(ServiceError, status=409):
     """The message is pending."""
 

@@ -113,9 +113,10 @@ class Settings(BaseSettings):
     metrics_token: Token | None = Field(
         None, description="bearer token that Prometheus sends to read `/metrics`; by default anybody may read it"
     )
-    poll_seconds: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = Field(
+    poll_seconds: Annotated[float, Field(gt=0, le=2, allow_inf_nan=False)] = Field(
         1.0, description="an event stream checks for news, and whether its key is still valid, at this interval"
     )
+    max_event_streams: Count = Field(100, description="event streams of one project, in each process of the API")
 
     # Webhooks
     webhook_private_addresses: bool = Field(
