@@ -181,7 +181,17 @@ class Settings(BaseSettings):
     )
     idempotency_hours: Hours = Field(24.0, description="answers to an `Idempotency-Key` are kept for this time")
 
-    @field_validator("metrics_token", "submap_workers", "console_tiles", mode="before")
+    @field_validator(
+        "metrics_token",
+        "submap_workers",
+        "console_tiles",
+        "drive_retention_days",
+        "scene_retention_days",
+        "map_retention_days",
+        "export_retention_days",
+        "job_retention_days",
+        mode="before",
+    )
     @classmethod
     def _is_given(cls, value: object) -> object:
         """Compose passes what nobody has set as an empty text."""
