@@ -111,8 +111,13 @@ def is_read_by_next_version(path: str) -> bool:
     return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))
 
 
+# What every export reads; of a map besides calibration/NAME.json and SCENES_FOLDER/NAME.npz of each scene.
+_EXPORTED = (REPORT_FILE, "poses.json", "frame.json", "points.ply", "model/images.bin", "model/points3D.bin")
+EXPORTED_OF_SCENE = frozenset({*_EXPORTED, "manifest.json", "calibration.json"})
+EXPORTED_OF_MAP = frozenset({*_EXPORTED, MAP_FILE})
+
+
 def is_read_by_export(path: str) -> bool:
-    """Return whether an export reads this file of a scene or map; of a scene's smaller components none is read."""
-    files = (MAP_FILE, REPORT_FILE, "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply")
+    """Return whether an export reads this file of a scene or map, by its path in the folder that is exported."""
     folders = (f"{OWN_CAR_FOLDER}/", f"{SCENES_FOLDER}/", "calibration/")
-    return path in files or path in ("model/images.bin", "model/points3D.bin") or path.startswith(folders)
+    return path in EXPORTED_OF_SCENE | EXPORTED_OF_MAP or path.startswith(folders)

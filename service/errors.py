@@ -371,6 +371,14 @@ class NotGeoreferenced(ServiceError, status=422):
     """The result is not georeferenced."""
 
 
+class ComponentUnknown(ServiceError, status=422):
+    """There is no such component."""
+
+
+class FilesMissing(ServiceError, status=422):
+    """The result lacks files that exports read."""
+
+
 class CrsNotTaken(ServiceError, status=422):
     """No format takes a coordinate reference system."""
 

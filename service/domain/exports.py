@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobKind
-from schemas.artifacts import is_read_by_export
+from schemas.artifacts import EXPORTED_OF_MAP, EXPORTED_OF_SCENE, component_folder, is_read_by_export
 from schemas.exports import EXPORT_FORMATS
 from service.database.tables import (
     TERMINAL,
@@ -30,15 +30,18 @@ from service.database.tables import (
     Scene,
     SceneFile,
     new_id,
+    now_us,
 )
 from service.domain import jobs
 from service.domain.map_inputs import StoredArtifact
 from service.domain.scenes import media_type
 from service.errors import (
+    ComponentUnknown,
     CrsNotTaken,
     DriveDeleted,
     ExportActive,
     ExportDeleted,
+    FilesMissing,
     NotGeoreferenced,
     UsedByJob,
 )
@@ -57,7 +60,7 @@ class ExportInputs:
     Attributes
     ----------
     files
-        Of the scene or version, those that exports read.
+        Of the scene, component or version, those that exports read.
     drives
         Ids of drives by the names of scenes; of a scene that is no map, by the empty name. None where no format has
         images.
@@ -87,12 +90,15 @@ def create(
     Raises
     ------
     ServiceError
-        409 where a drive whose images are needed was deleted; 422 where the scene or map lacks what a format needs;
-        413 and 429 as for all jobs.
+        409 where a drive whose images are needed was deleted; 422 where the scene or map has no such component, or
+        lacks what a format needs; 413 and 429 as for all jobs.
     """
     formats = sorted(set(asked.formats))
     options = {"image_size_px": asked.image_size_px, "crs": asked.crs}
+    if asked.component is not None:
+        options["component"] = asked.component
     _require_needs(subject, formats, options)
+    _require_files(session, subject, options)
     drives = _require_drives(session, subject) if _needs_images(formats) else {}
     inputs = _inputs_sha256(subject, formats, options)
     known = _same(session, project_id, inputs)
@@ -162,21 +168,35 @@ def inputs_of(session: Session, held: jobs.Claim) -> ExportInputs:
     export = session.get(Export, _export_id(held.request))
     if export is None:
         raise ExportGoneError(_export_id(held.request))
+    subject: Scene | MapVersion
     if export.scene_id is not None:
-        table: type[SceneFile] | type[MapFile] = SceneFile
-        mine: ColumnElement[bool] = SceneFile.scene_id == export.scene_id
-        subject: Scene | MapVersion = session.get_one(Scene, export.scene_id)
+        subject = session.get_one(Scene, export.scene_id)
     else:
-        table, mine = MapFile, (MapFile.map_id == export.map_id) & (MapFile.number == export.map_version)
         subject = session.get_one(MapVersion, (export.map_id, export.map_version))
-    statement = select(table.path, Blob.key).join(Blob, table.blob_id == Blob.id).where(mine).order_by(table.path)
-    files = [StoredArtifact(path, key) for path, key in session.execute(statement) if is_read_by_export(path)]
     return ExportInputs(
-        files=files,
+        files=_files(session, subject, export.options),
         drives=_drives(session, subject) if _needs_images(export.formats) else {},
         formats=export.formats,
-        options=export.options,
+        options={name: value for name, value in export.options.items() if name != "component"},
     )
+
+
+def _files(session: Session, subject: Scene | MapVersion, options: Mapping[str, Any]) -> list[StoredArtifact]:
+    """What is read of a scene, component or version, by its path in the folder that is exported."""
+    table: type[SceneFile] | type[MapFile] = SceneFile
+    if isinstance(subject, Scene):
+        mine = SceneFile.scene_id == subject.id
+    else:
+        table, mine = MapFile, (MapFile.map_id == subject.map_id) & (MapFile.number == subject.number)
+    number = options.get("component")
+    prefix = "" if number is None else f"{component_folder(number)}/"
+    statement = select(table.path, Blob.key).join(Blob, table.blob_id == Blob.id).where(mine).order_by(table.path)
+    found = session.execute(statement.where(table.path.startswith(prefix, autoescape=True))).all()
+    return [
+        StoredArtifact(path.removeprefix(prefix), key)
+        for path, key in found
+        if is_read_by_export(path.removeprefix(prefix))
+    ]
 
 
 def publish(
@@ -274,10 +294,12 @@ def _needs_images(formats: Sequence[str]) -> bool:
 
 
 def _require_needs(subject: Scene | MapVersion, formats: Sequence[str], options: Mapping[str, Any]) -> None:
+    component = options.get("component")
+    figures = subject.summary if component is None else _component(subject, component)
     needing = [name for name in formats if EXPORT_FORMATS[name].needs_place]
-    if needing and not subject.summary["georeferenced"]:
+    if needing and not figures["georeferenced"]:
         raise NotGeoreferenced(
-            f"format {needing[0]} needs a place on the earth, and {_named(subject)} has none",
+            f"format {needing[0]} needs a place on the earth, and {_named(subject, options)} has none",
             remedy="Leave the format out, or reconstruct the drive with GNSS.",
         )
     taking = [known.name for known in EXPORT_FORMATS.values() if known.takes_crs]
@@ -285,6 +307,29 @@ def _require_needs(subject: Scene | MapVersion, formats: Sequence[str], options:
         raise CrsNotTaken(
             f"crs is given, and no format of {', '.join(formats)} takes one",
             remedy=f"Leave it out; formats that take one: {', '.join(taking) or 'none'}.",
+        )
+
+
+def _component(subject: Scene | MapVersion, number: int) -> Mapping[str, Any]:
+    """The figures of a component that has a folder of its own."""
+    listed = subject.summary.get("components") or () if isinstance(subject, Scene) else ()
+    own = {each["component"]: each for each in listed if each["folder"] == component_folder(each["component"])}
+    if number not in own:
+        raise ComponentUnknown(
+            f"{_named(subject, {})} has no component {number} with files of its own",
+            remedy=f"Leave it out, or give one that has: {', '.join(map(str, sorted(own))) or 'there is none'}.",
+        )
+    found: Mapping[str, Any] = own[number]
+    return found
+
+
+def _require_files(session: Session, subject: Scene | MapVersion, options: Mapping[str, Any]) -> None:
+    read = EXPORTED_OF_SCENE if isinstance(subject, Scene) else EXPORTED_OF_MAP
+    missing = sorted(read - {file.path for file in _files(session, subject, options)})
+    if missing:
+        raise FilesMissing(
+            f"{_named(subject, options)} has no {missing[0]}, which exports read",
+            remedy="Another version of the service made it: make it again with this one.",
         )
 
 
@@ -317,8 +362,12 @@ def _source(subject: Scene | MapVersion) -> dict[str, Any]:
     return {"map_id": subject.map_id, "map_version": subject.number}
 
 
-def _named(subject: Scene | MapVersion) -> str:
-    return f"scene {subject.id}" if isinstance(subject, Scene) else f"version {subject.number} of map {subject.map_id}"
+def _named(subject: Scene | MapVersion, options: Mapping[str, Any]) -> str:
+    if not isinstance(subject, Scene):
+        return f"version {subject.number} of map {subject.map_id}"
+    return (
+        f"component {options['component']} of scene {subject.id}" if "component" in options else f"scene {subject.id}"
+    )
 
 
 def _inputs_sha256(subject: Scene | MapVersion, formats: Sequence[str], options: Mapping[str, Any]) -> str:
@@ -328,8 +377,9 @@ def _inputs_sha256(subject: Scene | MapVersion, formats: Sequence[str], options:
 
 
 def _same(session: Session, project_id: str, inputs: str) -> Export | None:
-    """An export of the same that is there with all formats, or will be."""
+    """An export of the same that is there with all formats, or will be; not one that is deleted at any moment."""
     same = (Export.project_id == project_id) & (Export.inputs_sha256 == inputs)
+    same &= Export.expires_us.is_(None) | (Export.expires_us > now_us())
     for export in session.scalars(select(Export).where(same).order_by(Export.created_us.desc())):
         if export.results is not None:
             if not any(result.get("withheld") for result in export.results):
