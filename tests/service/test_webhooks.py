@@ -222,6 +222,18 @@ def test_a_webhook_that_is_slow_holds_up_neither_others_nor_other_projects(
     assert [(message.project_id, message.webhook_id in slow) for message in one] == [(project_id, True)]
 
 
+def test_a_webhook_that_is_deleted_while_it_is_told_leaves_nothing(database: Database, project_id: str) -> None:
+    webhook_id = new_webhook(database, project_id)
+    ended_job(database, project_id)
+    (message,) = taken(database)
+    _delete_webhook(database, webhook_id)
+    with database.write() as session:
+        webhooks.note(session, message, webhooks.Outcome(status=410, error="answered 410"))
+        webhooks.note(session, message, webhooks.Outcome(status=200))
+    with database.read() as session:
+        assert session.query(Webhook).count() == session.query(WebhookDelivery).count() == 0
+
+
 def test_messages_of_a_webhook_are_bounded(
     database: Database, project_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

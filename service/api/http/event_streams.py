@@ -4,23 +4,34 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
-from typing import Any
+from typing import Any, TypeVar, TypeVarTuple
 
+import anyio
+import anyio.to_thread
 from starlette.requests import Request
 
 from service.errors import TooManyStreams
 
 _KEY = "mrasfm_event_stream"  # in the state of the request
 _RETRY_AFTER_S = 30
+_THREADS = 8
+
+Given = TypeVarTuple("Given")
+News = TypeVar("News")
 
 
 class EventStream:
     """One open stream. It ends by itself where the server stops: uvicorn would wait for it, and cut it off."""
 
-    def __init__(self) -> None:
+    def __init__(self, threads: anyio.CapacityLimiter) -> None:
         self._ended = asyncio.Event()
+        self._threads = threads
+
+    async def look(self, function: Callable[[*Given], News], *given: *Given) -> News:
+        """The result of a function that asks the database, in a thread."""
+        return await anyio.to_thread.run_sync(function, *given, limiter=self._threads)
 
     async def pause(self, pause_s: float) -> None:
         """Wait before the next look for news, no longer than the server goes on."""
@@ -51,6 +62,8 @@ class EventStreams:
     def __init__(self, per_project: int) -> None:
         self._per_project = per_project
         self._open: Counter[str] = Counter()
+        # Of their own: a database that does not answer would else let streams take the threads of all other requests.
+        self._threads = anyio.CapacityLimiter(_THREADS)
 
     @property
     def open_streams(self) -> int:
@@ -71,7 +84,7 @@ class EventStreams:
                 remedy="Close some, or poll: GET /v1/jobs with If-None-Match.",
                 headers={"Retry-After": str(_RETRY_AFTER_S)},
             )
-        stream = EventStream()
+        stream = EventStream(self._threads)
         setattr(request.state, _KEY, stream)
         self._open[project_id] += 1
         try:

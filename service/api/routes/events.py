@@ -9,7 +9,6 @@ from fastapi import APIRouter, Request
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from sqlalchemy.orm import Session
-from starlette.concurrency import run_in_threadpool
 
 from schemas.api.jobs import JobResource
 from schemas.api.resource import example_of
@@ -148,18 +147,18 @@ async def stream_events(
     key or the session has ended.
     """
     reader = _Reader(context, caller.project_id, secret_of(request) or "")
-    position = await run_in_threadpool(reader.begin, last_event_id)
+    position = await stream.look(reader.begin, last_event_id)
     yield ServerSentEvent(
         event=READY, id=str(position.floor), data={"after": position.floor}
     )  # browsers drop what has no data
     while not stream.has_ended:
         floor = position.floor
-        changed = await run_in_threadpool(reader.changed, position)
+        changed = await stream.look(reader.changed, position)
         if changed is None:
             yield ServerSentEvent(event=END, data={"reason": "the key or the session has ended"})
             return
         for first in range(0, len(changed), _JOBS_AT_ONCE):
-            for job in await run_in_threadpool(reader.views, changed[first : first + _JOBS_AT_ONCE]):
+            for job in await stream.look(reader.views, changed[first : first + _JOBS_AT_ONCE]):
                 # Whoever goes away before the last one is shown all of them again.
                 is_last = job.id == changed[-1]
                 yield ServerSentEvent(event=JOB, id=str(position.floor if is_last else floor), data=job)

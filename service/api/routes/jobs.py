@@ -10,7 +10,6 @@ from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Request,
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from sqlalchemy.orm import Session
-from starlette.concurrency import run_in_threadpool
 
 from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
@@ -191,7 +190,7 @@ async def stream_job_events(
     """The job's changes of state, from the beginning, and its newest progress, until it or the key has ended."""
     last, secret = last_event_id or 0, secret_of(request) or ""
     while not stream.has_ended:
-        ended, events = await run_in_threadpool(_news, context, secret, job_id, last)
+        ended, events = await stream.look(_news, context, secret, job_id, last)
         for event in events:
             last = event.id
             yield ServerSentEvent(id=str(event.id), event=event.kind, data=event.data)
