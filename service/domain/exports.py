@@ -277,7 +277,8 @@ def forget_expired(session: Session, now: int, *, limit: int = 20) -> int:
     active = of_job.where(Job.state.not_in(TERMINAL)).exists()
     ripe = or_((Export.expires_us < now) & ~active, Export.results.is_(None) & ~of_job.exists())
     found = session.scalars(select(Export.id).where(ripe).order_by(Export.id).limit(limit).with_for_update()).all()
-    dropped = delete(Export).where(Export.id.in_(found)).execution_options(synchronize_session=False)
+    # Asked again under the locks: one that is retried at this moment has a job by now.
+    dropped = delete(Export).where(Export.id.in_(found), ripe).execution_options(synchronize_session=False)
     return int(session.execute(dropped).rowcount)  # type: ignore[attr-defined]
 
 
