@@ -168,6 +168,9 @@ def test_streams_of_a_project_are_bounded(start_api: StartApi) -> None:
     wait_until(lambda: api.context.streams.open_streams == 0, "the end of the streams")
     with stream(client) as events:
         next(events)
+    told = client.get("/metrics").text
+    assert 'mrasfm_http_requests_total{method="GET",route="/v1/events",status="200"}' in told
+    assert 'mrasfm_http_request_seconds_count{method="GET",route="/v1/events"} 1' in told, "of the refusal alone"
 
 
 def test_streams_end_with_the_server(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import threading
 from typing import Any
 
@@ -69,6 +70,10 @@ def test_jobs_that_end_leave_one_message_each(client: Client) -> None:
         assert client.post(f"/v1/jobs/{job['id']}:cancel").status_code == 202
     assert [m["job_id"] for m in messages(client, other["id"])] == [job["id"]]
     assert len(messages(client, wanted["id"])) == 1
+    (pending,) = re.findall(
+        r'^mrasfm_webhook_messages{state="PENDING"} (\d+)', client.get("/metrics").text, re.MULTILINE
+    )
+    assert int(pending) >= 2
 
 
 def test_a_message_is_rolled_back_with_its_transaction(client: Client) -> None:
