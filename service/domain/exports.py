@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, delete, or_, select
@@ -14,62 +10,28 @@ from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobKind
-from schemas.artifacts import EXPORTED_OF_MAP, EXPORTED_OF_SCENE, component_folder, is_read_by_export
-from schemas.exports import EXPORT_FORMATS
 from service.database.tables import (
     TERMINAL,
-    Blob,
     Drive,
     Export,
     ExportFile,
     Job,
     JobState,
-    MapFile,
-    MapScene,
     MapVersion,
     Scene,
-    SceneFile,
     new_id,
     now_us,
 )
 from service.domain import jobs
-from service.domain.map_inputs import StoredArtifact
+from service.domain.export_inputs import ExportInputs, drive_deleted
 from service.domain.scenes import media_type
-from service.errors import (
-    ComponentUnknown,
-    CrsNotTaken,
-    DriveDeleted,
-    ExportActive,
-    ExportDeleted,
-    FilesMissing,
-    NotGeoreferenced,
-    UsedByJob,
-)
+from service.errors import ExportActive, ExportDeleted, UsedByJob
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 
 
 class ExportGoneError(Exception):
     """The export was deleted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportInputs:
-    """Inputs of an export.
-
-    Attributes
-    ----------
-    files
-        Of the scene, component or version, those that exports read.
-    drives
-        Ids of drives by the names of scenes; of a scene that is no map, by the empty name. None where no format has
-        images.
-    """
-
-    files: Sequence[StoredArtifact]
-    drives: Mapping[str, str]
-    formats: Sequence[str]
-    options: Mapping[str, Any]
 
 
 def create(
@@ -93,15 +55,9 @@ def create(
         409 where a drive whose images are needed was deleted; 422 where the scene or map has no such component, or
         lacks what a format needs; 413 and 429 as for all jobs.
     """
-    formats = sorted(set(asked.formats))
-    options = {"image_size_px": asked.image_size_px, "crs": asked.crs}
-    if asked.component is not None:
-        options["component"] = asked.component
-    _require_needs(subject, formats, options)
-    _require_files(session, subject, options)
-    drives = _require_drives(session, subject) if _needs_images(formats) else {}
-    inputs = _inputs_sha256(subject, formats, options)
-    known = _same(session, project_id, inputs)
+    inputs = ExportInputs.from_request(subject, asked)
+    inputs.require(session)
+    known = _same(session, project_id, inputs.sha256)
     if known is not None:
         return known, None
     export_id = new_id("exp")
@@ -110,7 +66,7 @@ def create(
         project_id=project_id,
         kind=JobKind.EXPORT,
         # A drive that a job names is not deleted meanwhile; those of a map are not, anyway.
-        drive_id=drives.get("") if isinstance(subject, Scene) else None,
+        drive_id=inputs.drives(session).get(""),
         expires_us=job_expires_us,
         request={"export_id": export_id},
     )
@@ -118,10 +74,10 @@ def create(
         id=export_id,
         project_id=project_id,
         job_id=job.id,
-        inputs_sha256=inputs,
-        formats=formats,
-        options=options,
-        **_source(subject),
+        inputs_sha256=inputs.sha256,
+        formats=list(inputs.formats),
+        options=dict(inputs.options),
+        **inputs.source,
     )
     session.add(export)
     session.flush()
@@ -143,7 +99,7 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     if export.job_id != job.id:
         raise ExportActive(f"job {export.job_id} makes export {export.id}", remedy="Look at that job.")
     if job.drive_id is not None and session.get(Drive, job.drive_id, with_for_update=True) is None:
-        raise _drive_deleted(job.drive_id)
+        raise drive_deleted(job.drive_id)
     new = jobs.create(
         session,
         project_id=job.project_id,
@@ -168,35 +124,7 @@ def inputs_of(session: Session, held: jobs.Claim) -> ExportInputs:
     export = session.get(Export, _export_id(held.request))
     if export is None:
         raise ExportGoneError(_export_id(held.request))
-    subject: Scene | MapVersion
-    if export.scene_id is not None:
-        subject = session.get_one(Scene, export.scene_id)
-    else:
-        subject = session.get_one(MapVersion, (export.map_id, export.map_version))
-    return ExportInputs(
-        files=_files(session, subject, export.options),
-        drives=_drives(session, subject) if _needs_images(export.formats) else {},
-        formats=export.formats,
-        options={name: value for name, value in export.options.items() if name != "component"},
-    )
-
-
-def _files(session: Session, subject: Scene | MapVersion, options: Mapping[str, Any]) -> list[StoredArtifact]:
-    """What is read of a scene, component or version, by its path in the folder that is exported."""
-    table: type[SceneFile] | type[MapFile] = SceneFile
-    if isinstance(subject, Scene):
-        mine = SceneFile.scene_id == subject.id
-    else:
-        table, mine = MapFile, (MapFile.map_id == subject.map_id) & (MapFile.number == subject.number)
-    number = options.get("component")
-    prefix = "" if number is None else f"{component_folder(number)}/"
-    statement = select(table.path, Blob.key).join(Blob, table.blob_id == Blob.id).where(mine).order_by(table.path)
-    found = session.execute(statement.where(table.path.startswith(prefix, autoescape=True))).all()
-    return [
-        StoredArtifact(path.removeprefix(prefix), key)
-        for path, key in found
-        if is_read_by_export(path.removeprefix(prefix))
-    ]
+    return ExportInputs.from_export(session, export)
 
 
 def publish(
@@ -288,93 +216,6 @@ def _active() -> Select[str]:
 
 def _export_id(request: Mapping[str, Any] | None) -> str:
     return str((request or {})["export_id"])
-
-
-def _needs_images(formats: Sequence[str]) -> bool:
-    return any(EXPORT_FORMATS[name].needs_images for name in formats)
-
-
-def _require_needs(subject: Scene | MapVersion, formats: Sequence[str], options: Mapping[str, Any]) -> None:
-    component = options.get("component")
-    figures = subject.summary if component is None else _component(subject, component)
-    needing = [name for name in formats if EXPORT_FORMATS[name].needs_place]
-    if needing and not figures["georeferenced"]:
-        raise NotGeoreferenced(
-            f"format {needing[0]} needs a place on the earth, and {_named(subject, options)} has none",
-            remedy="Leave the format out, or reconstruct the drive with GNSS.",
-        )
-    taking = [known.name for known in EXPORT_FORMATS.values() if known.takes_crs]
-    if options["crs"] is not None and not set(taking) & set(formats):
-        raise CrsNotTaken(
-            f"crs is given, and no format of {', '.join(formats)} takes one",
-            remedy=f"Leave it out; formats that take one: {', '.join(taking) or 'none'}.",
-        )
-
-
-def _component(subject: Scene | MapVersion, number: int) -> Mapping[str, Any]:
-    """The figures of a component that has a folder of its own."""
-    listed = subject.summary.get("components") or () if isinstance(subject, Scene) else ()
-    own = {each["component"]: each for each in listed if each["folder"] == component_folder(each["component"])}
-    if number not in own:
-        raise ComponentUnknown(
-            f"{_named(subject, {})} has no component {number} with files of its own",
-            remedy=f"Leave it out, or give one that has: {', '.join(map(str, sorted(own))) or 'there is none'}.",
-        )
-    found: Mapping[str, Any] = own[number]
-    return found
-
-
-def _require_files(session: Session, subject: Scene | MapVersion, options: Mapping[str, Any]) -> None:
-    read = EXPORTED_OF_SCENE if isinstance(subject, Scene) else EXPORTED_OF_MAP
-    missing = sorted(read - {file.path for file in _files(session, subject, options)})
-    if missing:
-        raise FilesMissing(
-            f"{_named(subject, options)} has no {missing[0]}, which exports read",
-            remedy="Another version of the service made it: make it again with this one.",
-        )
-
-
-def _require_drives(session: Session, subject: Scene | MapVersion) -> dict[str, str]:
-    drives = _drives(session, subject)
-    there = set(session.scalars(select(Drive.id).where(Drive.id.in_(drives.values())).with_for_update(read=True)))
-    for drive_id in drives.values():
-        if drive_id not in there:
-            raise _drive_deleted(drive_id)
-    return drives
-
-
-def _drive_deleted(drive_id: str) -> DriveDeleted:
-    return DriveDeleted(
-        f"drive {drive_id}, whose images are needed, was deleted", remedy="Ask for formats without images alone."
-    )
-
-
-def _drives(session: Session, subject: Scene | MapVersion) -> dict[str, str]:
-    """Ids of drives by the names of their scenes."""
-    if isinstance(subject, Scene):
-        return {"": subject.drive_id}
-    mine = (MapScene.map_id == subject.map_id) & (MapScene.number == subject.number)
-    return {scene.name: scene.drive_id for scene in session.scalars(select(MapScene).where(mine))}
-
-
-def _source(subject: Scene | MapVersion) -> dict[str, Any]:
-    if isinstance(subject, Scene):
-        return {"scene_id": subject.id}
-    return {"map_id": subject.map_id, "map_version": subject.number}
-
-
-def _named(subject: Scene | MapVersion, options: Mapping[str, Any]) -> str:
-    if not isinstance(subject, Scene):
-        return f"version {subject.number} of map {subject.map_id}"
-    return (
-        f"component {options['component']} of scene {subject.id}" if "component" in options else f"scene {subject.id}"
-    )
-
-
-def _inputs_sha256(subject: Scene | MapVersion, formats: Sequence[str], options: Mapping[str, Any]) -> str:
-    """Digest of all that the files are made of: scenes and versions never change, nor do committed drives."""
-    made_of = {**_source(subject), "formats": list(formats), **options, "version": version("mrasfm")}
-    return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
 
 
 def _same(session: Session, project_id: str, inputs: str) -> Export | None:

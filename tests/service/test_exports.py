@@ -10,6 +10,8 @@ import pytest
 from schemas.api.scenes import SceneComponent
 from service.database.tables import Export, Job, now_us
 from service.domain import exports, jobs
+from service.domain.export_inputs import ExportInputs
+from service.domain.map_inputs import StoredArtifact
 from tests.helpers import live_api
 from tests.helpers.live_api import MAP_FILES, SCENE_FILES, Client, forget_all, problem_of
 
@@ -34,14 +36,15 @@ def ask(client: Client, scene_id: str, status: int = 202, **asked: Any) -> dict[
     return dict(answer.json())
 
 
-def inputs_of(client: Client, asked: dict[str, Any]) -> exports.ExportInputs:
+def inputs_of(client: Client, asked: dict[str, Any]) -> tuple[ExportInputs, list[StoredArtifact], dict[str, str]]:
     """What a worker gets for an export that was asked for."""
     held = jobs.Claim(
         job_id=asked["job_id"], fence=1, attempt=1, project_id=client.project_id, kind="EXPORT", drive_id=None,
         map_id=None, settings={}, request={"export_id": asked["id"]},
     )  # fmt: skip
     with client.api.database.read() as session:
-        return exports.inputs_of(session, held)
+        inputs = exports.inputs_of(session, held)
+        return inputs, inputs.files(session), inputs.drives(session)
 
 
 def publish(client: Client, job_id: str, results: list[dict[str, Any]] = RESULTS) -> None:
@@ -163,9 +166,9 @@ def test_versions_of_maps(client: Client) -> None:
     asked = answer.json()
     assert (asked["map_id"], asked["map_version"], asked["scene_id"]) == (job["map_id"], 1, None)
     problem_of(client.delete(f"/v1/maps/{job['map_id']}"), 409, "used-by-job")
-    inputs = inputs_of(client, asked)
-    assert [file.path for file in inputs.files] == sorted(MAP_FILES)
-    assert len(inputs.drives) == 2
+    _, files, drives = inputs_of(client, asked)
+    assert [file.path for file in files] == sorted(MAP_FILES)
+    assert len(drives) == 2
     assert client.get(f"{url}/1/exports").json()["items"][0]["id"] == asked["id"]
     publish(client, asked["job_id"])
     assert client.post(f"{url}/1/exports", json={"formats": ["colmap"]}).status_code == 200
@@ -189,10 +192,10 @@ def test_components_of_a_scene(client: Client, monkeypatch: pytest.MonkeyPatch) 
     url = f"/v1/scenes/{scene_id}/exports"
     asked = ask(client, scene_id, formats=["kitti"], component=1)
     assert asked["component"] == 1
-    inputs = inputs_of(client, asked)
-    assert [file.path for file in inputs.files] == sorted(SCENE_FILES)
-    assert len({file.key for file in inputs.files}) == 1, "files of the component alone, which are all the same"
-    assert inputs.options == {"image_size_px": None, "crs": None}
+    inputs, files, _ = inputs_of(client, asked)
+    assert [file.path for file in files] == sorted(SCENE_FILES)
+    assert len({file.key for file in files}) == 1, "files of the component alone, which are all the same"
+    assert inputs.engine_options == {"image_size_px": None, "crs": None}
     assert ask(client, scene_id, formats=["kitti"])["id"] != asked["id"]
     assert ask(client, scene_id, 200, formats=["kitti"], component=1)["id"] == asked["id"]
     refused = problem_of(client.post(url, json={"formats": ["kitti"], "component": 2}), 422, "component-unknown")
