@@ -166,6 +166,7 @@ class Reconciler:
         unkept = IdempotencyKey.created_us < now - int(self._settings.idempotency_hours * _HOUR_US)
         self._in_batches(lambda session: _delete_some(session, unkept, IdempotencyKey.project_id, IdempotencyKey.key))
         with self._database.write() as session:
+            webhooks.forget_old_secrets(session)
             workers.forget(session, unseen_since_us=now - 30 * 24 * _HOUR_US)
 
     def _in_batches(self, step: Callable[[Session], int]) -> None:

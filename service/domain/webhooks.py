@@ -110,6 +110,12 @@ def rotate(webhook: Webhook) -> None:
     webhook.secret = new_secret()
 
 
+def forget_old_secrets(session: Session) -> None:
+    """Delete secrets that sign no more."""
+    over = Webhook.previous_until_us <= clock_us(session)
+    session.execute(update(Webhook).where(over).values(previous_secret=None, previous_until_us=None))
+
+
 def record(session: Session, job: Job) -> None:
     """Record the messages that a job has ended, in the transaction in which it ends."""
     event = _EVENTS.get(JobState(job.state))

@@ -100,6 +100,16 @@ def test_rotating_keeps_the_secret_before_for_a_day(client: Client, monkeypatch:
     assert taken[0].secrets == [rotated["secret"], made["secret"]]
     headers = webhooks.signed_headers(taken[0], timestamp_s=1)
     assert len(headers["webhook-signature"].split(" ")) == 2
+    with client.api.database.write() as session:
+        webhooks.forget_old_secrets(session)
+        webhook = session.get_one(Webhook, made["id"], populate_existing=True)
+        assert webhook.previous_secret == made["secret"]
+        webhook.previous_until_us = now_us() - 1
+    with client.api.database.write() as session:
+        webhooks.forget_old_secrets(session)
+        webhook = session.get_one(Webhook, made["id"], populate_existing=True)
+        assert (webhook.previous_secret, webhook.previous_until_us) == (None, None)
+        assert webhook.secret == rotated["secret"]
 
 
 def test_the_signature_is_that_of_standard_webhooks() -> None:
