@@ -372,7 +372,7 @@ class NotGeoreferenced(ServiceError, status=422):
 
 
 class ComponentUnknown(ServiceError, status=422):
-    """There is no such component."""
+    """The component has no files of its own."""
 
 
 class FilesMissing(ServiceError, status=422):

@@ -1,4 +1,4 @@
-"""What an export is made of: a scene, one of its components or a version of a map, in formats, with options."""
+"""Inputs of exports: a scene, one of its components or a version of a map, in formats, with options."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ExportInputs:
 
     @classmethod
     def from_request(cls, subject: Scene | MapVersion, asked: ExportRequest) -> ExportInputs:
-        """What is asked for."""
+        """Inputs of a request."""
         options: dict[str, Any] = {"image_size_px": asked.image_size_px, "crs": asked.crs}
         if asked.component is not None:
             options[_COMPONENT] = asked.component
@@ -50,7 +50,7 @@ class ExportInputs:
 
     @classmethod
     def from_export(cls, session: Session, export: Export) -> ExportInputs:
-        """What was asked for; a scene or version is there as long as its exports are."""
+        """Inputs of an export that is recorded; its scene or version is there as long as it is."""
         subject: Scene | MapVersion
         if export.scene_id is not None:
             subject = session.get_one(Scene, export.scene_id)
