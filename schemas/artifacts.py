@@ -113,12 +113,18 @@ def is_read_by_next_version(path: str) -> bool:
     return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))
 
 
-def is_read_by_export(path: str, formats: Collection[str]) -> bool:
-    """Return whether an export in these formats reads this file of a scene or map.
+# What every export reads; of a map besides calibration/NAME.json and SCENES_FOLDER/NAME.npz of each scene.
+_EXPORTED = (REPORT_FILE, "poses.json", "frame.json", "points.ply", "model/images.bin", "model/points3D.bin")
+EXPORTED_OF_SCENE = frozenset({*_EXPORTED, "manifest.json", "calibration.json"})
+EXPORTED_OF_MAP = frozenset({*_EXPORTED, MAP_FILE})
 
-    Of a scene's smaller components none is read; the picture of the road, which may be large, by its own format alone.
+
+def is_read_by_export(path: str, formats: Collection[str]) -> bool:
+    """Return whether an export in these formats reads this file of a scene or map, by its path in the folder that is
+    exported.
+
+    The picture of the road, which may be large, is read by its own format alone.
     """
-    files = (MAP_FILE, REPORT_FILE, "manifest.json", "poses.json", "calibration.json", "frame.json", "points.ply")
     folders = (f"{OWN_CAR_FOLDER}/", f"{SCENES_FOLDER}/", "calibration/")
-    others = ("model/images.bin", "model/points3D.bin", *([ROAD_TIFF_FILE] if "geotiff" in formats else []))
-    return path in files or path in others or path.startswith(folders)
+    others = {ROAD_TIFF_FILE} if "geotiff" in formats else set()
+    return path in EXPORTED_OF_SCENE | EXPORTED_OF_MAP | others or path.startswith(folders)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 MIN_IMAGE_SIZE_PX, MAX_IMAGE_SIZE_PX = 64, 20_000
 MAX_FORMATS = 32  # of one export
+MAX_COMPONENT = 100_000  # a drive has no more frames
 
 
 @dataclass(frozen=True, kw_only=True)

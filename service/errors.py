@@ -371,6 +371,14 @@ class NotGeoreferenced(ServiceError, status=422):
     """The result is not georeferenced."""
 
 
+class ComponentUnknown(ServiceError, status=422):
+    """The component has no files of its own."""
+
+
+class FilesMissing(ServiceError, status=422):
+    """The result lacks files that exports read."""
+
+
 class CrsNotTaken(ServiceError, status=422):
     """No format takes a coordinate reference system."""
 
@@ -392,6 +400,10 @@ class AddressRefused(ServiceError, status=422):
 
 class TooManyWebhooks(ServiceError, status=429):
     """The project has as many webhooks as it may."""
+
+
+class TooManyStreams(ServiceError, status=429):
+    """The project has as many event streams open as it may."""
 
 
 class DeliveryPending(ServiceError, status=409):

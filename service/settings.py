@@ -113,9 +113,10 @@ class Settings(BaseSettings):
     metrics_token: Token | None = Field(
         None, description="bearer token that Prometheus sends to read `/metrics`; by default anybody may read it"
     )
-    poll_seconds: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = Field(
+    poll_seconds: Annotated[float, Field(gt=0, le=2, allow_inf_nan=False)] = Field(
         1.0, description="an event stream checks for news, and whether its key is still valid, at this interval"
     )
+    max_event_streams: Count = Field(100, description="event streams of one project, in each process of the API")
 
     # Webhooks
     webhook_private_addresses: bool = Field(
@@ -180,7 +181,17 @@ class Settings(BaseSettings):
     )
     idempotency_hours: Hours = Field(24.0, description="answers to an `Idempotency-Key` are kept for this time")
 
-    @field_validator("metrics_token", "submap_workers", "console_tiles", mode="before")
+    @field_validator(
+        "metrics_token",
+        "submap_workers",
+        "console_tiles",
+        "drive_retention_days",
+        "scene_retention_days",
+        "map_retention_days",
+        "export_retention_days",
+        "job_retention_days",
+        mode="before",
+    )
     @classmethod
     def _is_given(cls, value: object) -> object:
         """Compose passes what nobody has set as an empty text."""

@@ -252,21 +252,22 @@ class ExportHandler:
         """
         with self._database.read() as session:
             inputs = exports.inputs_of(session, self._held)
-        source, drives = folder.root / "source", folder.root / "drives"
-        total = len(inputs.files) + len(inputs.drives)  # a drive counts as one until its files are known
-        wanted = [(source / file.path, file) for file in inputs.files]
+            files, drives = inputs.files(session), inputs.drives(session)
+        source = folder.root / "source"
+        total = len(files) + len(drives)  # a drive counts as one until its files are known
+        wanted = [(source / file.path, file) for file in files]
         _fetch_all(wanted, fetch, lambda done: progress(done, total))
         folders: dict[str, Path] = {}
-        for drive_id in sorted(set(inputs.drives.values())):
-            folders[drive_id] = drives / drive_id
+        for drive_id in sorted(set(drives.values())):
+            folders[drive_id] = folder.root / "drives" / drive_id
             materialise(self._database, drive_id, folders[drive_id], fetch=fetch, progress=progress)
         return Attempt(
             work=Work.EXPORT,
             settings=self._held.settings,
             source=source,
-            drives={name: folders[drive_id] for name, drive_id in inputs.drives.items()},
+            drives={name: folders[drive_id] for name, drive_id in drives.items()},
             formats=inputs.formats,
-            options=inputs.options,
+            options=inputs.engine_options,
         )
 
     def publish(

@@ -70,7 +70,7 @@ class Reconciler:
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
                 ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
-                ("webhooks", self.send_webhooks, self._settings.webhook_seconds, 0.0),
+                ("webhooks", lambda: self._webhooks.send_due(ended), self._settings.webhook_seconds, 0.0),
                 ("orphans", self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
             )
         ]
@@ -81,14 +81,14 @@ class Reconciler:
             thread.join(_END_WITHIN_S)  # what is cut short is done by the next one
 
     def _repeat(
-        self, ended: threading.Event, what: str, step: Callable[[], None], every_s: float, first_s: float
+        self, ended: threading.Event, what: str, step: Callable[[], object], every_s: float, first_s: float
     ) -> None:
         ended.wait(first_s)
         while not ended.is_set():
             self._try(what, step)
             ended.wait(every_s)
 
-    def _try(self, what: str, step: Callable[[], None]) -> None:
+    def _try(self, what: str, step: Callable[[], object]) -> None:
         try:
             step()
         except Exception:  # the next pass tries again
@@ -134,10 +134,6 @@ class Reconciler:
         with self._database.write() as session:
             jobs.mark_enqueued(session, [job.id for job in missing])
 
-    def send_webhooks(self) -> None:
-        """Send the messages of webhooks that are due."""
-        self._webhooks.send_due()
-
     def sweep(self) -> None:
         """Delete what has passed its retention date, and bytes that nothing needs."""
         self._try("retention", self._expire)
@@ -170,6 +166,7 @@ class Reconciler:
         unkept = IdempotencyKey.created_us < now - int(self._settings.idempotency_hours * _HOUR_US)
         self._in_batches(lambda session: _delete_some(session, unkept, IdempotencyKey.project_id, IdempotencyKey.key))
         with self._database.write() as session:
+            webhooks.forget_old_secrets(session)
             workers.forget(session, unseen_since_us=now - 30 * 24 * _HOUR_US)
 
     def _in_batches(self, step: Callable[[Session], int]) -> None:

@@ -1,37 +1,35 @@
-"""Sends the messages of webhooks, to addresses that were checked: the connection goes to what was looked up.
+"""Sends the messages of webhooks. Redirects are answers like others; proxies of the environment are not used.
 
-A name is resolved once for each connection. If one of its addresses is private, nothing is sent; else the connection is
-made to one of these addresses, so that a name server that answers differently the next time changes nothing. Redirects
-are answers like others, and none is followed; proxies of the environment are not used.
+One message at a time goes to each webhook, and some to each project: an address that takes long, or does not answer,
+holds up its own messages alone.
 """
 
 from __future__ import annotations
 
 import logging
-import socket
 import ssl
+import threading
 import time
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from importlib.metadata import version
-from typing import Any
 
 import httpcore
 
 from service.database.connections import Database
 from service.domain import webhooks
+from service.domain.webhook_addresses import require_url
 from service.domain.webhooks import Message, Outcome
+from service.errors import AddressRefused
 from service.settings import Settings
+from worker.checked_connections import AddressRefusedError, CheckedBackend
 
 log = logging.getLogger("mrasfm.webhooks")
 
 THREADS = 8
+OF_PROJECT = 2  # messages of one project that are sent at one time
 _CONNECT_S = 5.0
-_WITHIN_S = 15.0  # of a whole try: an address that answers a byte at a time holds nobody up
-
-
-class AddressRefusedError(Exception):
-    """The name leads to an address that is not told anything."""
+_WITHIN_S = 15.0  # of a whole try; well below `webhooks.TAKEN_US`
+_NEVER = threading.Event()
 
 
 class WebhookSender:
@@ -40,28 +38,42 @@ class WebhookSender:
     def __init__(self, settings: Settings, database: Database) -> None:
         self._database = database
         self._allow_private = settings.webhook_private_addresses
+        self._look_every_s = settings.webhook_seconds
         self._tls = ssl.create_default_context()
 
-    def send_due(self) -> int:
-        """Send what is due, several at one time; how many messages were tried."""
-        total = 0
-        with ThreadPoolExecutor(THREADS, thread_name_prefix="webhook") as pool:
-            while taken := self._take():
-                list(pool.map(self._send, taken))
-                total += len(taken)
-        return total
+    def send_due(self, ended: threading.Event = _NEVER) -> int:
+        """Send what is due until nothing is; how many messages were tried.
 
-    def _take(self) -> list[Message]:
+        Parameters
+        ----------
+        ended
+            Once it is set no more are begun. What is under way ends within seconds.
+        """
+        total, under_way = 0, dict[Future[None], Message]()
+        with ThreadPoolExecutor(THREADS, thread_name_prefix="webhook") as pool:
+            while True:
+                if not ended.is_set():
+                    under_way |= {pool.submit(self._send, each): each for each in self._take(list(under_way.values()))}
+                if not under_way:
+                    return total
+                # Others may become due while a slow one is under way.
+                done, _ = wait(under_way, timeout=self._look_every_s, return_when=FIRST_COMPLETED)
+                for sent in done:
+                    del under_way[sent]
+                    sent.result()
+                    total += 1
+
+    def _take(self, under_way: list[Message]) -> list[Message]:
+        free = THREADS - len(under_way)
         with self._database.read() as session:
-            if not webhooks.is_any_due(session):
+            if not free or not webhooks.is_any_due(session):
                 return []
         with self._database.write() as session:
-            return webhooks.take(session, limit=THREADS)
+            return webhooks.take(session, limit=free, of_project=OF_PROJECT, under_way=under_way)
 
     def _send(self, message: Message) -> None:
         outcome = self._try(message)
-        with self._database.write() as session:
-            webhooks.note(session, message, outcome)
+        self._database.transact(lambda session: webhooks.note(session, message, outcome))
         fields = {"delivery": message.id, "attempt": message.attempts, "status": outcome.status, "why": outcome.error}
         if outcome.is_delivered:
             log.info("webhook delivered", extra={"fields": fields})
@@ -78,10 +90,10 @@ class WebhookSender:
         }
         content = message.body.encode()
         headers["content-length"] = str(len(content))
-        deadline_s = time.monotonic() + _WITHIN_S
-        backend = _CheckedBackend(allow_private=self._allow_private, deadline_s=deadline_s)
+        backend = CheckedBackend(allow_private=self._allow_private, deadline_s=time.monotonic() + _WITHIN_S)
         timeouts = {"connect": _CONNECT_S, "read": _WITHIN_S, "write": _WITHIN_S, "pool": _CONNECT_S}
         try:
+            require_url(message.url, allow_private=self._allow_private)  # the operator may have changed what is allowed
             with (
                 httpcore.ConnectionPool(ssl_context=self._tls, network_backend=backend, retries=0) as pool,
                 pool.stream(
@@ -94,86 +106,12 @@ class WebhookSender:
             ):
                 status = int(answer.status)
         except AddressRefusedError as error:
+            log.warning("webhook refused", extra={"fields": {"delivery": message.id, "addresses": error.addresses}})
             return Outcome(error=str(error))
+        except AddressRefused as error:
+            return Outcome(error=error.problem.detail)
         except Exception as error:  # httpcore lets errors of sockets, of TLS and of h11 through
             return Outcome(error=f"{type(error).__name__}: {error}".rstrip(": "))
         if 300 <= status < 400:
             return Outcome(status=status, error="a redirect is not followed")
         return Outcome(status=status, error=None if 200 <= status < 300 else f"answered {status}")
-
-
-class _CheckedBackend(httpcore.NetworkBackend):
-    """Connections to addresses that were looked up and checked, up to a deadline."""
-
-    def __init__(self, *, allow_private: bool, deadline_s: float) -> None:
-        self._allow_private, self._deadline_s = allow_private, deadline_s
-        self._inner = httpcore.SyncBackend()
-
-    def connect_tcp(
-        self,
-        host: str,
-        port: int,
-        timeout: float | None = None,
-        local_address: str | None = None,
-        socket_options: Iterable[Any] | None = None,
-    ) -> httpcore.NetworkStream:
-        """Connect to the first of the name's addresses that answers, where all of them are public."""
-        addresses = resolved(host, port)
-        refused = [] if self._allow_private else [a for a in addresses if not webhooks.is_public(a)]
-        if refused or not addresses:
-            what = f"leads to {refused[0]}, an address of a private network" if refused else "has no address"
-            raise AddressRefusedError(f"{host} {what}")
-        failed: Exception | None = None
-        for address in addresses:
-            try:
-                stream = self._inner.connect_tcp(address, port, timeout=_left(self._deadline_s, timeout))
-                return _BoundedStream(stream, self._deadline_s)
-            except (httpcore.ConnectError, httpcore.ConnectTimeout) as error:
-                failed = error
-        assert failed is not None
-        raise failed
-
-
-def resolved(host: str, port: int) -> list[str]:
-    """Addresses of a name, each once."""
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    return list(dict.fromkeys(str(address[0]) for *_, address in found))
-
-
-class _BoundedStream(httpcore.NetworkStream):
-    """A connection whose steps end by a deadline."""
-
-    def __init__(self, inner: httpcore.NetworkStream, deadline_s: float) -> None:
-        self._inner, self._deadline_s = inner, deadline_s
-
-    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
-        return self._inner.read(max_bytes, timeout=_left(self._deadline_s, timeout))
-
-    def write(self, buffer: bytes, timeout: float | None = None) -> None:
-        self._inner.write(buffer, timeout=_left(self._deadline_s, timeout))
-
-    def close(self) -> None:
-        self._inner.close()
-
-    def start_tls(
-        self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
-    ) -> httpcore.NetworkStream:
-        inner = self._inner.start_tls(ssl_context, server_hostname, timeout=_left(self._deadline_s, timeout))
-        return _BoundedStream(inner, self._deadline_s)
-
-    def get_extra_info(self, info: str) -> Any:
-        return self._inner.get_extra_info(info)
-
-
-def _left(deadline_s: float, timeout_s: float | None) -> float:
-    """Seconds that a step has.
-
-    Raises
-    ------
-    httpcore.ReadTimeout
-        Where none is left.
-    """
-    left_s = deadline_s - time.monotonic()
-    if left_s <= 0.0:
-        raise httpcore.ReadTimeout(f"no answer within {_WITHIN_S:g} s")
-    return left_s if timeout_s is None else min(left_s, timeout_s)

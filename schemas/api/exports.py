@@ -20,7 +20,7 @@ from schemas.api.resource import (
     Resource,
     Times,
 )
-from schemas.exports import EXPORT_FORMATS, MAX_FORMATS, MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
+from schemas.exports import EXPORT_FORMATS, MAX_COMPONENT, MAX_FORMATS, MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
 
 
 def _known(name: str) -> str:
@@ -47,6 +47,11 @@ class ExportRequest(RequestBody):
     )
     crs: Crs | None = Field(
         None, description="coordinate reference system of formats that take one; null: the format's own"
+    )
+    component: Annotated[int, Field(ge=1, le=MAX_COMPONENT, strict=True)] | None = Field(
+        None,
+        description="number of the scene's component that is wanted in its place, of those whose `folder` is "
+        "`components/N`; null: the scene itself. A map has none",
     )
 
 
@@ -98,6 +103,7 @@ class ExportResource(Times):
                     "formats": ["colmap"],
                     "image_size_px": 1600,
                     "crs": None,
+                    "component": None,
                     "job_id": EXAMPLE_JOB,
                     "state": "SUCCEEDED",
                     "problem": None,
@@ -117,6 +123,7 @@ class ExportResource(Times):
     formats: list[str] = Field(description="as asked, each once, sorted")
     image_size_px: int | None = Field(None, description="as asked")
     crs: str | None = Field(None, description="as asked")
+    component: int | None = Field(None, description="as asked")
     job_id: str = Field(description="the job that makes it; poll it, cancel it, retry it there")
     state: JobState = Field(description="of that job")
     problem: Problem | None = Field(None, description="why that job failed")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import anyio
 
+from service.api.http.event_streams import EventStreams
 from service.api.http.fair_places import FairPlaces
 from service.database.connections import Database
 from service.domain.keys import KeyRing
@@ -35,6 +36,7 @@ class Context:
     disk: anyio.CapacityLimiter  # uploads that write at one time
     large_bodies: FairPlaces  # JSON bodies that are in memory at one time
     large_documents: FairPlaces  # of these, what is parsed and recorded at one time
+    streams: EventStreams
     # Of their own, so that what takes minutes leaves the threads of all other requests alone.
     commits: anyio.CapacityLimiter
     unpacking: anyio.CapacityLimiter
@@ -56,6 +58,7 @@ class Context:
                 _LARGE_BODIES, per_project=_LARGE_BODIES // 2, waiting_per_project=_LARGE_BODIES_WAITING
             ),
             large_documents=FairPlaces(1, per_project=1, waiting_per_project=_LARGE_BODIES),
+            streams=EventStreams(settings.max_event_streams),
             commits=anyio.CapacityLimiter(_COMMITS),
             unpacking=anyio.CapacityLimiter(_UNPACKING),
         )

@@ -36,11 +36,29 @@ def secret_of(request: Request) -> str | None:
 
 
 def _require_same_origin(request: Request) -> None:
+    if not _is_same_origin(request):
+        raise ForeignOrigin(
+            "a request that changes something carries the console's cookie, and does not come from a page of this host",
+            remedy="Use the console's own page or send an API key; a proxy in front of the service has to pass on "
+            "Host as it came, with its port.",
+        )
+
+
+def _is_same_origin(request: Request) -> bool:
+    # Scripts can set neither of the two headers. The first compares schemes as well and knows nothing of proxies, but
+    # browsers leave it out where there is no TLS.
+    site = request.headers.get("sec-fetch-site")
+    if site is not None:
+        return site == "same-origin"
     origin, host = urlsplit(request.headers.get("origin", "")), request.headers.get("host", "")
     port = _DEFAULT_PORTS.get(origin.scheme, "")
-    if not origin.netloc or origin.netloc.lower().removesuffix(port) != host.lower().removesuffix(port):
-        raise ForeignOrigin(
-            "a request that changes something carries the console's cookie, and no Origin of this host",
-            remedy="Use the console's own page or send an API key; a proxy in front of the service has to pass on "
-            "Host as it came.",
-        )
+    return bool(origin.netloc) and origin.netloc.lower().removesuffix(port) == host.lower().removesuffix(port)
+
+
+def is_encrypted(request: Request) -> bool:
+    """Return whether the client's connection has TLS, as the first of the proxies in between says.
+
+    Whoever claims it for a request of its own gets a cookie that its browser does not send back without TLS.
+    """
+    first = request.headers.get("x-forwarded-proto", "").partition(",")[0].strip().lower()
+    return "https" in (request.url.scheme, first)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated
@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 
 from service.api.context import Context
 from service.api.credentials import secret_of
+from service.api.http.event_streams import EventStream
 from service.api.http.paging import MAX_CURSOR_CHARACTERS, MAX_LIMIT
 from service.api.http.request_bodies import request_sha256
 from service.database.tables import Job
@@ -78,6 +79,21 @@ _api_key = _ApiKey(
     auto_error=False, scheme_name="HTTPBearer", description="An API key: `Authorization: Bearer mrasfm_...`"
 )
 CallerDep = Annotated[Caller, Depends(_api_key)]
+
+
+async def get_event_stream(context: ContextDep, caller: CallerDep, request: Request) -> AsyncIterator[EventStream]:
+    """The event stream that answers this request.
+
+    Raises
+    ------
+    ServiceError
+        429 where the project has as many open as it may.
+    """
+    async with context.streams.opened(request, caller.project_id) as stream:
+        yield stream
+
+
+StreamDep = Annotated[EventStream, Depends(get_event_stream)]
 
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items a page")]
 LastEventId = Annotated[

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import version
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
@@ -43,7 +43,11 @@ class FolderViewError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class DriveFolder:
-    """The images of a drive."""
+    """The images of a drive.
+
+    Names in its manifest lie inside the folder. Links of the file system are followed: images are often kept elsewhere,
+    and whoever has put a link there may read what it leads to.
+    """
 
     name: str
     folder: Path
@@ -60,9 +64,16 @@ class DriveFolder:
         manifest = _document(folder / "drive.json")
         try:
             images = {image["file"] for frame in manifest["frames"] for image in frame["images"].values()}
-            return cls(name=str(manifest["name"]), folder=folder.resolve(), images=frozenset(images))
+            outside = sorted(path for path in images if not _is_inside(path))
+            name = str(manifest["name"])
         except (KeyError, TypeError, AttributeError) as error:
             raise FolderViewError(f"{folder / 'drive.json'} is no manifest: check it with mrasfm preflight.") from error
+        if outside:
+            raise FolderViewError(
+                f"{folder / 'drive.json'} names {outside[0]}, which is not in its folder. Correct it: the command "
+                "mrasfm preflight lists all such names."
+            )
+        return cls(name=name, folder=folder.resolve(), images=frozenset(images))
 
 
 def create_view(folder: Path, drives: Sequence[DriveFolder] = ()) -> tuple[FastAPI, str]:
@@ -224,6 +235,11 @@ def _add_images(app: FastAPI, drives: Sequence[DriveFolder]) -> None:
     def download(drive_id: str, path: str) -> Response:
         drive = {f"drive-{number}": drive for number, drive in enumerate(drives)}.get(drive_id)
         return _sent(drive.folder / path if drive is not None and path in drive.images else None, path)
+
+
+def _is_inside(path: str) -> bool:
+    parts = PurePosixPath(path)
+    return not parts.is_absolute() and ".." not in parts.parts
 
 
 def _sent(file: Path | None, path: str) -> Response:

@@ -11,9 +11,11 @@ from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
+from schemas.api.webhooks import DeliveryState
 from service.database.connections import Database
-from service.database.tables import Job, JobState, Project, WorkerSeen, now_us
+from service.database.tables import Job, JobState, Project, WebhookDelivery, WorkerSeen, now_us
 from service.domain.workers import ONLINE_US
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -55,9 +57,9 @@ class _Records(Collector):
         return iter(())
 
     def collect(self) -> Iterator[Metric]:
-        """Jobs by state, workers online, bytes stored; without a database, only that it does not answer."""
+        """Counts of what is recorded; without a database, only that it does not answer."""
         try:
-            states, workers, used = self._counts()
+            states, messages, workers, used = self._counts()
         except SQLAlchemyError:
             yield GaugeMetricFamily("mrasfm_database_up", "Whether the database answers", value=0)
             return
@@ -66,14 +68,23 @@ class _Records(Collector):
         for state in JobState:
             jobs.add_metric([state], states.get(state, 0))
         yield jobs
+        webhooks = GaugeMetricFamily(
+            "mrasfm_webhook_messages", "Messages of webhooks by state, of the last month", labels=["state"]
+        )
+        for message_state in DeliveryState:
+            webhooks.add_metric([message_state], messages.get(message_state, 0))
+        yield webhooks
         yield GaugeMetricFamily("mrasfm_workers_online", "Workers that reported lately", value=workers)
         yield GaugeMetricFamily("mrasfm_stored_bytes", "Bytes in the artifact store", value=used)
 
-    def _counts(self) -> tuple[dict[str, int], int, int]:
+    def _counts(self) -> tuple[dict[str, int], dict[str, int], int, int]:
         with self._database.read() as session:
-            by_state = select(Job.state, func.count()).group_by(Job.state)
-            states: dict[str, int] = {row[0]: row[1] for row in session.execute(by_state)}
+            states, messages = _by_state(session, Job.state), _by_state(session, WebhookDelivery.state)
             seen = WorkerSeen.seen_us > now_us() - ONLINE_US
             workers = session.scalar(select(func.count()).select_from(WorkerSeen).where(seen)) or 0
             used = session.scalar(select(func.coalesce(func.sum(Project.used_bytes), 0))) or 0
-        return states, workers, int(used)
+        return states, messages, workers, int(used)
+
+
+def _by_state(session: Session, state: InstrumentedAttribute[str]) -> dict[str, int]:
+    return {row[0]: row[1] for row in session.execute(select(state, func.count()).group_by(state))}

@@ -63,6 +63,7 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     )
     parser.add_argument("--image-size", type=int, metavar="PX", help="scale images down to this longest side")
     parser.add_argument("--crs", metavar="EPSG:CODE", help="coordinate reference system, for formats that take one")
+    parser.add_argument("--component", type=int, metavar="N", help="of a scene: export its components/N in its place")
     parser.add_argument("--out", type=Path, metavar="OUT", help="folder for its files; waits for them")
     parser = _command(subparsers, "webhook", "register an address that is told when jobs end", _webhook)
     parser.add_argument("address", metavar="ADDRESS", help="https address that takes POST requests")
@@ -244,7 +245,12 @@ def _asked(arguments: argparse.Namespace) -> ExportRequest:
     from service.client import ClientError
 
     try:
-        return ExportRequest(formats=arguments.formats, image_size_px=arguments.image_size, crs=arguments.crs)
+        return ExportRequest(
+            formats=arguments.formats,
+            image_size_px=arguments.image_size,
+            crs=arguments.crs,
+            component=arguments.component,
+        )
     except ValidationError as error:
         first = error.errors()[0]
         option = {"image_size_px": "image-size", "formats": "format"}.get(str(first["loc"][0]), first["loc"][0])

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, delete, or_, select
@@ -14,59 +10,28 @@ from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobKind
-from schemas.artifacts import is_read_by_export
-from schemas.exports import EXPORT_FORMATS
 from service.database.tables import (
     TERMINAL,
-    Blob,
     Drive,
     Export,
     ExportFile,
     Job,
     JobState,
-    MapFile,
-    MapScene,
     MapVersion,
     Scene,
-    SceneFile,
     new_id,
+    now_us,
 )
 from service.domain import jobs
-from service.domain.map_inputs import StoredArtifact
+from service.domain.export_inputs import ExportInputs, drive_deleted
 from service.domain.scenes import media_type
-from service.errors import (
-    CrsNotTaken,
-    DriveDeleted,
-    ExportActive,
-    ExportDeleted,
-    NotGeoreferenced,
-    UsedByJob,
-)
+from service.errors import ExportActive, ExportDeleted, UsedByJob
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 
 
 class ExportGoneError(Exception):
     """The export was deleted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportInputs:
-    """Inputs of an export.
-
-    Attributes
-    ----------
-    files
-        Of the scene or version, those that exports read.
-    drives
-        Ids of drives by the names of scenes; of a scene that is no map, by the empty name. None where no format has
-        images.
-    """
-
-    files: Sequence[StoredArtifact]
-    drives: Mapping[str, str]
-    formats: Sequence[str]
-    options: Mapping[str, Any]
 
 
 def create(
@@ -87,15 +52,12 @@ def create(
     Raises
     ------
     ServiceError
-        409 where a drive whose images are needed was deleted; 422 where the scene or map lacks what a format needs;
-        413 and 429 as for all jobs.
+        409 where a drive whose images are needed was deleted; 422 where the scene or map has no such component, or
+        lacks what a format needs; 413 and 429 as for all jobs.
     """
-    formats = sorted(set(asked.formats))
-    options = {"image_size_px": asked.image_size_px, "crs": asked.crs}
-    _require_needs(subject, formats, options)
-    drives = _require_drives(session, subject) if _needs_images(formats) else {}
-    inputs = _inputs_sha256(subject, formats, options)
-    known = _same(session, project_id, inputs)
+    inputs = ExportInputs.from_request(subject, asked)
+    inputs.require(session)
+    known = _same(session, project_id, inputs.sha256)
     if known is not None:
         return known, None
     export_id = new_id("exp")
@@ -104,7 +66,7 @@ def create(
         project_id=project_id,
         kind=JobKind.EXPORT,
         # A drive that a job names is not deleted meanwhile; those of a map are not, anyway.
-        drive_id=drives.get("") if isinstance(subject, Scene) else None,
+        drive_id=inputs.drives(session).get(""),
         expires_us=job_expires_us,
         request={"export_id": export_id},
     )
@@ -112,10 +74,10 @@ def create(
         id=export_id,
         project_id=project_id,
         job_id=job.id,
-        inputs_sha256=inputs,
-        formats=formats,
-        options=options,
-        **_source(subject),
+        inputs_sha256=inputs.sha256,
+        formats=list(inputs.formats),
+        options=dict(inputs.options),
+        **inputs.source,
     )
     session.add(export)
     session.flush()
@@ -137,7 +99,7 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     if export.job_id != job.id:
         raise ExportActive(f"job {export.job_id} makes export {export.id}", remedy="Look at that job.")
     if job.drive_id is not None and session.get(Drive, job.drive_id, with_for_update=True) is None:
-        raise _drive_deleted(job.drive_id)
+        raise drive_deleted(job.drive_id)
     new = jobs.create(
         session,
         project_id=job.project_id,
@@ -162,22 +124,7 @@ def inputs_of(session: Session, held: jobs.Claim) -> ExportInputs:
     export = session.get(Export, _export_id(held.request))
     if export is None:
         raise ExportGoneError(_export_id(held.request))
-    if export.scene_id is not None:
-        table: type[SceneFile] | type[MapFile] = SceneFile
-        mine: ColumnElement[bool] = SceneFile.scene_id == export.scene_id
-        subject: Scene | MapVersion = session.get_one(Scene, export.scene_id)
-    else:
-        table, mine = MapFile, (MapFile.map_id == export.map_id) & (MapFile.number == export.map_version)
-        subject = session.get_one(MapVersion, (export.map_id, export.map_version))
-    statement = select(table.path, Blob.key).join(Blob, table.blob_id == Blob.id).where(mine).order_by(table.path)
-    stored, formats = session.execute(statement), export.formats
-    files = [StoredArtifact(path, key) for path, key in stored if is_read_by_export(path, formats)]
-    return ExportInputs(
-        files=files,
-        drives=_drives(session, subject) if _needs_images(export.formats) else {},
-        formats=export.formats,
-        options=export.options,
-    )
+    return ExportInputs.from_export(session, export)
 
 
 def publish(
@@ -258,7 +205,8 @@ def forget_expired(session: Session, now: int, *, limit: int = 20) -> int:
     active = of_job.where(Job.state.not_in(TERMINAL)).exists()
     ripe = or_((Export.expires_us < now) & ~active, Export.results.is_(None) & ~of_job.exists())
     found = session.scalars(select(Export.id).where(ripe).order_by(Export.id).limit(limit).with_for_update()).all()
-    dropped = delete(Export).where(Export.id.in_(found)).execution_options(synchronize_session=False)
+    # Asked again under the locks: one that is retried at this moment has a job by now.
+    dropped = delete(Export).where(Export.id.in_(found), ripe).execution_options(synchronize_session=False)
     return int(session.execute(dropped).rowcount)  # type: ignore[attr-defined]
 
 
@@ -270,67 +218,10 @@ def _export_id(request: Mapping[str, Any] | None) -> str:
     return str((request or {})["export_id"])
 
 
-def _needs_images(formats: Sequence[str]) -> bool:
-    return any(EXPORT_FORMATS[name].needs_images for name in formats)
-
-
-def _require_needs(subject: Scene | MapVersion, formats: Sequence[str], options: Mapping[str, Any]) -> None:
-    needing = [name for name in formats if EXPORT_FORMATS[name].needs_place]
-    if needing and not subject.summary["georeferenced"]:
-        raise NotGeoreferenced(
-            f"format {needing[0]} needs a place on the earth, and {_named(subject)} has none",
-            remedy="Leave the format out, or reconstruct the drive with GNSS.",
-        )
-    taking = [known.name for known in EXPORT_FORMATS.values() if known.takes_crs]
-    if options["crs"] is not None and not set(taking) & set(formats):
-        raise CrsNotTaken(
-            f"crs is given, and no format of {', '.join(formats)} takes one",
-            remedy=f"Leave it out; formats that take one: {', '.join(taking) or 'none'}.",
-        )
-
-
-def _require_drives(session: Session, subject: Scene | MapVersion) -> dict[str, str]:
-    drives = _drives(session, subject)
-    there = set(session.scalars(select(Drive.id).where(Drive.id.in_(drives.values())).with_for_update(read=True)))
-    for drive_id in drives.values():
-        if drive_id not in there:
-            raise _drive_deleted(drive_id)
-    return drives
-
-
-def _drive_deleted(drive_id: str) -> DriveDeleted:
-    return DriveDeleted(
-        f"drive {drive_id}, whose images are needed, was deleted", remedy="Ask for formats without images alone."
-    )
-
-
-def _drives(session: Session, subject: Scene | MapVersion) -> dict[str, str]:
-    """Ids of drives by the names of their scenes."""
-    if isinstance(subject, Scene):
-        return {"": subject.drive_id}
-    mine = (MapScene.map_id == subject.map_id) & (MapScene.number == subject.number)
-    return {scene.name: scene.drive_id for scene in session.scalars(select(MapScene).where(mine))}
-
-
-def _source(subject: Scene | MapVersion) -> dict[str, Any]:
-    if isinstance(subject, Scene):
-        return {"scene_id": subject.id}
-    return {"map_id": subject.map_id, "map_version": subject.number}
-
-
-def _named(subject: Scene | MapVersion) -> str:
-    return f"scene {subject.id}" if isinstance(subject, Scene) else f"version {subject.number} of map {subject.map_id}"
-
-
-def _inputs_sha256(subject: Scene | MapVersion, formats: Sequence[str], options: Mapping[str, Any]) -> str:
-    """Digest of all that the files are made of: scenes and versions never change, nor do committed drives."""
-    made_of = {**_source(subject), "formats": list(formats), **options, "version": version("mrasfm")}
-    return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
-
-
 def _same(session: Session, project_id: str, inputs: str) -> Export | None:
-    """An export of the same that is there with all formats, or will be."""
+    """An export of the same that is there with all formats, or will be; not one that is deleted at any moment."""
     same = (Export.project_id == project_id) & (Export.inputs_sha256 == inputs)
+    same &= Export.expires_us.is_(None) | (Export.expires_us > now_us())
     for export in session.scalars(select(Export).where(same).order_by(Export.created_us.desc())):
         if export.results is not None:
             if not any(result.get("withheld") for result in export.results):

@@ -9,26 +9,28 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
-import ipaddress
 import json
 import random
 import secrets
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from typing import Any
-from urllib.parse import urlsplit
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
 from schemas.api.webhooks import DeliveryState, WebhookEvent, WebhookRequest
+from service.database.connections import clock_us
 from service.database.tables import Job, JobState, Project, Webhook, WebhookDelivery, now_us
-from service.errors import AddressRefused, DeliveryPending, TooManyWebhooks, not_found
+from service.domain.webhook_addresses import require_url
+from service.errors import DeliveryPending, TooManyWebhooks, not_found
 
 MAX_OF_PROJECT = 20
+MAX_PENDING = 10_000  # messages of one webhook: what does not answer for days shall not fill the database
 SECRET_PREFIX = "whsec_"
 _SECRET_BYTES = 32
 ROTATION_US = 24 * 3600 * 1_000_000  # how long the secret before signs as well
@@ -50,6 +52,7 @@ class Message:
 
     id: str
     webhook_id: str
+    project_id: str
     url: str
     body: str
     secrets: Sequence[str]
@@ -96,54 +99,6 @@ def create(session: Session, *, project_id: str, asked: WebhookRequest, allow_pr
     return webhook
 
 
-def require_url(url: str, *, allow_private: bool) -> None:
-    """Refuse an address that is never told anything; what its name resolves to is looked at before each message.
-
-    Raises
-    ------
-    AddressRefused
-    """
-    try:
-        parts = urlsplit(url)
-        host, _ = parts.hostname or "", parts.port
-    except ValueError as error:
-        raise AddressRefused(f"url {url!r} is not one: {error}", remedy="Correct it.") from None
-    if not host or parts.username or parts.password or parts.fragment:
-        raise AddressRefused(
-            "the url has no host, or has a user, a password or a fragment", remedy="Give scheme, host and path alone."
-        )
-    if parts.scheme != "https" and not allow_private:
-        raise AddressRefused("the url is not encrypted", remedy="Give an https url.")
-    literal = _address_of(host)
-    if not allow_private and (host == "localhost" or (literal is not None and not is_public(host))):
-        raise AddressRefused(
-            f"{host} is an address of a private network", remedy="Give an address that is reached from the internet."
-        )
-
-
-def is_public(address: str) -> bool:
-    """Return whether an address is one of the internet, also where one of IPv4 is written as one of IPv6."""
-    found = _address_of(address)
-    if found is None or found.is_multicast or not found.is_global:
-        return False
-    if isinstance(found, ipaddress.IPv6Address):
-        inner = [found.ipv4_mapped, found.sixtofour, *(found.teredo or ())]
-        if found in _NAT64:
-            inner.append(ipaddress.IPv4Address(int(found) & 0xFFFFFFFF))
-        return all(is_public(str(address)) for address in inner if address is not None)
-    return True
-
-
-_NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
-
-
-def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return None
-
-
 def new_secret() -> str:
     """A secret in the form of Standard Webhooks."""
     return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode("ascii")
@@ -155,27 +110,45 @@ def rotate(webhook: Webhook) -> None:
     webhook.secret = new_secret()
 
 
+def forget_old_secrets(session: Session) -> None:
+    """Delete secrets that sign no more."""
+    over = Webhook.previous_until_us <= clock_us(session)
+    session.execute(update(Webhook).where(over).values(previous_secret=None, previous_until_us=None))
+
+
 def record(session: Session, job: Job) -> None:
     """Record the messages that a job has ended, in the transaction in which it ends."""
     event = _EVENTS.get(JobState(job.state))
     if event is None or job.kind == JobKind.SUBMAP:
         return
     mine = (Webhook.project_id == job.project_id) & Webhook.disabled_us.is_(None)
-    now = now_us()
-    for webhook in session.scalars(select(Webhook).where(mine)):
-        if event not in webhook.events:
-            continue
+    # One that is deleted at this moment is gone, or waits: else the message, and with it the job's end, would fail.
+    found = session.scalars(select(Webhook).where(mine).with_for_update(read=True, key_share=True)).all()
+    wanting = [webhook for webhook in found if event in webhook.events]
+    if not wanting:
+        return
+    now = clock_us(session)
+    body = _body(event, job, now)
+    for webhook in wanting:
+        is_full = _is_full(session, webhook)
         session.add(
             WebhookDelivery(
                 webhook_id=webhook.id,
                 job_id=job.id,
                 event=event,
-                body=_body(event, job, now),
-                state=DeliveryState.PENDING,
+                body=body,
+                state=DeliveryState.FAILED if is_full else DeliveryState.PENDING,
+                error=f"{MAX_PENDING} messages were pending" if is_full else None,
                 next_us=now,
                 created_us=now,
             )
         )
+
+
+def _is_full(session: Session, webhook: Webhook) -> bool:
+    pending = (WebhookDelivery.webhook_id == webhook.id) & (WebhookDelivery.state == DeliveryState.PENDING)
+    some = select(WebhookDelivery.id).where(pending).limit(MAX_PENDING).subquery()
+    return session.scalar(select(func.count()).select_from(some)) == MAX_PENDING
 
 
 def _body(event: WebhookEvent, job: Job, now: int) -> str:
@@ -197,33 +170,72 @@ def _body(event: WebhookEvent, job: Job, now: int) -> str:
 
 def is_any_due(session: Session) -> bool:
     """Return whether there is a message to send."""
-    due = (WebhookDelivery.state == DeliveryState.PENDING) & (WebhookDelivery.next_us <= now_us())
-    return session.scalar(select(WebhookDelivery.id).where(due).limit(1)) is not None
+    return session.scalar(select(WebhookDelivery.id).where(_due(clock_us(session))).limit(1)) is not None
 
 
-def take(session: Session, *, limit: int) -> list[Message]:
-    """Take messages that are due; nobody else gets them for a while."""
-    now = now_us()
-    due = (WebhookDelivery.state == DeliveryState.PENDING) & (WebhookDelivery.next_us <= now)
-    statement = select(WebhookDelivery, Webhook).join(Webhook, Webhook.id == WebhookDelivery.webhook_id).where(due)
-    statement = statement.order_by(WebhookDelivery.next_us).limit(limit)
-    taken = []
-    for delivery, webhook in session.execute(
-        statement.with_for_update(skip_locked=True, of=WebhookDelivery).execution_options(populate_existing=True)
-    ):
-        delivery.attempts += 1
-        delivery.next_us = now + TAKEN_US
-        taken.append(
-            Message(
-                id=delivery.id,
-                webhook_id=webhook.id,
-                url=webhook.url,
-                body=delivery.body,
-                secrets=_secrets(webhook, now),
-                attempts=delivery.attempts,
-            )
-        )
+def _due(now: int) -> ColumnElement[bool]:
+    return (WebhookDelivery.state == DeliveryState.PENDING) & (WebhookDelivery.next_us <= now)
+
+
+def take(
+    session: Session, *, limit: int, of_project: int = MAX_OF_PROJECT, under_way: Sequence[Message] = ()
+) -> list[Message]:
+    """Take messages that are due, one of each webhook; nobody else gets them for a while.
+
+    Parameters
+    ----------
+    limit
+        How many at most.
+    of_project
+        How many of one project at most, with those under way.
+    under_way
+        What the caller is sending: their webhooks wait.
+    """
+    now = clock_us(session)
+    of_projects = Counter(message.project_id for message in under_way)
+    waiting = (
+        select(Webhook.id, Webhook.project_id)
+        .join(WebhookDelivery, WebhookDelivery.webhook_id == Webhook.id)
+        .where(_due(now), Webhook.id.not_in([message.webhook_id for message in under_way]))
+        .group_by(Webhook.id, Webhook.project_id)
+        .order_by(func.min(WebhookDelivery.next_us))
+    )
+    taken: list[Message] = []
+    for webhook_id, project_id in session.execute(waiting).all():
+        if len(taken) == limit:
+            break
+        message = _take_first(session, webhook_id, now) if of_projects[project_id] < of_project else None
+        if message is not None:
+            of_projects[project_id] += 1
+            taken.append(message)
     return taken
+
+
+def _take_first(session: Session, webhook_id: str, now: int) -> Message | None:
+    statement = (
+        select(WebhookDelivery, Webhook)
+        .join(Webhook, Webhook.id == WebhookDelivery.webhook_id)
+        .where(_due(now), WebhookDelivery.webhook_id == webhook_id)
+        .order_by(WebhookDelivery.next_us, WebhookDelivery.id)
+        .limit(1)
+        .with_for_update(skip_locked=True, of=WebhookDelivery)
+        .execution_options(populate_existing=True)
+    )
+    row = session.execute(statement).first()
+    if row is None:
+        return None
+    delivery, webhook = row[0], row[1]
+    delivery.attempts += 1
+    delivery.next_us = now + TAKEN_US
+    return Message(
+        id=delivery.id,
+        webhook_id=webhook.id,
+        project_id=webhook.project_id,
+        url=webhook.url,
+        body=delivery.body,
+        secrets=_secrets(webhook, now),
+        attempts=delivery.attempts,
+    )
 
 
 def _secrets(webhook: Webhook, now: int) -> list[str]:
@@ -249,9 +261,11 @@ def signed_headers(message: Message, *, timestamp_s: int) -> dict[str, str]:
 
 def note(session: Session, message: Message, outcome: Outcome) -> None:
     """Record the end of one try: delivered, to be tried again, or given up. One that another took over stays its."""
-    now = now_us()
+    now = clock_us(session)
     values: dict[str, Any] = {"status": outcome.status, "error": (outcome.error or "")[:_ERROR_CHARACTERS] or None}
     gone = outcome.status == HTTPStatus.GONE
+    if gone:
+        _disable(session, message, now)
     if outcome.is_delivered:
         values |= {"state": DeliveryState.DELIVERED, "delivered_us": now}
     elif gone or message.attempts > len(DELAYS_S):
@@ -263,8 +277,17 @@ def note(session: Session, message: Message, outcome: Outcome) -> None:
     session.execute(
         update(WebhookDelivery).where(mine, WebhookDelivery.state == DeliveryState.PENDING).values(**values)
     )
-    if gone:
-        session.execute(update(Webhook).where(Webhook.id == message.webhook_id).values(disabled_us=now))
+
+
+def _disable(session: Session, message: Message, now: int) -> None:
+    """Tell an address nothing more. The webhook is locked before its messages, as where it is deleted."""
+    session.execute(update(Webhook).where(Webhook.id == message.webhook_id).values(disabled_us=now))
+    others = (WebhookDelivery.webhook_id == message.webhook_id) & (WebhookDelivery.id != message.id)
+    session.execute(
+        update(WebhookDelivery)
+        .where(others, WebhookDelivery.state == DeliveryState.PENDING)
+        .values(state=DeliveryState.FAILED, error="the address answered 410 to another message", next_us=now)
+    )
 
 
 def send_again(session: Session, webhook: Webhook, delivery_id: str) -> WebhookDelivery:
@@ -280,7 +303,7 @@ def send_again(session: Session, webhook: Webhook, delivery_id: str) -> WebhookD
         raise not_found(f"delivery of webhook {webhook.id}", delivery_id)
     if delivery.state == DeliveryState.PENDING:
         raise DeliveryPending(f"delivery {delivery_id} is pending", remedy="Wait for its next attempt.")
-    delivery.state, delivery.attempts, delivery.next_us = DeliveryState.PENDING, 0, now_us()
+    delivery.state, delivery.attempts, delivery.next_us = DeliveryState.PENDING, 0, clock_us(session)
     delivery.delivered_us = None
     session.flush()
     return delivery
@@ -288,7 +311,8 @@ def send_again(session: Session, webhook: Webhook, delivery_id: str) -> WebhookD
 
 def forget_old(session: Session, now: int, *, limit: int = 500) -> int:
     """Delete messages that ended a month ago; how many."""
-    old = (WebhookDelivery.state != DeliveryState.PENDING) & (WebhookDelivery.created_us < now - KEPT_US)
-    some = select(WebhookDelivery.id).where(old).limit(limit)
+    # Nobody changes the time of the next try once there is none.
+    ended = WebhookDelivery.state.in_((DeliveryState.DELIVERED, DeliveryState.FAILED))
+    some = select(WebhookDelivery.id).where(ended, WebhookDelivery.next_us < now - KEPT_US).limit(limit)
     dropped = delete(WebhookDelivery).where(WebhookDelivery.id.in_(some))
     return int(session.execute(dropped.execution_options(synchronize_session=False)).rowcount)  # type: ignore[attr-defined]

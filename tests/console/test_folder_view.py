@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import httpx
 import pytest
 from playwright.sync_api import expect
 
-from service.api.folder_view import FolderViewError, create_view
+from service.api.folder_view import DriveFolder, FolderViewError, create_view
 from tests.console.conftest import Open, World, example_drive, viewing, wait_for
 
 
@@ -55,3 +56,12 @@ def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "report.json").write_text("[")
     with pytest.raises(FolderViewError, match=r"report\.json cannot be read"):
         create_view(tmp_path)
+
+
+@pytest.mark.parametrize("path", ["/etc/hostname", "../secret.png", "front/../../secret.png"])
+def test_a_manifest_that_leads_out_of_its_folder_is_refused(tmp_path: Path, path: str) -> None:
+    """The folder may come from anybody, and every program of this machine may ask for the images."""
+    manifest = {"name": "d", "frames": [{"images": {"front": {"file": path}}}]}
+    (tmp_path / "drive.json").write_text(json.dumps(manifest))
+    with pytest.raises(FolderViewError, match="which is not in its folder"):
+        DriveFolder.read(tmp_path)

@@ -20,6 +20,7 @@ import httpx
 
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
+from schemas.artifacts import EXPORTED_OF_MAP, EXPORTED_OF_SCENE
 from service.api.app import create_app
 from service.api.server import server_of
 from service.database.connections import Database, migrate
@@ -38,6 +39,9 @@ DEADLINE_S = 60.0
 REPOSITORY = Path(__file__).resolve().parents[2]
 LIMITS = jobs.RetryLimits(max_attempts=3)
 ONE_ATTEMPT = jobs.RetryLimits(max_attempts=1)
+# Files of a scene that is exported and of a map's version, as far as the service looks at them.
+SCENE_FILES = {path: path.encode() for path in EXPORTED_OF_SCENE}
+MAP_FILES = {path: path.encode() for path in EXPORTED_OF_MAP}
 SUMMARY = SceneSummary(
     registered_units=3,
     units=3,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE
 from service.settings import Settings
 
@@ -33,6 +35,28 @@ def test_every_variable_of_the_example_is_used() -> None:
         assert f"${{{name}:" in COMPOSE, name
 
 
+def service_of(name: str) -> str:
+    """The lines of one service."""
+    return COMPOSE.partition(f"\n  {name}:\n")[2].partition("\n\n")[0]
+
+
+def test_the_reconciler_alone_reaches_the_internet() -> None:
+    """It sends the messages of webhooks, and its other network leads nowhere else."""
+    assert "networks: [backend, egress]" in service_of("reconciler")
+    assert re.search(r"^  backend:\n    internal: true", COMPOSE, re.MULTILINE)
+    assert not re.search(r"^  egress:.*\n    internal", COMPOSE, re.MULTILINE)
+    assert len(re.findall(r"networks: \[.*egress", COMPOSE)) == 1
+
+
+def test_what_is_left_out_of_the_example_is_no_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose passes an empty text."""
+    optional = re.findall(r"^ +(MRASFM_\w+): \$\{MRASFM_\w+:-\}", COMPOSE, re.MULTILINE)
+    assert {"MRASFM_EXPORT_RETENTION_DAYS", "MRASFM_METRICS_TOKEN", "MRASFM_CONSOLE_TILES"} <= set(optional)
+    for name in optional:
+        monkeypatch.setenv(name, "")
+        assert getattr(Settings(), name.removeprefix("MRASFM_").lower()) is None
+
+
 def test_images_are_pinned_and_only_the_api_is_published_on_loopback() -> None:
     for image in re.findall(r"image: (\S+)", COMPOSE):
         assert re.search(r":(v?\d|\$\{MRASFM_VERSION)", image), image
@@ -42,5 +66,6 @@ def test_images_are_pinned_and_only_the_api_is_published_on_loopback() -> None:
 def test_one_service_alone_builds_the_image() -> None:
     """Several that build one tag at the same time end with "already exists" where containerd keeps the images."""
     assert len(re.findall(r"^ +build:", COMPOSE, re.MULTILINE)) == 1
-    migrate = COMPOSE.partition("\n  migrate:\n")[2].partition("\n\n")[0]
-    assert "\n    build: ." in migrate  # all others wait for it, so that it is part of whatever is started
+    assert "\n    build: ." in service_of(
+        "migrate"
+    )  # all others wait for it, so that it is part of whatever is started

@@ -48,9 +48,16 @@ def test_a_key_becomes_a_cookie_that_scripts_and_other_sites_cannot_use(api: Api
         assert morsel.value not in (stored.secret_sha256, stored.id)
 
 
-def test_behind_tls_the_cookie_is_secure(client: Client) -> None:
-    answer = client.post("/v1/session", headers={"X-Forwarded-Proto": "https"})
+@pytest.mark.parametrize("protocols", ["https", "https, http", "HTTPS,http"])
+def test_behind_tls_the_cookie_is_secure(client: Client, protocols: str) -> None:
+    """Each proxy adds what it was asked by: the first is the client's own."""
+    answer = client.post("/v1/session", headers={"X-Forwarded-Proto": protocols})
     assert SimpleCookie(answer.headers["set-cookie"])[COOKIE]["secure"] is True
+
+
+def test_without_tls_the_cookie_is_not_secure(client: Client) -> None:
+    answer = client.post("/v1/session", headers={"X-Forwarded-Proto": "http, https"})
+    assert SimpleCookie(answer.headers["set-cookie"])[COOKIE]["secure"] == ""
 
 
 def test_the_cookie_reads_and_writes_what_the_key_does(api: Api, client: Client) -> None:
@@ -69,6 +76,16 @@ def test_a_write_from_elsewhere_changes_nothing(api: Api, client: Client, origin
     problem_of(browser.delete("/v1/session", headers=headers), 403, "foreign-origin")
     assert client.get("/v1/drives").json()["items"] == []
     assert browser.get("/v1/drives").status_code == 200
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "none"])
+def test_a_browser_that_says_where_a_write_comes_from_is_believed(api: Api, client: Client, site: str) -> None:
+    """Also behind a proxy that changes Host, and where Origin has another scheme, which Host does not tell."""
+    browser = login(api, client)
+    told = {**origin_of(api), "Sec-Fetch-Site": site}
+    problem_of(browser.post("/v1/drives", content=tiny_drive().raw, headers=told), 403, "foreign-origin")
+    told = {"Origin": "https://maps.example.org", "Sec-Fetch-Site": "same-origin"}
+    assert browser.post("/v1/drives", content=tiny_drive().raw, headers=told).status_code == 201
 
 
 def test_a_bearer_key_needs_no_origin_and_no_cookie_helps_a_wrong_one(api: Api, client: Client) -> None:

@@ -11,13 +11,13 @@ import pytest
 
 from service.database.tables import WebhookDelivery
 from service.domain import exports
-from tests.helpers.live_api import Api, Client
+from tests.helpers.live_api import MAP_FILES, SCENE_FILES, Api, Client
 from tests.helpers.tiny_drive import tiny_drive
 from tests.helpers.tus_client import VERSION, create, head, metadata, patch
 
 # Of the connection and of the body's form: every HTTP server sends them.
 FRAMING = {"connection", "content-length", "content-type", "date", "server", "transfer-encoding"}
-FILES = {"points.ply": b"ply of a scene"}
+FILES = {**SCENE_FILES, "points.ply": b"ply of a scene"}
 
 
 class Conversation:
@@ -159,7 +159,7 @@ def _aggregate(said: Conversation, scene_id: str) -> str:
     client = said.client
     other, third = (_scene(client, name) for name in ("other", "third"))
     job = said.post("create_aggregation", "/v1/aggregations", 202, json={"scenes": [scene_id, other]})
-    url, files = f"/v1/maps/{job['map_id']}", {"points.ply": b"ply of a map"}
+    url, files = f"/v1/maps/{job['map_id']}", {**MAP_FILES, "points.ply": b"ply of a map"}
     said.ask("create_aggregation", "POST", "/v1/aggregations", 409, json={"map_id": job["map_id"], "remove": [other]})
     client.publish_map(client.claim(job["id"]), files)
     again = client.aggregate(map_id=job["map_id"], scenes=[third])

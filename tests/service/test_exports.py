@@ -7,8 +7,13 @@ from typing import Any
 
 import pytest
 
+from schemas.api.scenes import SceneComponent
+from service.database.tables import Export, Job, now_us
 from service.domain import exports, jobs
-from tests.helpers.live_api import Client, forget_all, problem_of
+from service.domain.export_inputs import ExportInputs
+from service.domain.map_inputs import StoredArtifact
+from tests.helpers import live_api
+from tests.helpers.live_api import MAP_FILES, SCENE_FILES, Client, forget_all, problem_of
 
 CONTENT = bytes(range(256)) * 8
 FILES = {"colmap/sparse/0/cameras.bin": CONTENT, "kitti/00/poses.txt": b"1 0 0\n", "report.json": b"{}"}
@@ -21,7 +26,7 @@ ASKED = {"formats": ["kitti", "colmap", "kitti"], "image_size_px": 800}
 
 @pytest.fixture
 def scene_id(client: Client) -> str:
-    return client.scene({"points.ply": b"ply", "poses.json": b"{}", "features.db": b"db"})
+    return client.scene({**SCENE_FILES, "report.json": b"{}", "features.db": b"db"})
 
 
 def ask(client: Client, scene_id: str, status: int = 202, **asked: Any) -> dict[str, Any]:
@@ -29,6 +34,17 @@ def ask(client: Client, scene_id: str, status: int = 202, **asked: Any) -> dict[
     assert answer.status_code == status, answer.text
     assert answer.headers["location"] == f"/v1/exports/{answer.json()['id']}"
     return dict(answer.json())
+
+
+def inputs_of(client: Client, asked: dict[str, Any]) -> tuple[ExportInputs, list[StoredArtifact], dict[str, str]]:
+    """What a worker gets for an export that was asked for."""
+    held = jobs.Claim(
+        job_id=asked["job_id"], fence=1, attempt=1, project_id=client.project_id, kind="EXPORT", drive_id=None,
+        map_id=None, settings={}, request={"export_id": asked["id"]},
+    )  # fmt: skip
+    with client.api.database.read() as session:
+        inputs = exports.inputs_of(session, held)
+        return inputs, inputs.files(session), inputs.drives(session)
 
 
 def publish(client: Client, job_id: str, results: list[dict[str, Any]] = RESULTS) -> None:
@@ -68,7 +84,7 @@ def test_an_idempotency_key_replays_the_answer(client: Client, scene_id: str) ->
 
 def test_lists(client: Client, scene_id: str) -> None:
     ids = [ask(client, scene_id, formats=["kitti"], image_size_px=size)["id"] for size in (100, 200, 300)]
-    other = ask(client, client.scene({"points.ply": b"other"}), formats=["kitti"])["id"]
+    other = ask(client, client.scene({**SCENE_FILES, "points.ply": b"other"}), formats=["kitti"])["id"]
     page = client.get(f"/v1/scenes/{scene_id}/exports", params={"limit": 2}).json()
     assert [item["id"] for item in page["items"]] == ids[:0:-1]
     rest = client.get(f"/v1/scenes/{scene_id}/exports", params={"limit": 2, "cursor": page["next"]}).json()
@@ -133,10 +149,8 @@ def test_what_is_refused(client: Client, scene_id: str) -> None:
 
 
 def test_a_scene_nowhere_on_earth(client: Client, scene_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.helpers import live_api
-
     monkeypatch.setattr(live_api, "SUMMARY", live_api.SUMMARY.model_copy(update={"georeferenced": False}))
-    nowhere = client.scene({"points.ply": b"nowhere"})
+    nowhere = client.scene({**SCENE_FILES, "points.ply": b"nowhere"})
     answer = client.post(f"/v1/scenes/{nowhere}/exports", json={"formats": ["geojson", "kitti"]})
     problem_of(answer, 422, "not-georeferenced")
     ask(client, nowhere, formats=["kitti"])
@@ -145,24 +159,76 @@ def test_a_scene_nowhere_on_earth(client: Client, scene_id: str, monkeypatch: py
 def test_versions_of_maps(client: Client) -> None:
     scenes = [client.scene({"points.ply": b"a"}), client.scene({"points.ply": b"b"})]
     job = client.aggregate(scenes=scenes)
-    client.publish_map(client.claim(job["id"]), {"map.json": b"{}"})
+    client.publish_map(client.claim(job["id"]), MAP_FILES)
     url = f"/v1/maps/{job['map_id']}/versions"
     answer = client.post(f"{url}/current/exports", json={"formats": ["colmap"]})
     assert answer.status_code == 202, answer.text
     asked = answer.json()
     assert (asked["map_id"], asked["map_version"], asked["scene_id"]) == (job["map_id"], 1, None)
     problem_of(client.delete(f"/v1/maps/{job['map_id']}"), 409, "used-by-job")
-    with client.api.database.read() as session:
-        held = jobs.Claim(
-            job_id=asked["job_id"], fence=1, attempt=1, project_id=client.project_id, kind="EXPORT", drive_id=None,
-            map_id=None, settings={}, request={"export_id": asked["id"]},
-        )  # fmt: skip
-        inputs = exports.inputs_of(session, held)
-    assert [file.path for file in inputs.files] == ["map.json"]
-    assert len(inputs.drives) == 2
+    _, files, drives = inputs_of(client, asked)
+    assert [file.path for file in files] == sorted(MAP_FILES)
+    assert len(drives) == 2
     assert client.get(f"{url}/1/exports").json()["items"][0]["id"] == asked["id"]
     publish(client, asked["job_id"])
     assert client.post(f"{url}/1/exports", json={"formats": ["colmap"]}).status_code == 200
     problem_of(client.post(f"{url}/2/exports", json={"formats": ["colmap"]}), 404, "not-found")
     assert client.delete(f"/v1/maps/{job['map_id']}").status_code == 204
     problem_of(client.get(f"/v1/exports/{asked['id']}"), 404, "not-found")
+
+
+def component(number: int, folder: str, *, georeferenced: bool) -> SceneComponent:
+    figures = {"registered_units": 1, "registered_images": 2, "points": 3}
+    return SceneComponent(component=number, folder=folder, georeferenced=georeferenced, **figures)
+
+
+def test_components_of_a_scene(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = [component(0, ".", georeferenced=True), component(1, "components/1", georeferenced=False)]
+    listed += [component(2, ".", georeferenced=True)]
+    summary = live_api.SUMMARY.model_copy(update={"components": listed, "georeferenced": True})
+    monkeypatch.setattr(live_api, "SUMMARY", summary)
+    own = {f"components/1/{path}": b"of the component" for path in SCENE_FILES}
+    scene_id = client.scene({**SCENE_FILES, **own, "components/10/poses.json": b"of another"})
+    url = f"/v1/scenes/{scene_id}/exports"
+    asked = ask(client, scene_id, formats=["kitti"], component=1)
+    assert asked["component"] == 1
+    inputs, files, _ = inputs_of(client, asked)
+    assert [file.path for file in files] == sorted(SCENE_FILES)
+    assert len({file.key for file in files}) == 1, "files of the component alone, which are all the same"
+    assert inputs.engine_options == {"image_size_px": None, "crs": None}
+    assert ask(client, scene_id, formats=["kitti"])["id"] != asked["id"]
+    assert ask(client, scene_id, 200, formats=["kitti"], component=1)["id"] == asked["id"]
+    refused = problem_of(client.post(url, json={"formats": ["kitti"], "component": 2}), 422, "component-unknown")
+    assert refused["remedy"] == "Leave it out, or give one that has: 1."
+    refused = problem_of(client.post(url, json={"formats": ["geojson"], "component": 1}), 422, "not-georeferenced")
+    assert f"component 1 of scene {scene_id}" in refused["detail"]
+    problem_of(client.post(url, json={"formats": ["kitti"], "component": 0}), 422, "invalid-document")
+    ask(client, scene_id, formats=["geojson"])
+
+
+def test_a_result_without_the_files_that_are_read_is_refused_before_a_job(client: Client) -> None:
+    files = {path: data for path, data in SCENE_FILES.items() if path != "manifest.json"}
+    scene_id = client.scene(files)
+    answer = client.post(f"/v1/scenes/{scene_id}/exports", json=ASKED)
+    assert "has no manifest.json" in problem_of(answer, 422, "files-missing")["detail"]
+    assert client.get("/v1/exports").json()["items"] == []
+
+
+def test_an_export_whose_time_is_over_is_not_given_again(client: Client, scene_id: str) -> None:
+    """It is deleted at the next pass: whoever was sent to it would find nothing."""
+    asked = ask(client, scene_id)
+    publish(client, asked["job_id"])
+    with client.api.database.write() as session:
+        session.get_one(Export, asked["id"]).expires_us = now_us() - 1
+    assert ask(client, scene_id)["id"] != asked["id"]
+
+
+def test_an_export_whose_job_was_deleted_is_listed_as_failed(client: Client, scene_id: str) -> None:
+    for size in (100, 200, 300):
+        ask(client, scene_id, formats=["kitti"], image_size_px=size)
+    with client.api.database.write() as session:
+        oldest = session.query(Export).filter_by(project_id=client.project_id).order_by(Export.created_us).first()
+        assert oldest is not None
+        session.query(Job).filter_by(id=oldest.job_id).delete()
+    items = client.get("/v1/exports").json()["items"]
+    assert [item["state"] for item in items] == ["QUEUED", "QUEUED", "FAILED"]

@@ -15,7 +15,18 @@ from alembic.runtime.migration import MigrationContext
 from sqlalchemy import inspect, text
 
 from service.database.connections import MIGRATIONS, Database, is_current, migrate
-from service.database.tables import Base, Drive, Job, JobAttempt, JobEvent, Scene
+from service.database.tables import (
+    Base,
+    ConsoleSession,
+    Drive,
+    Export,
+    Job,
+    JobAttempt,
+    JobEvent,
+    Scene,
+    WebhookDelivery,
+)
+from service.domain import webhooks
 from service.settings import Settings
 from tests.helpers.live_api import REPOSITORY, free_port
 
@@ -90,6 +101,40 @@ _FIRST_RECORDS = (
     "('job_2', 'prj_1', 'RECONSTRUCTION', 'drv_1', '{}', 'QUEUED', 1, 2, 3, 0, 0, '[]', 1)",
     "INSERT INTO job_attempts (job_id, fence, attempt, owner, started_us) VALUES ('job_1', 1, 1, 'w', 1)",
     "INSERT INTO job_events (job_id, kind, data, created_us) VALUES ('job_1', 'state', '{}', 1)",
+)
+
+
+def test_records_of_sessions_exports_and_webhooks_stay(database_settings: Settings) -> None:
+    database = Database.from_settings(database_settings)
+    _upgrade(database, "0009")
+    with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
+        for statement in _LATER_RECORDS:
+            connection.execute(text(statement))
+    migrate(database_settings)
+    assert differences(database) == []
+    with database.write() as session:
+        assert session.query(ConsoleSession).one().expires_us == 2**53
+        export = session.query(Export).one()
+        assert (export.formats, export.options, export.results) == (["kitti"], {"crs": None}, None)
+        (message,) = webhooks.take(session, limit=8)
+        assert (message.id, message.secrets) == ("msg_1", ["whsec_AA=="])
+        webhooks.note(session, message, webhooks.Outcome(status=204))
+        assert session.query(WebhookDelivery).one().state == "DELIVERED"
+    database.close()
+
+
+_LATER_RECORDS = (
+    "INSERT INTO projects (id, name, used_bytes, max_bytes, max_active_jobs, max_drives, created_us) "
+    "VALUES ('prj_1', 'p', 0, 1, 1, 1, 1)",
+    "INSERT INTO api_keys (id, project_id, name, secret_sha256, created_us) VALUES ('key_1', 'prj_1', 'k', 's', 1)",
+    "INSERT INTO console_sessions (id, key_id, secret_sha256, created_us, expires_us) "
+    "VALUES ('ses_1', 'key_1', 's', 1, 9007199254740992)",
+    "INSERT INTO exports (id, project_id, job_id, inputs_sha256, formats, options, created_us) "
+    "VALUES ('exp_1', 'prj_1', 'job_1', 's', '[\"kitti\"]', '{\"crs\": null}', 1)",
+    "INSERT INTO webhooks (id, project_id, url, events, description, secret, created_us) "
+    "VALUES ('whk_1', 'prj_1', 'https://example.org/', '[\"job.failed\"]', '', 'whsec_AA==', 1)",
+    "INSERT INTO webhook_deliveries (id, webhook_id, job_id, event, body, state, attempts, next_us, created_us) "
+    "VALUES ('msg_1', 'whk_1', 'job_1', 'job.failed', '{}', 'PENDING', 3, 1, 1)",
 )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -13,8 +14,9 @@ import pytest
 
 from service.database.tables import Job, JobEvent, now_us
 from service.domain.keys import revoke_key
-from tests.helpers.live_api import Api, Client
+from tests.helpers.live_api import Api, Client, api_in_thread, problem_of, settings_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
+from tests.service.conftest import StartApi
 
 Event = tuple[str, str, Any]  # its name, its id, its data
 
@@ -47,14 +49,16 @@ def test_changes_of_every_job_come_as_the_jobs_are_shown(api: Api, client: Clien
             name, first_id, data = next(events)
         assert (name, data["state"]) == ("job", "QUEUED")
         client.claim(job["id"])
-        name, second_id, data = next(events)
+        name, _, data = next(events)
         assert (data["id"], data["state"]) == (job["id"], "RUNNING")
         assert data == client.get(f"/v1/jobs/{job['id']}").json()
-        assert int(second_id) > int(first_id)
     with stream(client, **{"Last-Event-ID": first_id}) as again:
         assert next(again)[0] == "ready"
-        name, again_id, data = next(again)
-        assert (data["id"], data["state"], again_id) == (job["id"], "RUNNING", second_id)
+        seen = {}
+        while job["id"] not in seen:
+            data = next(again)[2]
+            seen[data["id"]] = data["state"]
+        assert seen[job["id"]] == "RUNNING"
 
 
 def test_foreign_jobs_do_not_come(api: Api, client: Client) -> None:
@@ -84,18 +88,102 @@ def test_what_is_new_of_a_child_is_new_of_its_tree(api: Api, client: Client) -> 
     assert states[child] == "RUNNING"
 
 
-def test_an_event_of_a_transaction_that_ended_late_is_not_missed(api: Api, client: Client) -> None:
-    """Ids are given before a transaction ends: a smaller one may appear after a greater one."""
-    early, late = (client.reconstruct(client.frozen(tiny_drive(n, seed=n)))["id"] for n in ("early", "late"))
+def add_event(api: Api, job_id: str, *, before: int = 0, age_s: float = 0.0) -> int:
+    """An event of a transaction that began before others and ends now; ids are given before a transaction ends."""
     with api.database.write() as session:
         newest = max(session.query(JobEvent.id).all())[0]
-        session.add(JobEvent(id=newest + 10, job_id=early, kind="state", data={}))
-    with stream(client, **{"Last-Event-ID": str(newest)}) as events:
+        event_id = newest - before if before else newest + 10
+        created_us = now_us() - int(age_s * 1e6)
+        session.add(JobEvent(id=event_id, job_id=job_id, kind="state", data={}, created_us=created_us))
+        return int(event_id)
+
+
+def two_jobs(client: Client, name: str) -> tuple[str, str]:
+    early, late = (client.reconstruct(client.frozen(tiny_drive(n, seed=n)))["id"] for n in (f"{name}-1", f"{name}-2"))
+    return early, late
+
+
+def test_an_event_of_a_transaction_that_ended_late_is_not_missed(api: Api, client: Client) -> None:
+    early, late = two_jobs(client, "late")
+    with stream(client) as events:
         next(events)
+        add_event(api, early)
         assert next(events)[2]["id"] == early
-        with api.database.write() as session:
-            session.add(JobEvent(id=newest + 5, job_id=late, kind="state", data={}))
+        add_event(api, late, before=5)
         assert next(events)[2]["id"] == late
+
+
+def test_an_event_from_before_the_stream_that_ends_late_is_not_missed(api: Api, client: Client) -> None:
+    """The page is read after `ready`, and without what that transaction writes."""
+    early, late = two_jobs(client, "before")
+    add_event(api, early)
+    with stream(client) as events:
+        assert next(events)[0] == "ready"
+        add_event(api, late, before=5)
+        assert next(events)[2]["id"] == late
+
+
+def test_a_reader_that_comes_back_misses_nothing(api: Api, client: Client) -> None:
+    """Neither an event that ends late, nor the rest of what came at one time."""
+    early, late = two_jobs(client, "back")
+    with stream(client) as events:
+        next(events)
+        add_event(api, early)
+        _, last_id, data = next(events)
+        assert data["id"] == early
+    add_event(api, late, before=5)
+    with stream(client, **{"Last-Event-ID": last_id}) as events:
+        next(events)
+        _, last_id, first = next(events)
+    with stream(client, **{"Last-Event-ID": last_id}) as events:
+        next(events)
+        seen = [next(events)[2]["id"] for _ in range(4)]  # two checks of drives are among them
+    assert {early, late, first["id"]} <= set(seen)
+
+
+def test_what_was_sent_long_ago_does_not_come_again(api: Api, client: Client) -> None:
+    early, late = two_jobs(client, "ago")
+    with api.database.write() as session:
+        session.query(JobEvent).update({"created_us": now_us() - 3600 * 1_000_000})
+    add_event(api, early, age_s=3600)
+    with stream(client, **{"Last-Event-ID": "0"}) as events:
+        next(events)
+        ids = [next(events)[1] for _ in range(4)]
+        assert ids[:3] == ["0"] * 3, "whoever goes away here is shown all again"
+    with stream(client, **{"Last-Event-ID": ids[-1]}) as events:
+        next(events)
+        add_event(api, late)
+        assert next(events)[2]["id"] == late
+
+
+def test_streams_of_a_project_are_bounded(start_api: StartApi) -> None:
+    api = start_api(max_event_streams=1)
+    client, other = api.client(), api.client()
+    with stream(client) as events:
+        next(events)
+        refused = problem_of(client.get("/v1/events"), 429, "too-many-streams")
+        assert "GET /v1/jobs" in refused["remedy"]
+        with stream(other) as others:
+            next(others)
+    wait_until(lambda: api.context.streams.open_streams == 0, "the end of the streams")
+    with stream(client) as events:
+        next(events)
+    told = client.get("/metrics").text
+    assert 'mrasfm_http_requests_total{method="GET",route="/v1/events",status="200"}' in told
+    assert 'mrasfm_http_request_seconds_count{method="GET",route="/v1/events"} 1' in told, "of the refusal alone"
+
+
+def test_streams_end_with_the_server(tmp_path: Path) -> None:
+    """It would wait for them, in vain, and cut them off."""
+    with httpx.Client(timeout=20) as browser, ExitStack() as opened:
+        with api_in_thread(settings_of(tmp_path)) as api:
+            browser.base_url = httpx.URL(api.url)
+            browser.headers["Authorization"] = f"Bearer {api.new_key()[1]}"
+            events = opened.enter_context(stream(browser))
+            assert next(events)[0] == "ready"
+            began_s = time.monotonic()
+        assert time.monotonic() - began_s < 1.5
+        assert list(events) == []
 
 
 def test_a_job_that_stalls_is_told_although_nobody_writes_it(api: Api, client: Client) -> None:

@@ -14,7 +14,7 @@ from service.database.connections import migrate
 from service.database.tables import ApiKey
 from service.domain import exports
 from service.domain.keys import ensure_first_key, revoke_key
-from tests.helpers.live_api import Api, Client, api_process, problem_of, settings_of, wait_until
+from tests.helpers.live_api import SCENE_FILES, Api, Client, api_process, problem_of, settings_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
 from tests.helpers.tus_client import OFFSET_TYPE, VERSION, begin, metadata
 from tests.service.test_maps import new_version
@@ -66,7 +66,7 @@ def headers_of(path: str) -> dict[str, str]:
 def foreign(api: Api) -> dict[str, str]:
     """Ids of another project's things, all of which exist."""
     other = api.client()
-    scene_id = other.scene({"points.ply": b"secret"})
+    scene_id = other.scene({**SCENE_FILES, "points.ply": b"secret"})
     scene = other.get(f"/v1/scenes/{scene_id}").json()
     drive = tiny_drive("open", seed="open")
     upload = begin(other, other.create(drive), *next(iter(drive.files.items())))
@@ -120,7 +120,7 @@ def test_foreign_ids_are_not_found_at_any_route(api: Api, client: Client, foreig
 
 
 def test_head_is_get_without_a_body(api: Api, client: Client) -> None:
-    scene_id = client.scene({"points.ply": b"ply"})
+    scene_id = client.scene(SCENE_FILES)
     scene = client.get(f"/v1/scenes/{scene_id}").json()
     ids = {"scene_id": scene_id, "drive_id": scene["drive_id"], "job_id": scene["job_id"], "path": "points.ply"}
     drives = [client.frozen(tiny_drive(f"head-{i}", seed=f"head-{i}")) for i in range(2)]

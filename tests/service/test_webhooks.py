@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
+import re
+import threading
 from typing import Any
 
 import pytest
@@ -13,8 +15,11 @@ from sqlalchemy.orm import Session
 from schemas.api.jobs import JobKind
 from schemas.api.webhooks import WebhookRequest
 from service.database.connections import Database
-from service.database.tables import Export, Scene, WebhookDelivery, now_us
+from service.database.tables import Export, Job, Scene, Webhook, WebhookDelivery, now_us
 from service.domain import exports, jobs, maps, webhooks
+from service.domain.keys import create_project
+from service.domain.webhook_addresses import is_public
+from service.settings import Settings
 from tests.helpers.live_api import Client, problem_of
 
 URL = "https://example.org/hooks/mrasfm?from=us"
@@ -65,6 +70,10 @@ def test_jobs_that_end_leave_one_message_each(client: Client) -> None:
         assert client.post(f"/v1/jobs/{job['id']}:cancel").status_code == 202
     assert [m["job_id"] for m in messages(client, other["id"])] == [job["id"]]
     assert len(messages(client, wanted["id"])) == 1
+    (pending,) = re.findall(
+        r'^mrasfm_webhook_messages{state="PENDING"} (\d+)', client.get("/metrics").text, re.MULTILINE
+    )
+    assert int(pending) >= 2
 
 
 def test_a_message_is_rolled_back_with_its_transaction(client: Client) -> None:
@@ -91,6 +100,16 @@ def test_rotating_keeps_the_secret_before_for_a_day(client: Client, monkeypatch:
     assert taken[0].secrets == [rotated["secret"], made["secret"]]
     headers = webhooks.signed_headers(taken[0], timestamp_s=1)
     assert len(headers["webhook-signature"].split(" ")) == 2
+    with client.api.database.write() as session:
+        webhooks.forget_old_secrets(session)
+        webhook = session.get_one(Webhook, made["id"], populate_existing=True)
+        assert webhook.previous_secret == made["secret"]
+        webhook.previous_until_us = now_us() - 1
+    with client.api.database.write() as session:
+        webhooks.forget_old_secrets(session)
+        webhook = session.get_one(Webhook, made["id"], populate_existing=True)
+        assert (webhook.previous_secret, webhook.previous_until_us) == (None, None)
+        assert webhook.secret == rotated["secret"]
 
 
 def test_the_signature_is_that_of_standard_webhooks() -> None:
@@ -98,6 +117,7 @@ def test_the_signature_is_that_of_standard_webhooks() -> None:
     message = webhooks.Message(
         id="msg_p5jXN8AQM9LWM0D4loKWxJek",
         webhook_id="",
+        project_id="",
         url="",
         body='{"test": 2432232314}',
         secrets=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"],
@@ -122,6 +142,14 @@ def test_the_signature_is_that_of_standard_webhooks() -> None:
         "https://[fe80::1]/",
         "https://example.org/#part",
         "https://:443/",
+        "https://127.1/",
+        "https://2130706433/",
+        "https://0x7f000001/",
+        "https://hooks.localhost./",
+        "https://[::127.0.0.1]/",
+        "https://192.0.0.192/",
+        "https://@example.org/",
+        "https://example.org\\@10.0.0.1/",
         "https://example.org:99999/",
     ],
 )
@@ -146,34 +174,129 @@ def test_a_project_has_a_bound(client: Client) -> None:
         ("8.8.8.8", True), ("2606:4700::1111", True), ("127.0.0.1", False), ("0.0.0.0", False), ("100.64.0.1", False),
         ("224.0.0.1", False), ("192.0.2.1", False), ("::", False), ("fd00::1", False), ("::ffff:8.8.8.8", True),
         ("::ffff:10.0.0.1", False), ("2002:0a00:0001::1", False), ("64:ff9b::7f00:1", False), ("fe80::1%eth0", False),
+        ("64:ff9b::8.8.8.8", True), ("64:ff9b:1::a00:1", False), ("::127.0.0.1", False), ("::ffff:0:10.0.0.1", False),
+        ("fec0::1", False), ("3fff::1", False), ("5f00::1", False), ("2001:0:a00:1::", False),
+        ("2002:808:808::", False), ("192.0.0.192", False),
+        ("192.88.99.1", False), ("169.254.169.254", False), ("fd00:ec2::254", False),
     ],
 )  # fmt: skip
 def test_addresses_of_the_internet(address: str, public: bool) -> None:
-    assert webhooks.is_public(address) is public
+    assert is_public(address) is public
+
+
+def ended_job(database: Database, project_id: str) -> str:
+    with database.write() as session:
+        job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
+        jobs.request_cancel(session, job.id)
+        return job.id
+
+
+def new_webhook(database: Database, project_id: str) -> str:
+    with database.write() as session:
+        return webhooks.create(session, project_id=project_id, asked=WebhookRequest(url=URL), allow_private=False).id
+
+
+def taken(database: Database, **bounds: Any) -> list[webhooks.Message]:
+    with database.write() as session:
+        return webhooks.take(session, **{"limit": 8, **bounds})
 
 
 def test_messages_are_taken_once_in_every_database(database: Database, project_id: str) -> None:
-    """Two senders at one time get different messages."""
-    with database.write() as session:
-        asked = WebhookRequest(url=URL)
-        webhooks.create(session, project_id=project_id, asked=asked, allow_private=False)
-        for _ in range(3):
-            job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
-            jobs.request_cancel(session, job.id)
+    """Two senders at one time get different messages, the older one first."""
+    new_webhook(database, project_id)
+    ended = [ended_job(database, project_id) for _ in range(3)]
     with database.read() as session:
         assert webhooks.is_any_due(session)
+    found = [message for _ in range(4) for message in taken(database)]
+    assert [json.loads(message.body)["data"]["job_id"] for message in found] == ended
     with database.write() as session:
-        first = webhooks.take(session, limit=2)
-    with database.write() as session:
-        rest = webhooks.take(session, limit=2)
-    assert len({message.id for message in (*first, *rest)}) == 3
-    with database.write() as session:
-        for message in first:
+        for message in found[:2]:
             webhooks.note(session, message, webhooks.Outcome(status=200))
-        webhooks.note(session, rest[0], webhooks.Outcome(status=410, error="answered 410"))
+        webhooks.note(session, found[2], webhooks.Outcome(status=410, error="answered 410"))
     with database.write() as session:
         assert webhooks.forget_old(session, now_us() + 2 * webhooks.KEPT_US) == 3
         assert not webhooks.is_any_due(session)
+
+
+def test_a_webhook_that_is_slow_holds_up_neither_others_nor_other_projects(
+    database: Database, database_settings: Settings, project_id: str
+) -> None:
+    slow = [new_webhook(database, project_id) for _ in range(5)]
+    for _ in range(3):
+        ended_job(database, project_id)
+    with database.write() as session:
+        other_id = create_project(session, "other", database_settings).id
+    new_webhook(database, other_id)
+    ended_job(database, other_id)
+    first = taken(database, of_project=2)
+    assert [message.project_id for message in first].count(project_id) == 2
+    assert [message.project_id for message in first].count(other_id) == 1
+    assert len({message.webhook_id for message in first}) == 3
+    assert taken(database, of_project=2, under_way=first) == []
+    one = taken(database, of_project=2, under_way=first[1:])
+    assert [(message.project_id, message.webhook_id in slow) for message in one] == [(project_id, True)]
+
+
+def test_a_webhook_that_is_deleted_while_it_is_told_leaves_nothing(database: Database, project_id: str) -> None:
+    webhook_id = new_webhook(database, project_id)
+    ended_job(database, project_id)
+    (message,) = taken(database)
+    _delete_webhook(database, webhook_id)
+    with database.write() as session:
+        webhooks.note(session, message, webhooks.Outcome(status=410, error="answered 410"))
+        webhooks.note(session, message, webhooks.Outcome(status=200))
+    with database.read() as session:
+        assert session.query(Webhook).count() == session.query(WebhookDelivery).count() == 0
+
+
+def test_messages_of_a_webhook_are_bounded(
+    database: Database, project_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhooks, "MAX_PENDING", 2)
+    new_webhook(database, project_id)
+    ended = [ended_job(database, project_id) for _ in range(3)]
+    with database.read() as session:
+        found = {message.job_id: message for message in session.query(WebhookDelivery)}
+    assert [found[job_id].state for job_id in ended] == ["PENDING", "PENDING", "FAILED"]
+    assert found[ended[2]].error == "2 messages were pending"
+
+
+def test_an_address_that_wants_no_more_gets_no_more(database: Database, project_id: str) -> None:
+    webhook_id = new_webhook(database, project_id)
+    for _ in range(2):
+        ended_job(database, project_id)
+    (message,) = taken(database)
+    with database.write() as session:
+        webhooks.note(session, message, webhooks.Outcome(status=410, error="answered 410"))
+    assert taken(database) == []
+    with database.read() as session:
+        assert session.get_one(Webhook, webhook_id).disabled_us is not None
+        assert {found.state for found in session.query(WebhookDelivery)} == {"FAILED"}
+
+
+def test_a_webhook_that_is_deleted_as_a_job_ends_fails_no_job(
+    database: Database, project_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Deleted between the look at the webhooks and the record of the message: the job ends all the same."""
+    webhook_id, body_of = new_webhook(database, project_id), webhooks._body
+    deleting = threading.Thread(target=_delete_webhook, args=(database, webhook_id))
+
+    def body_while_deleted(*given: Any) -> str:
+        deleting.start()
+        deleting.join(0.3)
+        return body_of(*given)
+
+    monkeypatch.setattr(webhooks, "_body", body_while_deleted)
+    job_id = ended_job(database, project_id)
+    deleting.join()
+    with database.read() as session:
+        assert session.get_one(Job, job_id).state == "CANCELLED"
+        assert session.query(Webhook).count() == session.query(WebhookDelivery).count() == 0
+
+
+def _delete_webhook(database: Database, webhook_id: str) -> None:
+    with database.write() as session:
+        session.delete(session.get_one(Webhook, webhook_id, with_for_update=True))
 
 
 def test_retention_in_every_database(database: Database, project_id: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobKind
-from schemas.api.scenes import SceneSummary
+from schemas.api.scenes import SceneComponent, SceneSummary
 from service.database.tables import Blob, Drive, Export, ExportFile, Job, Scene
 from service.domain import exports, jobs, scenes
 from service.errors import DriveDeleted, ExportDeleted
@@ -20,7 +20,11 @@ from worker.job_execution import Runner
 
 SUMMARY = SceneSummary(
     registered_units=4, units=5, registered_images=7, images=10, points=50, georeferenced=True, warnings=0,
-    engine_version="0.1.0",
+    engine_version="0.1.0", components=[
+        SceneComponent(
+            component=1, folder="components/1", georeferenced=True, registered_units=4, registered_images=7, points=50
+        )
+    ],
 )  # fmt: skip
 
 
@@ -41,10 +45,11 @@ def scene_id(world: World, tmp_path: Path) -> str:
 
 
 def publish_scene(world: World, drive_id: str, folder: Path) -> str:
-    """A folder as the scene of a drive."""
+    """A folder as the scene of a drive, and once more as a component of that scene."""
     files = {
         path.relative_to(folder).as_posix(): world.store(path) for path in folder.rglob("*") if path.is_file()
     }  # fmt: skip
+    files |= {f"components/1/{path}": file for path, file in files.items()}
     job_id = world.ask(drive_id, wake=False)
     with world.database.write() as session:
         held = jobs.claim(session, job_id, owner="test", lease_us=60_000_000)
@@ -135,14 +140,15 @@ def test_what_the_engine_refuses_ends_the_job_with_its_words(world: World, scene
 
 
 @pytest.mark.engine
-def test_formats_without_images_need_no_drive(world: World, scene_id: str) -> None:
+def test_formats_without_images_need_no_drive_also_of_a_component(world: World, scene_id: str) -> None:
     with world.database.write() as session:
         session.delete(session.get_one(Drive, session.get_one(Scene, scene_id).drive_id))
     with pytest.raises(DriveDeleted):
         ask(world, scene_id, "kitti", "colmap")
-    export_id, job_id = ask(world, scene_id, "kitti", "geojson")
+    export_id, job_id = ask(world, scene_id, "kitti", "geojson", component=1)
     assert job_id is not None
-    assert run(world, job_id).state == "SUCCEEDED"
+    job = run(world, job_id)
+    assert job.state == "SUCCEEDED", job.problem
     results = export_of(world, export_id).results or []
     assert [(result["format"], result["files"]) for result in results] == [("geojson", 3), ("kitti", 4)]
 

@@ -6,23 +6,27 @@ import base64
 import hashlib
 import hmac
 import json
+import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import httpcore
 import pytest
 
 from schemas.api.jobs import JobKind
 from schemas.api.webhooks import WebhookRequest
 from service.database.connections import Database, migrate
-from service.database.tables import Job, Webhook, WebhookDelivery
+from service.database.tables import Job, Webhook, WebhookDelivery, new_id
 from service.domain import jobs, webhooks
 from service.domain.keys import create_project
 from service.settings import Settings
 from tests.helpers.service_world import World, kill, wait_until
-from worker import webhook_sender
+from worker import checked_connections, webhook_sender
+from worker.checked_connections import CheckedBackend, resolved
 from worker.webhook_sender import WebhookSender
 
 
@@ -75,7 +79,7 @@ def receiver() -> Iterator[Receiver]:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    made = Settings(data_dir=tmp_path, webhook_private_addresses=True)
+    made = Settings(data_dir=tmp_path, webhook_private_addresses=True, webhook_seconds=0.1)
     migrate(made)
     return made
 
@@ -90,7 +94,7 @@ def database(settings: Settings) -> Iterator[Database]:
 def registered(database: Database, settings: Settings, url: str) -> Webhook:
     """A webhook, and a job that has ended."""
     with database.write() as session:
-        project = create_project(session, "test", settings)
+        project = create_project(session, new_id("test"), settings)
         webhook = webhooks.create(session, project_id=project.id, asked=WebhookRequest(url=url), allow_private=True)
         job = jobs.create(session, project_id=project.id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
         jobs.request_cancel(session, job.id)
@@ -105,6 +109,10 @@ def delivery_of(database: Database) -> WebhookDelivery:
 def make_due(database: Database) -> None:
     with database.write() as session:
         session.query(WebhookDelivery).one().next_us = 0
+
+
+def resolve_as(monkeypatch: pytest.MonkeyPatch, resolve: Callable[..., list[str]]) -> None:
+    monkeypatch.setattr(webhook_sender, "CheckedBackend", partial(CheckedBackend, resolve=resolve))
 
 
 def test_a_message_is_signed_and_delivered_once(database: Database, settings: Settings, receiver: Receiver) -> None:
@@ -185,14 +193,69 @@ def test_an_address_that_wants_no_more_is_disabled(database: Database, settings:
 def test_names_of_private_addresses_are_told_nothing(
     database: Database, settings: Settings, receiver: Receiver, monkeypatch: pytest.MonkeyPatch, addresses: list[str]
 ) -> None:
-    registered(database, settings, f"http://hooks.example.org:{receiver.port}/hook")
-    monkeypatch.setattr(webhook_sender, "resolved", lambda host, port: addresses)
+    registered(database, settings, "https://hooks.example.org/hook")
+    resolve_as(monkeypatch, lambda *_: addresses)
     strict = settings.model_copy(update={"webhook_private_addresses": False})
     WebhookSender(strict, database).send_due()
     delivery = delivery_of(database)
     assert receiver.got == []
     assert (delivery.state, delivery.status) == ("PENDING", None)
-    assert "hooks.example.org" in str(delivery.error)
+    # The same for a name without an address: else webhooks would tell what names the operator's network has.
+    assert delivery.error == "hooks.example.org has no address, or one of a private network"
+
+
+def test_what_the_operator_does_not_allow_any_more_is_told_nothing(
+    database: Database, settings: Settings, receiver: Receiver
+) -> None:
+    registered(database, settings, "http://hooks.example.org/hook")
+    strict = settings.model_copy(update={"webhook_private_addresses": False})
+    WebhookSender(strict, database).send_due()
+    assert delivery_of(database).error == "the url is not encrypted"
+
+
+def test_a_name_server_that_does_not_answer_ends_the_look_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    answered, free = threading.Event(), threading.BoundedSemaphore(1)
+    monkeypatch.setattr(checked_connections, "_LOOK_UPS", free)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [] if answered.wait(20) else None)
+    for _ in range(2):  # the first look-up goes on, and leaves no place for the second
+        began_s = time.monotonic()
+        with pytest.raises(httpcore.ConnectTimeout, match=r"slow\.example was not looked up within 0\.2 s"):
+            resolved("slow.example", 443, 0.2)
+        assert 0.2 <= time.monotonic() - began_s < 2.0
+    answered.set()
+    assert free.acquire(timeout=20)
+
+
+def test_an_address_that_hangs_holds_up_its_own_messages_alone(
+    database: Database, settings: Settings, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhook_sender, "_WITHIN_S", 1.0)
+    hanging = Receiver()
+    hanging.drips = True
+    project_id = registered(database, settings, hanging.url).project_id
+    for _ in range(5):
+        registered(database, settings, receiver.url)
+    began_s, sending = time.monotonic(), threading.Thread(target=WebhookSender(settings, database).send_due)
+    sending.start()
+    wait_until(lambda: len(receiver.got) == 5, "the others", within_s=20)
+    assert time.monotonic() - began_s < 1.0
+    with database.write() as session:
+        asked = WebhookRequest(url=receiver.url)
+        webhooks.create(session, project_id=project_id, asked=asked, allow_private=True)
+        job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
+        jobs.request_cancel(session, job.id)
+    sending.join()
+    assert len(receiver.got) == 6, "what becomes due meanwhile is sent as well"
+
+
+def test_a_sender_that_is_told_to_end_begins_no_more(
+    database: Database, settings: Settings, receiver: Receiver
+) -> None:
+    registered(database, settings, receiver.url)
+    ended = threading.Event()
+    ended.set()
+    assert WebhookSender(settings, database).send_due(ended) == 0
+    assert receiver.got == []
 
 
 def test_the_connection_goes_to_the_address_that_was_checked(
@@ -201,7 +264,7 @@ def test_the_connection_goes_to_the_address_that_was_checked(
     """A name server that answers differently the second time is not asked a second time."""
     answers = iter([["127.0.0.1"]])
     registered(database, settings, f"http://rebinding.invalid:{receiver.port}/hook")
-    monkeypatch.setattr(webhook_sender, "resolved", lambda host, port: next(answers))
+    resolve_as(monkeypatch, lambda *_: next(answers))
     WebhookSender(settings, database).send_due()
     assert delivery_of(database).state == "DELIVERED"
     ((headers, _),) = receiver.got

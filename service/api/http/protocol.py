@@ -14,6 +14,7 @@ from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
+from service.api.http.event_streams import end_stream
 from service.api.http.problem_response import problem_response
 from service.api.middleware.security_headers import add_security_headers
 from service.errors import HeadTooLarge, MalformedRequest, ServiceError, TooSlow
@@ -66,6 +67,12 @@ class BoundedHttpProtocol(HttpToolsProtocol):
                     remedy="Send fewer and shorter headers.",
                 )
             )
+
+    def shutdown(self) -> None:
+        """Extend uvicorn's method of this name: it waits for answers to end, which event streams do not."""
+        super().shutdown()
+        if self.cycle is not None:
+            end_stream(self.cycle.scope)
 
     def on_message_begin(self) -> None:
         """Extend uvicorn's method of this name."""

@@ -37,6 +37,7 @@ class RequestLog:
             await self._app(scope, receive, send)
             return
         request_id, started_s, status, received_bytes = new_id("req"), time.perf_counter(), 0, 0
+        is_stream = False
 
         async def counted_receive() -> Message:
             nonlocal received_bytes
@@ -45,10 +46,11 @@ class RequestLog:
             return message
 
         async def send_with_id(message: Message) -> None:
-            nonlocal status
+            nonlocal status, is_stream
             if message["type"] == "http.response.start":
-                status = message["status"]
-                MutableHeaders(scope=message)["X-Request-Id"] = request_id
+                status, headers = message["status"], MutableHeaders(scope=message)
+                is_stream = headers.get("content-type", "").startswith("text/event-stream")
+                headers["X-Request-Id"] = request_id
             await send(message)
 
         with log_fields(request_id=request_id):
@@ -61,12 +63,13 @@ class RequestLog:
                 await self._failed()(scope, counted_receive, send_with_id)
             finally:
                 self._metrics.received_bytes.inc(received_bytes)
-                self._note(scope, status, time.perf_counter() - started_s)
+                self._note(scope, status, time.perf_counter() - started_s, is_stream=is_stream)
 
-    def _note(self, scope: Scope, status: int, elapsed_s: float) -> None:
+    def _note(self, scope: Scope, status: int, elapsed_s: float, *, is_stream: bool) -> None:
         # The route, not the path, is a label: paths are as many as files.
         route = getattr(scope.get("route"), "path", "none")
         self._metrics.requests.labels(scope["method"], route, status).inc()
-        self._metrics.seconds.labels(scope["method"], route).observe(elapsed_s)
+        if not is_stream:  # how long somebody listened is no time to answer
+            self._metrics.seconds.labels(scope["method"], route).observe(elapsed_s)
         fields = {"method": scope["method"], "route": route, "path": scope["path"], "status": status}
         log.info("request", extra={"fields": {**fields, "seconds": round(elapsed_s, 4)}})

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, BackgroundTasks, Depends, Request, Response
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportFileResource, ExportRequest, ExportResource
@@ -47,7 +49,7 @@ _ASKED = {
 def create_scene_export(
     scene_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep, body: BodyDep
 ) -> Response:
-    """Ask for a scene in formats of other programs, as a job.
+    """Ask for a scene, or one of its components, in formats of other programs, as a job.
 
     Scenes never change: the same formats with the same options are exported once, and answered with 200 from then on.
     """
@@ -91,7 +93,7 @@ def list_scene_exports(
     with context.database.read() as session:
         require(session, Scene, caller.project_id, scene_id)
         found, following = newest(session, Export, caller.project_id, cursor=cursor, limit=limit, scene_id=scene_id)
-        return Page(items=[_shown(session, each, context.settings) for each in found], next=following)
+        return Page(items=_listed(session, found, context.settings), next=following)
 
 
 @router.get(
@@ -108,7 +110,7 @@ def list_map_exports(
         found, following = newest(
             session, Export, caller.project_id, cursor=cursor, limit=limit, map_id=map_id, map_version=number
         )
-        return Page(items=[_shown(session, each, context.settings) for each in found], next=following)
+        return Page(items=_listed(session, found, context.settings), next=following)
 
 
 @router.get("/exports", summary="List exports", responses={**gives(200, "A page of exports"), **problems(401, 422)})
@@ -118,7 +120,7 @@ def list_exports(
     """Exports of the project, newest first, without their files."""
     with context.database.read() as session:
         found, following = newest(session, Export, caller.project_id, cursor=cursor, limit=limit)
-        return Page(items=[_shown(session, each, context.settings) for each in found], next=following)
+        return Page(items=_listed(session, found, context.settings), next=following)
 
 
 @router.get(
@@ -128,7 +130,7 @@ def get_export(export_id: str, caller: CallerDep, context: ContextDep) -> Export
     """One export and its files. Its job tells how far it is."""
     with context.database.read() as session:
         export = require(session, Export, caller.project_id, export_id)
-        return _shown(session, export, context.settings, with_files=True)
+        return _shown(session, export, context.settings)
 
 
 @router.delete(
@@ -169,7 +171,7 @@ def _asked(
         job_expires_us=expiry_us(now_us(), context.settings.job_retention_days),
     )
     location = f"/v1/exports/{export.id}"
-    shown = _shown(session, export, context.settings, with_files=True)
+    shown = _shown(session, export, context.settings)
     if job is None and export.results is not None:
         return answer(200, shown, Location=location)
     status = 200 if job is None else 202
@@ -178,14 +180,25 @@ def _asked(
     )
 
 
-def _shown(session: Session, export: Export, settings: Settings, *, with_files: bool = False) -> ExportResource:
-    job = session.get(Job, export.job_id)
+def _listed(session: Session, found: Sequence[Export], settings: Settings) -> list[ExportResource]:
+    """Exports without their files."""
+    of_jobs = select(Job).where(Job.id.in_([export.job_id for export in found]))
+    by_id = {job.id: job for job in session.scalars(of_jobs)}
+    return [_resource(export, by_id.get(export.job_id), [], settings) for export in found]
+
+
+def _shown(session: Session, export: Export, settings: Settings) -> ExportResource:
+    """One export with its files."""
+    mine, url = ExportFile.export_id == export.id, f"/v1/exports/{export.id}"
+    files = files_of(session, ExportFile, mine, ExportFileResource, url)
+    return _resource(export, session.get(Job, export.job_id), files, settings)
+
+
+def _resource(export: Export, job: Job | None, files: list[ExportFileResource], settings: Settings) -> ExportResource:
     if export.results is not None:
         state = JobState.SUCCEEDED
     else:
         state = JobState.FAILED if job is None else shown_state(job, settings)
-    mine, url = ExportFile.export_id == export.id, f"/v1/exports/{export.id}"
-    files = files_of(session, ExportFile, mine, ExportFileResource, url) if with_files else []
     return ExportResource.model_validate(
         {
             "id": export.id,
@@ -195,6 +208,7 @@ def _shown(session: Session, export: Export, settings: Settings, *, with_files: 
             "formats": export.formats,
             "image_size_px": export.options.get("image_size_px"),
             "crs": export.options.get("crs"),
+            "component": export.options.get("component"),
             "job_id": export.job_id,
             "state": state,
             "problem": None if job is None else job.problem,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 from collections.abc import AsyncIterator
 from typing import Annotated
@@ -11,13 +10,22 @@ from fastapi import APIRouter, BackgroundTasks, Depends, Header, Query, Request,
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy import select
 from sqlalchemy.orm import Session
-from starlette.concurrency import run_in_threadpool
 
 from schemas.api.jobs import JobKind, JobResource
 from schemas.api.resource import Page
 from service.api.context import Context
 from service.api.credentials import secret_of
-from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, LastEventId, Limit, answer, expiry_us
+from service.api.dependencies import (
+    CallerDep,
+    ContextDep,
+    Cursor,
+    IdempotentDep,
+    LastEventId,
+    Limit,
+    StreamDep,
+    answer,
+    expiry_us,
+)
 from service.api.http.paging import newest
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
@@ -169,26 +177,27 @@ def _existing(job_id: str, caller: CallerDep, context: ContextDep) -> str:
     summary="Follow a job",
     responses={
         **gives(200, "Events as they come", "Cache-Control", "X-Accel-Buffering", content=_EVENTS),
-        **problems(401, 404, 422),
+        **problems(401, 404, 422, 429),
     },
 )
 async def stream_job_events(
     job_id: Annotated[str, Depends(_existing)],
     context: ContextDep,
     request: Request,
+    stream: StreamDep,
     last_event_id: LastEventId = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """The job's changes of state, from the beginning, and its newest progress, until it or the key has ended."""
     last, secret = last_event_id or 0, secret_of(request) or ""
-    while True:
-        ended, events = await run_in_threadpool(_news, context, secret, job_id, last)
+    while not stream.has_ended:
+        ended, events = await stream.look(_news, context, secret, job_id, last)
         for event in events:
             last = event.id
             yield ServerSentEvent(id=str(event.id), event=event.kind, data=event.data)
         if ended and not events:
             return
         if not events:
-            await asyncio.sleep(context.settings.poll_seconds)
+            await stream.pause(context.settings.poll_seconds)
 
 
 def _news(context: Context, secret: str, job_id: str, last: int) -> tuple[bool, list[JobEvent]]:

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 
 from schemas.api.session import SessionResource
 from service.api.context import Context
-from service.api.credentials import SESSION_COOKIE, secret_of
+from service.api.credentials import SESSION_COOKIE, is_encrypted, secret_of
 from service.api.dependencies import CallerDep, ContextDep, moment
 from service.api.http.responses import gives, problems
 from service.domain import sessions
@@ -28,7 +28,8 @@ def begin_session(caller: CallerDep, context: ContextDep, request: Request, resp
     """Exchange a key, sent as a bearer token, for a cookie that opens the same for 12 hours.
 
     Scripts cannot read the cookie (`HttpOnly`) and other sites' pages cannot send it (`SameSite=Strict`). A request
-    that changes something and carries the cookie needs an `Origin` equal to its `Host`. The session ends with its key.
+    that changes something and carries the cookie has to come from a page of this host: `Sec-Fetch-Site: same-origin`,
+    or an `Origin` equal to its `Host`. The session ends with its key.
     """
     secret = secret_of(request) or ""
     with context.database.write() as session:
@@ -77,9 +78,14 @@ def _no_key() -> Unauthorized:
 
 
 def _set_cookie(response: Response, request: Request, value: str, *, max_age_s: int) -> None:
-    is_https = "https" in (request.url.scheme, request.headers.get("x-forwarded-proto", ""))
     response.set_cookie(
-        SESSION_COOKIE, value, max_age=max_age_s, path="/", secure=is_https, httponly=True, samesite="strict"
+        SESSION_COOKIE,
+        value,
+        max_age=max_age_s,
+        path="/",
+        secure=is_encrypted(request),
+        httponly=True,
+        samesite="strict",
     )
 
 

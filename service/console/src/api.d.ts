@@ -115,6 +115,7 @@ export interface components {
             formats: ("colmap" | "nerfstudio" | "nuscenes" | "mcap" | "copc" | "geopackage" | "geotiff" | "kitti" | "geojson")[];
             image_size_px?: number | null;
             crs?: string | null;
+            component?: number | null;
         };
         ExportResource: {
             /** Format: date-time */
@@ -127,6 +128,7 @@ export interface components {
             formats: string[];
             image_size_px?: number | null;
             crs?: string | null;
+            component?: number | null;
             job_id: string;
             state: components["schemas"]["JobState"];
             problem?: components["schemas"]["Problem"] | null;

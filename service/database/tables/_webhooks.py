@@ -36,6 +36,7 @@ class WebhookDelivery(Base):
         UniqueConstraint("webhook_id", "job_id"),  # a job ends once
         Index(None, "webhook_id", "created_us", "id"),
         Index(None, "state", "next_us"),
+        Index(None, "webhook_id", "state", "next_us"),
     )
 
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=lambda: new_id("msg"))

@@ -20,6 +20,7 @@ from service.client import ApiError, AsyncClient, Client, ClientError, download,
 from service.client import api as client_api
 from service.commands.client_program import main
 from service.domain import exports
+from tests.helpers.live_api import SCENE_FILES
 from tests.helpers.live_api import Client as Owner
 from tests.service.client.conftest import Connect
 
@@ -73,7 +74,7 @@ def test_scenes_maps_and_jobs(client: Owner, connect: Connect) -> None:
 
 
 def test_an_export_is_asked_for_and_downloaded(client: Owner, connect: Connect, tmp_path: Path) -> None:
-    library, scene_id = connect(client), client.scene({"points.ply": b"ply"})
+    library, scene_id = connect(client), client.scene(SCENE_FILES)
     asked = ExportRequest(formats=["kitti"])
     export = library.export_scene(scene_id, asked)
     publish(client, export.job_id)
@@ -145,7 +146,7 @@ def test_commands(
     client: Owner, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("MRASFM_API_KEY", client.key)
-    scene_id = client.scene({"points.ply": b"ply", "report.json": b"{}"})
+    scene_id = client.scene({**SCENE_FILES, "report.json": b"{}"})
     code, told = run(client, capsys, "list", "scenes")
     assert (code, [item["id"] for item in told["items"]]) == (0, [scene_id])
     assert main(["list", "scenes", "--url", client.api.url]) == 0
