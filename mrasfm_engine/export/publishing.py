@@ -54,8 +54,9 @@ def publishing(
         try:
             with _held(work):
                 yield work
-            with while_nothing_moves(out):
-                _put_in_place(work, out, replaced() if callable(replaced) else replaced)
+            if not _appears(work, out):
+                with while_nothing_moves(out):
+                    _put_in_place(work, out, replaced() if callable(replaced) else replaced)
         finally:
             shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
@@ -65,8 +66,12 @@ def publishing(
 
 @contextmanager
 def while_nothing_moves(out: Path) -> Iterator[None]:
-    """Keep other runs from moving their results into `out`: until they have, what is there is no whole result."""
-    with _held(out.resolve().parent, wait=True):
+    """Keep other runs from moving their results into `out`: until they have, what is there is no whole result.
+
+    The lock is that of `out` alone: whoever runs this may hold the folder around it. Nothing moves one by one into a
+    folder that is not there.
+    """
+    with _held(out.resolve(), wait=True):
         yield
 
 
@@ -179,10 +184,20 @@ def _prepare(needed: int, out: Path, home: Path) -> None:
         )
 
 
-def _put_in_place(work: Path, out: Path, replaced: Sequence[str]) -> None:
-    if not out.exists():
+def _appears(work: Path, out: Path) -> bool:
+    """Move the folder to where nothing is; False where there is something, also since just now."""
+    if out.exists():
+        return False
+    try:
         work.rename(out)
-        return
+    except OSError as problem:
+        if problem.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            return False
+        raise
+    return True
+
+
+def _put_in_place(work: Path, out: Path, replaced: Sequence[str]) -> None:
     items = sorted(work.iterdir(), key=lambda item: item.name == COMPLETE_MARK)
     moved: list[tuple[Path, Path]] = []  # from, to
 

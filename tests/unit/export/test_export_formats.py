@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -288,6 +289,37 @@ def _publish(out: Path, *names: str) -> None:
             (work / name).mkdir()
             (work / name / "new").touch()
         (work / "report.json").write_text("new")
+
+
+def test_whoever_runs_it_may_hold_the_folder_around_it(tmp_path: Path) -> None:
+    """As the service's workers do: their lock tells others that a job's folder is in use."""
+    with ThreadPoolExecutor(1) as pool:
+        descriptor = os.open(tmp_path, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            for _ in range(2):  # into a new folder, and into one that is there
+                pool.submit(_publish, tmp_path / "out", "a").result(timeout=20)
+        finally:
+            os.close(descriptor)  # also lets a thread go on that waits for it
+    assert (tmp_path / "out" / "report.json").read_text() == "new"
+
+
+def test_a_folder_that_appears_at_the_last_moment_is_replaced_as_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, exists = tmp_path / "out", Path.exists
+
+    def appearing(path: Path) -> bool:
+        before = exists(path)
+        if path == out and not before and [*tmp_path.glob(".out.partial*/report.json")]:
+            out.mkdir()
+            (out / "report.json").write_text("of a faster run")
+        return before
+
+    monkeypatch.setattr(Path, "exists", appearing)
+    _publish(out, "a")
+    assert (out / "report.json").read_text() == "new"
+    assert {path.name for path in out.iterdir()} == {"a", "report.json"}
 
 
 def test_what_was_there_is_there_again_where_moving_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
