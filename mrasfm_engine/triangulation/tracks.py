@@ -14,7 +14,7 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.semantics import UNKNOWN, majority_class
-from mrasfm_engine.types import Bools, Bytes, Floats, Ints
+from mrasfm_engine.types import Bools, Bytes, Floats, Ints, Ints32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +56,11 @@ class Keypoints:
         """
         unit = np.array([image.unit for image in drive.images], dtype=np.int64)
         kept = [pair if unit[pair.image_a] == unit[pair.image_b] else _inliers_of(pair) for pair in pairs]
-        is_used = [np.zeros(len(f.xy_px), dtype=np.bool_) for f in features]
+        matched: list[list[Ints32]] = [[np.zeros(0, dtype=np.int32)] for _ in features]
         for pair in kept:
-            is_used[pair.image_a][pair.matches[:, 0]] = True
-            is_used[pair.image_b][pair.matches[:, 1]] = True
-        numbers = [np.flatnonzero(used) for used in is_used]
+            matched[pair.image_a].append(pair.matches[:, 0])
+            matched[pair.image_b].append(pair.matches[:, 1])
+        numbers = [np.unique(np.concatenate(of_image)).astype(np.int64) for of_image in matched]
 
         def numbered_anew(pair: PairMatches) -> PairMatches:
             ends = (pair.image_a, pair.image_b)
@@ -78,8 +78,13 @@ class Keypoints:
         image = np.repeat(np.arange(len(features), dtype=np.int64), counts)
         unit_of_image = np.array([i.unit for i in drive.images], dtype=np.int64)
         camera_of_image = np.array([i.camera for i in drive.images], dtype=np.int64)
-        of_images = list(zip(features, numbers, strict=True))
-        xy = np.concatenate([f.xy_px[rows] for f, rows in of_images]).astype(np.float64).reshape(-1, 2)
+        positions, classes, is_masked = [], [], []
+        for found, rows in zip(features, numbers, strict=True):
+            known = found.classes  # which, as all arrays of an image, may be read from a file at every use
+            positions.append(found.xy_px[rows])
+            classes.append(known[rows])
+            is_masked.append(bool((known != UNKNOWN).any()))
+        xy = np.concatenate(positions).astype(np.float64).reshape(-1, 2)
         camera = camera_of_image[image]
         rays = np.empty((len(xy), 3))
         kinds, params = pack_cameras(drive.cameras)
@@ -95,8 +100,8 @@ class Keypoints:
             band=image if bands is None else bands.of_pixels(image, xy),
             xy_px=xy,
             rays=rays,
-            classes=np.concatenate([f.classes[rows] for f, rows in of_images]),
-            is_masked=np.array([bool((f.classes != UNKNOWN).any()) for f in features]),
+            classes=np.concatenate(classes),
+            is_masked=np.array(is_masked),
         )
 
 
