@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 from alembic import command
@@ -63,15 +64,21 @@ def test_migrating_again_and_at_once_changes_nothing(database_settings: Settings
     database.close()
 
 
+def _migrated_with(settings: Settings, version: str, records: Sequence[str]) -> Database:
+    """A database of an older version with records, upgraded to the newest."""
+    database = Database.from_settings(settings)
+    _upgrade(database, version)
+    with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
+        for statement in records:
+            connection.execute(text(statement))
+    migrate(settings)
+    assert differences(database) == []
+    return database
+
+
 def test_records_of_the_first_schema_stay(database_settings: Settings) -> None:
     """SQLite copies a table to change it: what refers to the old one must not go with it."""
-    database = Database.from_settings(database_settings)
-    _upgrade(database, "0001")
-    with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
-        for statement in _FIRST_RECORDS:
-            connection.execute(text(statement))
-    migrate(database_settings)
-    assert differences(database) == []
+    database = _migrated_with(database_settings, "0001", _FIRST_RECORDS)
     with database.read() as session:
         job = session.get_one(Job, "job_1")
         assert (job.drive_id, job.map_id, job.is_child, job.waiting_for, job.children_percent) == (
@@ -105,13 +112,7 @@ _FIRST_RECORDS = (
 
 
 def test_records_of_sessions_exports_and_webhooks_stay(database_settings: Settings) -> None:
-    database = Database.from_settings(database_settings)
-    _upgrade(database, "0009")
-    with database.engine.connect().execution_options(mrasfm_begin="IMMEDIATE") as connection, connection.begin():
-        for statement in _LATER_RECORDS:
-            connection.execute(text(statement))
-    migrate(database_settings)
-    assert differences(database) == []
+    database = _migrated_with(database_settings, "0009", _LATER_RECORDS)
     with database.write() as session:
         assert session.query(ConsoleSession).one().expires_us == 2**53
         export = session.query(Export).one()
