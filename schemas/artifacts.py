@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from enum import StrEnum
 
 
@@ -111,20 +110,3 @@ def is_read_by_aggregation(path: str) -> bool:
 def is_read_by_next_version(path: str) -> bool:
     """Return whether an aggregation that goes on from a map's version reads this file of it."""
     return path in (MAP_FILE, REPORT_FILE) or path.startswith((f"{SCENES_FOLDER}/", f"{SEAMS_FOLDER}/"))
-
-
-# What every export reads; of a map besides calibration/NAME.json and SCENES_FOLDER/NAME.npz of each scene.
-_EXPORTED = (REPORT_FILE, "poses.json", "frame.json", "points.ply", "model/images.bin", "model/points3D.bin")
-EXPORTED_OF_SCENE = frozenset({*_EXPORTED, "manifest.json", "calibration.json"})
-EXPORTED_OF_MAP = frozenset({*_EXPORTED, MAP_FILE})
-
-
-def is_read_by_export(path: str, formats: Collection[str]) -> bool:
-    """Return whether an export in these formats reads this file of a scene or map, by its path in the folder that is
-    exported.
-
-    The picture of the road, which may be large, is read by its own format alone.
-    """
-    folders = (f"{OWN_CAR_FOLDER}/", f"{SCENES_FOLDER}/", "calibration/")
-    others = {ROAD_TIFF_FILE} if "geotiff" in formats else set()
-    return path in EXPORTED_OF_SCENE | EXPORTED_OF_MAP | others or path.startswith(folders)

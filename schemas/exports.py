@@ -6,8 +6,10 @@ documentation follow from the two.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+
+from schemas.artifacts import MAP_FILE, OWN_CAR_FOLDER, REPORT_FILE, ROAD_TIFF_FILE, SCENES_FOLDER
 
 MIN_IMAGE_SIZE_PX, MAX_IMAGE_SIZE_PX = 64, 20_000
 MAX_FORMATS = 32  # of one export
@@ -22,6 +24,8 @@ class ExportFormat:
     ----------
     needs_images
         Its writer reads the images of the drives.
+    needs_picture
+        Its writer reads the picture of the road, which may be large.
     needs_place
         Only a georeferenced scene or map has it.
     takes_crs
@@ -33,6 +37,7 @@ class ExportFormat:
     name: str
     description: str
     needs_images: bool = False
+    needs_picture: bool = False
     needs_place: bool = False
     takes_crs: bool = False
     without_crs: str = "its coordinates are those of the local frame"
@@ -76,6 +81,7 @@ EXPORT_FORMATS = {
         ExportFormat(
             name="geotiff",
             description="picture of the road from above as GeoTIFF in a coordinate reference system of your choice",
+            needs_picture=True,
             needs_place=True,
             takes_crs=True,
         ),
@@ -93,3 +99,19 @@ EXPORT_FORMATS = {
 def unknown_formats(names: Iterable[str]) -> list[str]:
     """Names that are of no format, each once."""
     return sorted(set(names) - EXPORT_FORMATS.keys())
+
+
+# What every export reads; of a map besides calibration/NAME.json and SCENES_FOLDER/NAME.npz of each scene.
+_EXPORTED = (REPORT_FILE, "poses.json", "frame.json", "points.ply", "model/images.bin", "model/points3D.bin")
+EXPORTED_OF_SCENE = frozenset({*_EXPORTED, "manifest.json", "calibration.json"})
+EXPORTED_OF_MAP = frozenset({*_EXPORTED, MAP_FILE})
+
+
+def is_read_by_export(path: str, formats: Collection[str]) -> bool:
+    """Return whether an export in these formats reads this file of a scene or map, by its path in the folder that is
+    exported.
+    """
+    if path == ROAD_TIFF_FILE:
+        return any(EXPORT_FORMATS[name].needs_picture for name in formats)
+    folders = (f"{OWN_CAR_FOLDER}/", f"{SCENES_FOLDER}/", "calibration/")
+    return path in EXPORTED_OF_SCENE | EXPORTED_OF_MAP or path.startswith(folders)

@@ -143,7 +143,7 @@ def _projected(scene: Scene, points_m: Floats, system: EarthSystem | None) -> Fl
 
 def _system_of(scene: Scene) -> EarthSystem | None:
     place = scene.georeference
-    return None if place is None else utm_system(place.origin_latitude_deg, place.origin_longitude_deg)
+    return None if place is None else utm_system(*place.origin_deg)
 
 
 def _chunks(scene: Scene, steps: Ints32, octree: Octree) -> Iterator[NDArray[np.void]]:

@@ -35,5 +35,4 @@ def write_copc_in_crs(work: ExportWork) -> Written:
 def _system(scene: Scene, crs: str | None) -> EarthSystem:
     place = scene.georeference
     assert place is not None
-    at = place.origin_latitude_deg, place.origin_longitude_deg
-    return utm_system(*at) if crs is None else named_system(crs, at=at)
+    return utm_system(*place.origin_deg) if crs is None else named_system(crs, at=place.origin_deg)

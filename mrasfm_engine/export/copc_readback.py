@@ -9,18 +9,17 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import lazrs
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
 from mrasfm_engine.export.comparisons import Row, Rows
+from mrasfm_engine.export.projection_readback import projected
 from mrasfm_engine.geometry import utm
-from mrasfm_engine.geometry.earth_system import area_around
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import ROAD
 from mrasfm_engine.types import Floats
@@ -231,14 +230,18 @@ def _nodes(found: CopcFile) -> Rows:
 def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
     header, information = found.header, found.information
     offset_m = header["offset"]
-    system = None
-    if scene.georeference is not None:
-        place, text = scene.georeference, found.records[2].data
-        code = utm.epsg_code(place.origin_latitude_deg, place.origin_longitude_deg)
+    place, system = scene.georeference, None
+    if place is not None:
+        text = found.records[2].data
+        code = utm.epsg_code(*place.origin_deg)
         expected = utm.well_known_text(code) if wanted is None else wanted
         yield Row("its coordinate reference system", text, expected.encode() + b"\0")
-        system = _transformer(text, place.origin_latitude_deg, place.origin_longitude_deg)
-    origin_m = np.zeros(3) if system is None else _projected(scene, np.zeros((1, 3)), system)[0] - 0.5
+        system = CRS.from_wkt(text.decode("ascii").removesuffix("\0"))
+
+    def in_system(points_m: Floats) -> Floats:
+        return points_m if place is None or system is None else projected(place, points_m, system)
+
+    origin_m = np.zeros(3) if system is None else in_system(np.zeros((1, 3)))[0] - 0.5
     yield Row("its offset, whole metres,", offset_m, np.rint(offset_m))
     yield Row("its offset", offset_m, origin_m, 0.0 if system is None else 0.5 + 1e-6)
     lengths = np.bincount(scene.observation_point, minlength=len(scene.points_m))
@@ -252,9 +255,7 @@ def _points(scene: Scene, found: CopcFile, wanted: str | None) -> Rows:
         unseen[index] = False
         steps = np.stack([points[axis] for axis in "xyz"], -1).astype(np.int64)
         low, high = np.minimum(low, steps.min(axis=0)), np.maximum(high, steps.max(axis=0))
-        points_m = scene.points_m[index]
-        expected_m = points_m if system is None else _projected(scene, points_m, system)
-        yield Row("a point", steps, (expected_m - offset_m) / STEP_M, TIE)
+        yield Row("a point", steps, (in_system(scene.points_m[index]) - offset_m) / STEP_M, TIE)
         side_m = np.repeat(information["half"] * 2.0 ** (1 - nodes["level"]), nodes["count"])[:, None]
         corner_m = cube_m + np.repeat(nodes["place"], nodes["count"], axis=0) * side_m
         inside = np.abs(steps * STEP_M + offset_m - corner_m - side_m / 2) - side_m / 2
@@ -283,27 +284,6 @@ def _components(scene: Scene) -> NDArray[np.int64]:
     found = np.zeros(len(scene.points_m), dtype=np.int64)
     found[scene.observation_point[::-1]] = scene.unit_component[unit][::-1]  # the first of each point is written last
     return found
-
-
-@cache
-def _transformer(text: bytes, latitude_deg: float, longitude_deg: float) -> Transformer:
-    """Transformer of longitude, latitude and height to the system that the file names, as it is best at a place."""
-    system = CRS.from_wkt(text.decode("ascii").removesuffix("\0"))
-    area = area_around(latitude_deg, longitude_deg)
-    return Transformer.from_crs("EPSG:4979", system, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
-
-
-@cache
-def _geodetic() -> Transformer:
-    """Transformer of earth-centred coordinates: PROJ would put them on another system's ellipsoid, 0.1 mm off."""
-    return Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-
-
-def _projected(scene: Scene, points_m: Floats, system: Transformer) -> Floats:
-    assert scene.georeference is not None
-    matrix = scene.georeference.ecef_from_local
-    places = _geodetic().transform(*(points_m @ matrix[:3, :3].T + matrix[:3, 3]).T)
-    return np.stack(system.transform(*places), -1)
 
 
 def _classification(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:

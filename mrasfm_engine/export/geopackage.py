@@ -87,7 +87,11 @@ def write_geopackage(scene: Scene, scene_of_unit: Sequence[str], path: Path, sys
             + "".join(f"CREATE TABLE {name} ({columns});" for name, columns in TABLES.items())
         )
         with db:
-            content = (*_content_rows(scene, system), *_feature_rows(scene, scene_of_unit, system))
+            rig, cameras = (_positions(scene, poses, system) for poses in (scene.world_from_rig, scene.world_from_cam))
+            content = (
+                *_content_rows(scene, system, rig, cameras),
+                *_feature_rows(scene, scene_of_unit, system, rig, cameras),
+            )
             for table, rows in filter(itemgetter(1), content):
                 db.executemany(f"INSERT INTO {table} VALUES ({', '.join('?' * len(rows[0]))})", rows)
         return write_content(path, db.serialize())
@@ -126,8 +130,10 @@ def _date(timestamp_us: int) -> str | None:
     return f"{np.datetime64((timestamp_us + 500) // 1000, 'ms')}Z"
 
 
-def _content_rows(scene: Scene, system: EarthSystem | None) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
-    """Rows of the tables that describe the others, by table."""
+def _content_rows(
+    scene: Scene, system: EarthSystem | None, rig: Floats, cameras: Floats
+) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
+    """Rows of the tables that describe the others, by table; positions (n, 3) are in the file's system."""
     srs = _srs_id(scene, system)
     yield (
         "gpkg_spatial_ref_sys",
@@ -138,7 +144,6 @@ def _content_rows(scene: Scene, system: EarthSystem | None) -> Iterator[tuple[st
             *([] if system is None else [_system_row(system)]),
         ],
     )
-    rig, cameras = (_positions(scene, poses, system) for poses in (scene.world_from_rig, scene.world_from_cam))
     # No time of writing: the same scene is the same file.
     last_change = _date(int(scene.drive.timestamps_us.max())) or NO_DATE
     yield (
@@ -161,11 +166,10 @@ def _system_row(system: EarthSystem) -> tuple[Any, ...]:
 
 
 def _feature_rows(
-    scene: Scene, scene_of_unit: Sequence[str], system: EarthSystem | None
+    scene: Scene, scene_of_unit: Sequence[str], system: EarthSystem | None, rig: Floats, cameras: Floats
 ) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
     """Rows of the tables with geometries, by table."""
     srs, drive, component = _srs_id(scene, system), scene.drive, scene.unit_component.tolist()
-    rig, cameras = (_positions(scene, poses, system) for poses in (scene.world_from_rig, scene.world_from_cam))
     lines: list[tuple[Any, ...]] = []
     # No line leads from one component to another: nothing links them.
     for name, number in dict.fromkeys(zip(scene_of_unit, component, strict=True)):

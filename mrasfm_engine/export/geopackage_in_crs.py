@@ -16,8 +16,7 @@ def write_geopackage_in_crs(work: ExportWork) -> Written:
     source, crs = work.source, work.options.crs
     place = source.scene.georeference
     assert place is not None
-    at = place.origin_latitude_deg, place.origin_longitude_deg
-    system = None if crs is None else named_system(crs, at=at)
+    system = None if crs is None else named_system(crs, at=place.origin_deg)
     digest = geopackage.write_geopackage(source.scene, source.scene_of_unit, work.folder / TRAJECTORY_FILE, system)
     compare = partial(geopackage_readback.geopackage, source.scene, source.scene_of_unit, crs=crs)
     check = Check(TRAJECTORY_FILE, geopackage_readback.read_geopackage, compare)

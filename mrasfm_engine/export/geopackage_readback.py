@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.geopackage import DESCRIPTIONS, ELLIPSOIDAL, HEIGHTS, IN_DATUM, LOCAL, TABLES
 from mrasfm_engine.export.pose_files import geodetic_positions
-from mrasfm_engine.geometry.earth_system import area_around
+from mrasfm_engine.export.projection_readback import projected
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
 
@@ -115,10 +115,8 @@ def _contents(
     rows = sorted(select("SELECT * FROM gpkg_contents"))
     yield Row("its contents", [(*row[:5], *row[9:]) for row in rows], described)
     for row in rows:
-        if tolerance is None or None in extents[row[0]]:
-            yield Row(f"the extent of {row[0]}", list(row[5:9]), extents[row[0]])
-        else:
-            yield Row(f"the extent of {row[0]}", list(row[5:9]), extents[row[0]], tolerance)
+        extent = extents[row[0]]
+        yield Row(f"the extent of {row[0]}", list(row[5:9]), extent, None if None in extent else tolerance)
     geometries = [(t, "geom", "LINESTRING" if t == "trajectory" else "POINT", srs, 1, 0) for t in sorted(extents)]
     yield Row("its geometry columns", sorted(select("SELECT * FROM gpkg_geometry_columns")), geometries)
 
@@ -217,15 +215,10 @@ def _places(scene: Scene, poses: Floats, system: tuple[Any, ...] | None) -> Floa
 def _projected(scene: Scene, poses: Floats, system: tuple[Any, ...]) -> Floats:
     place = scene.georeference
     assert place is not None
-    ecef = poses[:, :3, 3] @ place.ecef_from_local[:3, :3].T + place.ecef_from_local[:3, 3]
-    known = np.isfinite(ecef).all(axis=1)
-    geodetic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*ecef[known].T)
-    crs = CRS.from_wkt(system[4])
-    target = crs if system[2] == "NONE" else crs.to_3d()
-    area = area_around(place.origin_latitude_deg, place.origin_longitude_deg)
-    transformer = Transformer.from_crs("EPSG:4979", target, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
-    places = np.full(ecef.shape, np.nan)
-    places[known] = np.stack(transformer.transform(*geodetic), -1)
+    points_m, crs = poses[:, :3, 3], CRS.from_wkt(system[4])
+    known = np.isfinite(points_m).all(axis=1)
+    places = np.full(points_m.shape, np.nan)
+    places[known] = projected(place, points_m[known], crs if system[2] == "NONE" else crs.to_3d())
     return places
 
 

@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource, ExportWork, Written
+from mrasfm_engine.export.projection_readback import projected
 from mrasfm_engine.geometry import utm
-from mrasfm_engine.geometry.earth_system import EarthSystem, area_around, named_system
+from mrasfm_engine.geometry.earth_system import EarthSystem, named_system
 from mrasfm_engine.io import tiff
 from mrasfm_engine.types import Floats, Ints
 from schemas.artifacts import ROAD_TIFF_FILE
@@ -78,8 +79,7 @@ def write_geotiff_in_crs(work: ExportWork) -> Written:
     picture = _picture(source)
     place = source.scene.georeference
     assert place is not None
-    at = place.origin_latitude_deg, place.origin_longitude_deg
-    system = named_system(work.options.crs or f"EPSG:{utm.epsg_code(*at)}", at=at)
+    system = named_system(work.options.crs or f"EPSG:{utm.epsg_code(*place.origin_deg)}", at=place.origin_deg)
     pixels = picture.corners()
     places = system.projected(on_the_ground(source, picture, pixels), place.ecef_from_local)[:, :2]
     system_from_pixel, off_cells = _fitted(pixels, places)
@@ -189,14 +189,9 @@ def _compare(source: ExportSource, own: Picture, crs: str, found: Picture) -> Ro
         yield Row(f"the tiles of level {level}", _tiles(found, level), _tiles(own, level))
     place = source.scene.georeference
     assert place is not None
-    points = on_the_ground(source, own, own.corners())
-    ecef = points @ place.ecef_from_local[:3, :3].T + place.ecef_from_local[:3, 3]
-    geodetic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*ecef.T)
-    target = CRS.from_epsg(code).to_3d()
-    area = area_around(place.origin_latitude_deg, place.origin_longitude_deg)
-    to_system = Transformer.from_crs("EPSG:4979", target, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
-    expected = np.stack(to_system.transform(*geodetic), -1)[:, :2]
-    pixels = np.column_stack([own.corners(), np.ones(len(points))])
+    corners = own.corners()
+    expected = projected(place, on_the_ground(source, own, corners), CRS.from_epsg(code).to_3d())[:, :2]
+    pixels = np.column_stack([corners, np.ones(len(corners))])
     cell = float(np.sqrt(abs(np.linalg.det(found.world_from_pixel[:, :2]))))
     yield Row("a tile's place", pixels @ found.world_from_pixel.T, expected, 1.01 * MOST_OFF_CELLS * cell)
 

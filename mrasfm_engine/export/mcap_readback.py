@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyproj import Transformer
 
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.contract import ExportSource
 from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.mcap_cameras import SentCamera
+from mrasfm_engine.export.projection_readback import geodetic
 from mrasfm_engine.export.readers import transforms
 from mrasfm_engine.types import Floats
 
@@ -181,9 +181,7 @@ class _Known:
         scene, georeference = self._source.scene, self._source.scene.georeference
         assert georeference is not None
         unit = self._units[message.frame_id, time_ns]
-        ecef = georeference.ecef_from_local @ np.append(scene.world_from_rig[unit][:3, 3], 1.0)
-        to_geodetic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-        longitude, latitude, height = to_geodetic.transform(*ecef[:3])
+        longitude, latitude, height = geodetic(georeference, scene.world_from_rig[unit][None, :3, 3])[0]
         yield Row("a longitude and latitude", [message.longitude, message.latitude], [longitude, latitude], DEGREES)
         yield Row("a height", message.altitude, height, METRES)
         sigmas_m = scene.sigma_position_m[unit]

@@ -309,7 +309,7 @@ def _size_bytes(request: ExportRequest, source: ExportSource) -> int:
     for known in (EXPORT_FORMATS[name] for name in request.formats):
         total += POINT_BYTES * len(scene.points_m) + IMAGE_BYTES * len(scene.drive.images)
         total += 2 * images if known.needs_images else 0
-        total += _bytes(source.folder / ROAD_TIFF_FILE) if known.name == "geotiff" else 0
+        total += _bytes(source.folder / ROAD_TIFF_FILE) if known.needs_picture else 0
     return total
 
 

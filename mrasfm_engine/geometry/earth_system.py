@@ -127,7 +127,7 @@ def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
         well_known_text=text,
         horizontal=int(match[1]),
         has_vertical=vertical is not None,
-        transformer=_transformer(name, target, at),
+        transformer=best_transformer(CRS.from_user_input(_SOURCE), target, at=at, name=name),
     )
 
 
@@ -159,10 +159,6 @@ def area_around(latitude_deg: float, longitude_deg: float) -> AreaOfInterest:
     south, north = max(latitude_deg - _SCENE_DEG, -90.0), min(latitude_deg + _SCENE_DEG, 90.0)
     west, east = (((longitude_deg + side * _SCENE_DEG + 180.0) % 360.0) - 180.0 for side in (-1, 1))
     return AreaOfInterest(west, south, east, north)
-
-
-def _transformer(name: str, target: CRS, at: tuple[float, float]) -> Transformer:
-    return best_transformer(CRS.from_user_input(_SOURCE), target, at=at, name=name)
 
 
 def best_transformer(source: CRS, target: CRS, *, at: tuple[float, float], name: str) -> Transformer:

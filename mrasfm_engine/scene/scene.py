@@ -74,6 +74,11 @@ class Georeference:
     height_datum: str  # as declared in the manifest; the origin's height is ellipsoidal all the same
     ecef_from_local: Floats  # (4, 4), EPSG:4978
 
+    @property
+    def origin_deg(self) -> tuple[float, float]:
+        """Latitude and longitude of the origin."""
+        return self.origin_latitude_deg, self.origin_longitude_deg
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCalibration:

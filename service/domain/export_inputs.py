@@ -13,8 +13,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportRequest
-from schemas.artifacts import EXPORTED_OF_MAP, EXPORTED_OF_SCENE, ROAD_TIFF_FILE, component_folder, is_read_by_export
-from schemas.exports import EXPORT_FORMATS
+from schemas.artifacts import ROAD_TIFF_FILE, component_folder
+from schemas.exports import EXPORT_FORMATS, EXPORTED_OF_MAP, EXPORTED_OF_SCENE, is_read_by_export
 from service.database.tables import Blob, Drive, Export, MapFile, MapScene, MapVersion, Scene, SceneFile
 from service.domain.map_inputs import StoredArtifact
 from service.errors import ComponentUnknown, CrsNotTaken, DriveDeleted, FilesMissing, NotGeoreferenced
@@ -174,9 +174,10 @@ class ExportInputs:
                 f"{self.name} has no {missing[0]}, which exports read",
                 remedy="Another version of the service made it: make it again with this one.",
             )
-        if "geotiff" in self.formats and ROAD_TIFF_FILE not in there:
+        needing = [name for name in self.formats if EXPORT_FORMATS[name].needs_picture]
+        if needing and ROAD_TIFF_FILE not in there:
             raise FilesMissing(
-                f"{self.name} has no picture of the road, which format geotiff is made of",
+                f"{self.name} has no picture of the road, which format {needing[0]} is made of",
                 remedy="Leave the format out; a scene has the picture where the setting output.pictures is on.",
             )
 

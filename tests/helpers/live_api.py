@@ -20,7 +20,7 @@ import httpx
 
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
-from schemas.artifacts import EXPORTED_OF_MAP, EXPORTED_OF_SCENE
+from schemas.exports import EXPORTED_OF_MAP, EXPORTED_OF_SCENE
 from service.api.app import create_app
 from service.api.server import server_of
 from service.database.connections import Database, migrate

@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 
 from mrasfm_engine.aggregation.load import NEEDED
-from schemas.artifacts import is_read_by_aggregation, is_read_by_export
+from schemas.artifacts import is_read_by_aggregation
+from schemas.exports import is_read_by_export
 
 
 def test_an_aggregation_fetches_what_it_needs() -> None:
