@@ -182,9 +182,10 @@ def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Spa
     stages.load_models(run)
     stages.preflight(run)
     prior = stages.leave_out_standing(run, stages.prior(run))
-    if not stages.is_cut(run):  # else the probe came before
-        stages.probe(run)
+    was_cut = stages.is_cut(run)
     spans = stages.cut_drive(run, workers)
     stages.own_cars(run)
     stages.extraction_sizes(run)
+    if not was_cut:  # else the probe came before
+        stages.probe(run)
     return prior, spans

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -160,6 +160,7 @@ def features_by_image(
     segmenter: Segmenter | None = None,
     class_margin_px: int = 2,
     own_cars: Sequence[Bools | None] = (),
+    known: Mapping[str, ImageFeatures] | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> Generator[ImageFeatures | Incomplete]:
@@ -174,6 +175,8 @@ def features_by_image(
     An image whose pixels are not all there is left out, with the reason in the place of its features: the grey that
     fills it up has texture at its border.
 
+    Images whose features are `known`, by file, are not read: they were extracted with these very arguments.
+
     Raises
     ------
     InputError
@@ -187,8 +190,11 @@ def features_by_image(
     def one(index: int) -> ImageFeatures | Incomplete:
         if cancel is not None and cancel():
             raise CancelledError
+        file = drive.images[index].file
+        if known is not None and file in known:
+            return known[file]
         try:
-            rgb = read_image_rgb(drive.root / drive.images[index].file)
+            rgb = read_image_rgb(drive.root / file)
         except IncompleteImageError as problem:
             return problem.reason
         masked = masks.of_image(index, rgb)

@@ -43,12 +43,15 @@ def read_image_rgb(path: Path) -> Bytes:
     data, header = _load(path)
     if header.format == "JPEG":
         return decode_jpeg(data, "RGB", header, path)
-    if not _needs_conversion(header):
-        image = _to_8_bits(decode_png(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, header, path))
-    else:
+    if _needs_conversion(header):
         image = _to_8_bits(decode_png(data, cv2.IMREAD_UNCHANGED, header, path))
+    elif header.kind is ImageKind.GRAY:
+        image = _to_8_bits(decode_png(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, header, path))
+    else:
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        return _to_8_bits(decode_png(data, flags, header, path))
     if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=2)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
     return np.ascontiguousarray(image[..., 2::-1])
 
 

@@ -1,7 +1,10 @@
-"""Products of matrices of bytes, exact, in half the time of those of floats.
+"""Products of matrices of bytes, exact, in a quarter to half of the time of those of floats.
 
 Processors multiply and add four bytes where they would one float, but BLAS has no such product. onnxruntime has one for
 every kind of processor, as the operator MatMulInteger; this module writes the graph with that one operator.
+
+Most processors have the instruction for bytes without a sign times bytes with one. Where it is missing, onnxruntime
+adds such products in 16 bits, which overflow: it is tried once, and there both sides have no sign, at half the speed.
 """
 
 from __future__ import annotations
@@ -12,27 +15,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.learned.network import Network
-from mrasfm_engine.types import Bytes
+from mrasfm_engine.types import Bytes, Ints32
 
 IR_VERSION, OPERATORS_VERSION = 8, 13  # of ONNX
-UINT8, INT32 = 2, 6  # element types of ONNX
+UINT8, INT8, INT32 = 2, 3, 6  # element types of ONNX
+SIGN = 128  # what bytes with a sign are smaller by
+TRIED = (64, 128, 64)  # shape of the products that are tried: several of every kernel's blocks
 
 
-def product_of_bytes(a: Bytes, b: Bytes) -> NDArray[np.int32]:
-    """Matrix product (n, m) of bytes (n, k) and (k, m)."""
-    return _operator().run({"a": a, "b": b})["y"]
+def right_side(rows: Bytes) -> NDArray[np.int8] | Bytes:
+    """The right side (k, m) of a product, of its columns as rows (m, k)."""
+    columns = np.ascontiguousarray(rows.T)
+    return (columns ^ SIGN).view(np.int8) if _signs_are_exact() else columns
+
+
+def product_of_bytes(a: Bytes, b: NDArray[np.int8] | Bytes) -> Ints32:
+    """Matrix product (n, m) of bytes (n, k) and what `right_side` made (k, m), less `missing` of each row."""
+    return np.asarray(_operator(b.dtype == np.int8).run({"a": a, "b": b})["y"], dtype=np.int32)
+
+
+def missing(a: Bytes) -> Ints32:
+    """What all products with a row of bytes (n, k) are short of (n,)."""
+    sums = a.sum(axis=1, dtype=np.int32)
+    return SIGN * sums if _signs_are_exact() else np.zeros_like(sums)
 
 
 @cache
-def _operator() -> Network:
-    return Network("product of bytes", _model(), gpu=False)
+def _signs_are_exact() -> bool:
+    """Return whether this processor adds the largest products without overflow."""
+    n, k, m = TRIED
+    a, b = np.full((n, k), 255, np.uint8), np.full((k, m), 127, np.int8)
+    b[:, ::2] = -128
+    return np.array_equal(product_of_bytes(a, b), a.astype(np.int32) @ b.astype(np.int32))
 
 
-def _model() -> bytes:
+@cache
+def _operator(signed: bool) -> Network:
+    return Network("product of bytes", _model(INT8 if signed else UINT8), gpu=False)
+
+
+def _model(right: int) -> bytes:
     """The file: an ONNX ModelProto, of which the numbers are those of the fields in onnx.proto."""
     node = _field(1, b"a") + _field(1, b"b") + _field(2, b"y") + _field(4, b"MatMulInteger")
     graph = _field(1, node) + _field(2, b"product")
-    graph += _field(11, _value(b"a", UINT8, b"n", b"k")) + _field(11, _value(b"b", UINT8, b"k", b"m"))
+    graph += _field(11, _value(b"a", UINT8, b"n", b"k")) + _field(11, _value(b"b", right, b"k", b"m"))
     graph += _field(12, _value(b"y", INT32, b"n", b"m"))
     operators = _field(1, b"") + _number(2, OPERATORS_VERSION)
     return _number(1, IR_VERSION) + _field(7, graph) + _field(8, operators)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.learned.catalogue import Method
-from mrasfm_engine.matching.integer_products import product_of_bytes
+from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints32
 
+ROWS = 256  # of a product that exist at one time: as many as a core's cache holds
 LANES = 64  # columns that are taken at once, in vector registers; a column belongs to lane column % LANES
 
 
@@ -35,26 +36,35 @@ def _take_columns(row: Any, col_top: Any) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _scale(products: Any, factor: Any, factors: Any, out: Any) -> None:
-    """Cosines (m,) of products and the inverse lengths of both sides."""
+def _scale(products: Any, missing: Any, factor: Any, factors: Any, out: Any) -> None:
+    """Cosines (m,) of products, of what all of them are short of, and of the inverse lengths of both sides."""
     for j in range(len(out)):
-        out[j] = np.float32(products[j]) * (factor * factors[j])
+        out[j] = np.float32(products[j] + missing) * (factor * factors[j])
 
 
 @njit(cache=True, nogil=True)
-def _mutual_ratio(products: Any, factors_a: Any, factors_b: Any, ratio2: float) -> Any:
-    """One pass over products (n, m) of descriptors with inverse lengths (n,) and (m,): mutual best pairs whose distance
-    passes the ratio test.
+def _take_rows(
+    products: Any,
+    missing: Any,
+    factors_a: Any,
+    factors_b: Any,
+    ratio2: float,
+    col_top: Any,
+    row_top: Any,
+    row_best: Any,
+) -> None:
+    """Take products (n, m) of descriptors into the columns' largest cosines (m,), and find each row's best column (n,).
+
+    Rows whose best column does not pass the ratio test of distances have none (-1). `missing` (n,) is added to the
+    products, (n,) and (m,) are inverse lengths.
 
     The loops over a row have neither branches nor indices of what is best: that runs in vector registers, and the best
-    column is found in its lane afterwards. Of rows that are equally near to a column the first that passes is taken.
+    column is found in its lane afterwards.
     """
     n, m = products.shape
-    col_top, is_taken = np.full(m, -2.0, np.float32), np.zeros(m, np.bool_)
-    row_top, row_best = np.empty(n, np.float32), np.full(n, -1, np.int32)
     top, second, row = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(m, np.float32)
     for i in range(n):
-        _scale(products[i], factors_a[i], factors_b, row)
+        _scale(products[i], missing[i], factors_a[i], factors_b, row)
         top[:] = -2.0
         second[:] = -2.0
         for start in range(0, m, LANES):
@@ -66,15 +76,25 @@ def _mutual_ratio(products: Any, factors_a: Any, factors_b: Any, ratio2: float) 
             next_largest = max(next_largest, max(second[k], min(largest, top[k])))
             if top[k] > largest:
                 largest, lane = top[k], k
+        row_best[i] = -1
         # For unit vectors the squared distance is 2 - 2 similarity.
         if (1.0 - largest) < ratio2 * (1.0 - next_largest):
             for j in range(lane, m, LANES):
                 if row[j] == largest:
                     row_top[i], row_best[i] = largest, j
                     break
-    out = np.empty((n, 2), np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _mutual(col_top: Any, row_top: Any, row_best: Any) -> Any:
+    """Pairs (k, 2) of rows (n,) and their best columns (m,) that are best for both.
+
+    Of rows that are equally near to a column the first is taken.
+    """
+    is_taken = np.zeros(len(col_top), np.bool_)
+    out = np.empty((len(row_best), 2), np.int32)
     count = 0
-    for i in range(n):
+    for i in range(len(row_best)):
         j = row_best[i]
         if j >= 0 and row_top[i] == col_top[j] and not is_taken[j]:
             is_taken[j] = True
@@ -88,7 +108,8 @@ class Prepared:
     """Descriptors of an image as the matcher needs them."""
 
     rows: NDArray[Any]  # (n, D) bytes or floats
-    columns: NDArray[Any]  # (D, n)
+    columns: NDArray[Any]  # (D, n), of bytes as `integer_products.right_side` makes them
+    missing: Ints32 | Floats32  # (n,) what products of bytes with a row are short of
     inverse_lengths: Floats32  # (n,)
 
     def __len__(self) -> int:
@@ -105,17 +126,34 @@ class NearestNeighbourMatcher:
         """The descriptors and their lengths; the image's size does not matter."""
         rows: NDArray[Any] = np.ascontiguousarray(features.descriptors)
         lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
+        inverse = (1.0 / np.maximum(lengths, 1e-6)).astype(np.float32)
+        if rows.dtype == np.uint8:
+            return Prepared(rows, right_side(rows), missing(rows), inverse)
         # Floats that BLAS transposes on the way need no second copy.
-        columns = np.ascontiguousarray(rows.T) if rows.dtype == np.uint8 else rows.T
-        return Prepared(rows, columns, (1.0 / np.maximum(lengths, 1e-6)).astype(np.float32))
+        return Prepared(rows, rows.T, np.zeros(len(rows), np.float32), inverse)
 
     def match(self, a: Prepared, b: Prepared) -> Ints32:
         """See `Matcher`."""
         if len(a) < 2 or len(b) < 2:
             return np.zeros((0, 2), np.int32)
-        are_bytes = a.rows.dtype == np.uint8 and b.rows.dtype == np.uint8
-        products = product_of_bytes(a.rows, b.columns) if are_bytes else a.rows @ b.columns
-        result: Ints32 = _mutual_ratio(products, a.inverse_lengths, b.inverse_lengths, self._ratio2)
+        col_top = np.full(len(b), -2.0, np.float32)
+        row_top, row_best = np.empty(len(a), np.float32), np.empty(len(a), np.int32)
+        for start in range(0, len(a), ROWS):
+            rows = slice(start, start + ROWS)
+            products = (
+                product_of_bytes(a.rows[rows], b.columns) if a.rows.dtype == np.uint8 else a.rows[rows] @ b.columns
+            )
+            _take_rows(
+                products,
+                a.missing[rows],
+                a.inverse_lengths[rows],
+                b.inverse_lengths,
+                self._ratio2,
+                col_top,
+                row_top[rows],
+                row_best[rows],
+            )
+        result: Ints32 = _mutual(col_top, row_top, row_best)
         return result
 
 

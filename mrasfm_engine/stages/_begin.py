@@ -43,19 +43,25 @@ def prior(run: Run) -> PriorTrajectory:
 
 
 def probe(run: Run) -> None:
-    """Check on the first units that the calibration is the right way round."""
+    """Check on the first units that the calibration is the right way round; their features are those of the stage."""
     images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
     known = run.store.has("features", run.next_key(Stage.FEATURES, run.feature_settings))
     if len(run.drive.cameras) < 2 or known:
         return
     first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
+    beginning = Drive(run.drive.root, first)
     features = extract_features(
-        Drive(run.drive.root, first),
-        run.components.extractor,
+        beginning,
+        run.extractor,
         threads=run.config.threads,
         segmenter=run.components.segmenter,
+        class_margin_px=run.config.features.class_margin_px,
+        own_cars=run.own_cars,
         cancel=run.cancel,
     )
+    run.probed = {
+        image.file: found for image, found in zip(beginning.images, features, strict=True) if not found.left_out
+    }
     if all(f.left_out for f in features):
         return  # the extraction says whether there are others
     require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)

@@ -19,6 +19,7 @@ from mrasfm_engine.io.stage_store import Arrays, StageStore, StageWriter, Stored
 from mrasfm_engine.matching.standing import Standing
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, CountProgress, StageProgress
 from schemas.artifacts import CHECKPOINT_FOLDER, Stage
 
@@ -26,7 +27,7 @@ Result = TypeVar("Result")
 
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
-OWN_CAR_VERSION, EXTRACTION_SIZE_VERSION = 2, 2
+OWN_CAR_VERSION, EXTRACTION_SIZE_VERSION = 3, 2
 VERSIONS = {Stage.FEATURES: 6, Stage.MATCHES: 7, Stage.MAPPING: 11}
 
 
@@ -48,6 +49,7 @@ class Run:
     report: dict[str, Any] = field(default_factory=new_report)
     own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once images were looked at
     side_px: Mapping[Size, int] = field(default_factory=dict)  # that images of a size are reduced to, once it is known
+    probed: Mapping[str, ImageFeatures] = field(default_factory=dict)  # features of the first units' images, by file
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
     standing: Standing | None = None  # where units are left out: which, and the drive with all of them
     whole_drive: Drive | None = None

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import MatchConfig
-from mrasfm_engine.matching.integer_products import product_of_bytes
-from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, _mutual_ratio
+from mrasfm_engine.matching import integer_products
+from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
+from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, Prepared
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import random_descriptors
 
@@ -15,10 +16,12 @@ def features(descriptors: np.ndarray) -> ImageFeatures:
     return ImageFeatures(xy_px=np.zeros((n, 2), np.float32), descriptors=descriptors, colors=np.zeros((n, 3), np.uint8))
 
 
-def mutual_ratio(similarity: np.ndarray, ratio2: float) -> np.ndarray:
-    one = (np.ones(side, np.float32) for side in similarity.shape)
-    found: np.ndarray = _mutual_ratio(similarity, *one, ratio2)
-    return found
+def match_by(similarity: np.ndarray, ratio: float) -> np.ndarray:
+    """Match two images whose descriptors have given cosines (n, m): those of the first have them as elements."""
+    n, m = similarity.shape
+    a = Prepared(similarity, np.zeros((m, n), np.float32), np.zeros(n, np.float32), np.ones(n, np.float32))
+    b = Prepared(np.eye(m, dtype=np.float32), np.eye(m, dtype=np.float32), *(np.ones(m, np.float32) for _ in range(2)))
+    return NearestNeighbourMatcher(MatchConfig(ratio=ratio)).match(a, b)
 
 
 def brute_force(similarity: np.ndarray, ratio: float) -> list[tuple[int, int]]:
@@ -40,7 +43,7 @@ def test_mutual_ratio_agrees_with_brute_force(seed: int, ratio: float) -> None:
     b = np.concatenate([a[rng.permutation(60)[:40]] + rng.normal(size=(40, 16)) * 0.5, rng.normal(size=(15, 16))])
     a, b = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b))
     similarity = (a @ b.T).astype(np.float32)
-    found = [tuple(pair) for pair in mutual_ratio(similarity, ratio**2).tolist()]
+    found = [tuple(pair) for pair in match_by(similarity, ratio).tolist()]
     assert found == brute_force(similarity, ratio)
     assert 5 < len(found) < 55
 
@@ -54,7 +57,7 @@ def test_mutual_ratio_agrees_with_brute_force_over_many_columns(n: int, m: int) 
     b[both] = b[0]  # as near as another one: neither matches
     a, b = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b))
     similarity = (a @ b[rng.permutation(m)].T).astype(np.float32)
-    found = [tuple(pair) for pair in mutual_ratio(similarity, 0.8**2).tolist()]
+    found = [tuple(pair) for pair in match_by(similarity, 0.8).tolist()]
     assert found == brute_force(similarity, 0.8)
     assert both / 3 < len(found) < 2 * both
 
@@ -62,7 +65,7 @@ def test_mutual_ratio_agrees_with_brute_force_over_many_columns(n: int, m: int) 
 def test_of_equal_descriptors_one_matches_at_most() -> None:
     similarity = np.full((3, 80), -0.5, np.float32)
     similarity[:2, 70] = 0.9
-    assert mutual_ratio(similarity, 0.8**2).tolist() == [[0, 70]]
+    assert match_by(similarity, 0.8).tolist() == [[0, 70]]
 
 
 def test_planted_matches_are_found_and_nothing_else() -> None:
@@ -117,12 +120,17 @@ def test_bytes_match_as_the_same_floats_do() -> None:
     assert 150 < len(found[0]) <= 200
 
 
+@pytest.mark.parametrize("signs", [True, False])
 @pytest.mark.parametrize("shape", [(2, 1, 3), (5, 128, 700), (33, 64, 2)])
-def test_products_of_bytes_are_exact(shape: tuple[int, int, int]) -> None:
+def test_products_of_bytes_are_exact(shape: tuple[int, int, int], signs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     n, k, m = shape
     rng = np.random.default_rng(k)
-    a, b = (rng.integers(128, 256, size, dtype=np.uint8) for size in ((n, k), (k, m)))
-    assert np.array_equal(product_of_bytes(a, b), a.astype(np.int64) @ b.astype(np.int64))
+    a, b = (rng.integers(low, 256, size, dtype=np.uint8) for low, size in ((128, (n, k)), (0, (m, k))))
+    if not signs:  # as on a processor without the instruction
+        monkeypatch.setattr(integer_products, "_signs_are_exact", lambda: False)
+        assert right_side(b).dtype == np.uint8
+    products = product_of_bytes(a, right_side(b)) + missing(a)[:, None]
+    assert np.array_equal(products, a.astype(np.int64) @ b.astype(np.int64).T)
 
 
 def test_float_descriptors_of_any_length_match_too() -> None:
