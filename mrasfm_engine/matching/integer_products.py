@@ -35,7 +35,7 @@ def product_of_bytes(a: Bytes, b: NDArray[np.int8] | Bytes) -> Ints32:
 
 
 def missing(a: Bytes) -> Ints32:
-    """What all products with a row of bytes (n, k) are short of (n,)."""
+    """Shortfall (n,) of all products with a row of bytes (n, k)."""
     sums = a.sum(axis=1, dtype=np.int32)
     return SIGN * sums if _signs_are_exact() else np.zeros_like(sums)
 
