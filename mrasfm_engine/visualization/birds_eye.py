@@ -93,14 +93,15 @@ def birds_eye(
         mosaic, *plots = painter.mosaics()
         if not mosaic.images_used:
             return BirdsEye(report={"not_drawn": "no camera sees the road"})
-        drawn = RoadPicture()
+        pool = stack.enter_context(ThreadPoolExecutor(2))  # ends before the road's files go
+        finishing = None
         if scratch is not None:
-            drawn = finish_road(scene, plan, road, scratch, optional.error)
-    agreement = measure_agreement(plots or [mosaic], plan.trajectory_m)
-    with ThreadPoolExecutor(2) as pool:
+            finishing = pool.submit(finish_road, scene, plan, road, scratch, optional.error)
+        agreement = measure_agreement(plots or [mosaic], plan.trajectory_m)
         before, after = pool.map(
             lambda which: _picture(scene, mosaic, which, agreement, plan.plan_from_world), (GIVEN, REFINED)
         )
+        drawn = RoadPicture() if finishing is None else finishing.result()
     report = _report(scene, mosaic, agreement)
     report["world_from_pixel"] = _world_from_pixel(mosaic, plan, after.top_px).tolist()
     pictures = {BEFORE: before.picture, AFTER: after.picture, **drawn.pictures}
