@@ -115,6 +115,18 @@ class Slots(NamedTuple):
     inner: tuple[int, ...]
 
 
+class Loss(NamedTuple):
+    """Standard deviation of an observation in pixels, and the Cauchy loss on residuals over it.
+
+    With `is_curved` observations count in J' J with w^2 instead of their weight w: with the loss' second derivative,
+    where residuals of a length point anywhere. J' r is the gradient all the same.
+    """
+
+    sigma: float
+    scale2: float  # square of the loss' scale in sigmas
+    is_curved: bool
+
+
 class Sums(NamedTuple):
     """Output of `accumulate`: sums by image, blocks of the reduced matrix, its gradient, V^-1 and e of the points."""
 
@@ -177,7 +189,7 @@ def squared_errors(
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def linearise(
     unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, c: int, cam_r: Any, cam_t: Any,
-    kind: int, k: Any, x: Any, xy: Any, sigma: float, loss2: float,
+    kind: int, k: Any, x: Any, xy: Any, loss: Loss,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
 ) -> bool:  # fmt: skip
     """Weighted residual, and its derivatives in the point and the camera, of one observation; False if it is not seen.
@@ -187,10 +199,15 @@ def linearise(
     camera_point(unit_r, unit_t, bands, band, follows, cam_r, cam_t, x, d, rig, cam)
     if not project(kind, k, cam[0], cam[1], cam[2], work, proj):
         return False
-    r0, r1 = (proj[0] - xy[0]) / sigma, (proj[1] - xy[1]) / sigma
-    sw = math.sqrt(1.0 / (1.0 + (r0 * r0 + r1 * r1) / loss2))
-    res[0], res[1] = r0 * sw, r1 * sw
-    s = sw / sigma
+    r0, r1 = (proj[0] - xy[0]) / loss.sigma, (proj[1] - xy[1]) / loss.sigma
+    weight = 1.0 / (1.0 + (r0 * r0 + r1 * r1) / loss.scale2)
+    if loss.is_curved:
+        res[0], res[1] = r0, r1
+        s = weight / loss.sigma
+    else:
+        root = math.sqrt(weight)
+        res[0], res[1] = r0 * root, r1 * root
+        s = root / loss.sigma
     for i in range(2):
         p0, p1, p2 = proj[2 + 3 * i] * s, proj[3 + 3 * i] * s, proj[4 + 3 * i] * s
         m0 = p0 * cam_r[0, 0] + p1 * cam_r[0, 1] + p2 * cam_r[0, 2]
@@ -294,7 +311,7 @@ def invert3(v: Any, out: Any) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def accumulate(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, obs_image: Any,
-    free_slots: Slots, groups: Groups, sigma: float, loss2: float, damping: float, lo: int, hi: int, sums: Sums,
+    free_slots: Slots, groups: Groups, loss: Loss, damping: float, lo: int, hi: int, sums: Sums,
 ) -> None:  # fmt: skip
     """Eliminate points order[lo:hi].
 
@@ -332,7 +349,7 @@ def accumulate(
             follows = False if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
                 unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c],
-                kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
+                kind[c], params[c], points[p], obs_xy[n], loss,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue
@@ -653,7 +670,7 @@ def _camera_from_unit(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def substitute(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
-    sigma: float, loss2: float, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
+    loss: Loss, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
@@ -674,7 +691,7 @@ def substitute(
             follows = False if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
                 unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c],
-                kind[c], params[c], points[p], obs_xy[n], sigma, loss2,
+                kind[c], params[c], points[p], obs_xy[n], loss,
                 d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue
@@ -711,7 +728,7 @@ def substitute(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def add_scores(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
-    sigma: float, loss2: float, columns: Any, v_inverse: Any, image: Any, most: int, lo: int, hi: int, out: Any,
+    loss: Loss, columns: Any, v_inverse: Any, image: Any, most: int, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """Add r' (J_poses x + J_point y) of the observations of points lo..hi, y = -V^-1 W' x, to their images' scores."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
@@ -731,7 +748,7 @@ def add_scores(
             normal[n - begin] = 0.0
             if not linearise(
                 unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c], kind[c], params[c],
-                points[p], observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
+                points[p], observed.xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue
             # A unit's step moves the residual as moving the point by (X - t_u) x omega - tau does.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -89,11 +89,10 @@ def _regular_marginals(
     units, border = eliminated.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    columns, joint = _with_scale(problem, state, eliminated, border)
-    columns, joint, of_readouts = _with_readouts_as_declared(problem, columns, joint, eliminated.free)
+    joint, of_readouts = _of_functionals(problem, state, eliminated, border)[1:]
     cameras = joint[:-1, :-1]
     if shared_errors:
-        joint = joint + shared_error_covariance(problem, state, system, columns, joint)
+        joint = _with_shared_errors(problem, state, unseen, joint)
     joint = joint + of_readouts
     loose = eliminated.free[unseen[split:][eliminated.free]]
     covariances_of_cameras = np.zeros((2, *(layout.camera_dof * layout.num_cameras,) * 2))
@@ -111,6 +110,30 @@ def _regular_marginals(
         cameras_of_independent_errors=covariances_of_cameras[1],
         sigma_scale=scale,
     )
+
+
+def _with_shared_errors(problem: Problem, state: State, unseen: Bools, covariance: Floats) -> Floats:
+    """Covariance (f + 1, f + 1) of the cameras' unknowns and the scale, whatever errors the observations share.
+
+    That of independent errors where they are too few to tell, or do not determine all by the curvature of their loss.
+    """
+    curved = replace(problem, options=replace(problem.options, is_curved=True))
+    system = curved.normal_equations(state, 0.0)
+    eliminated = system.eliminate(unseen.astype(np.float64))
+    if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
+        return covariance
+    columns = _of_functionals(curved, state, eliminated, eliminated.inverse()[1])[0]
+    found = shared_error_covariance(curved, state, system, columns)
+    return covariance if found is None else found
+
+
+def _of_functionals(
+    problem: Problem, state: State, eliminated: Eliminated, border: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Columns (n, f + 1) of the inverse for the cameras' unknowns and the scale, their covariance, and what readouts
+    add to it."""
+    columns, joint = _with_scale(problem, state, eliminated, border)
+    return _with_readouts_as_declared(problem, columns, joint, eliminated.free)
 
 
 def _with_scale(problem: Problem, state: State, eliminated: Eliminated, border: Floats) -> tuple[Floats, Floats]:

@@ -18,6 +18,7 @@ from numba import njit
 from mrasfm_engine.bundle_adjustment.kernels import (
     BEHIND_PX,
     Bands,
+    Loss,
     Observed,
     Views,
     camera_point,
@@ -55,7 +56,7 @@ def _point_cost(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _point_system(
-    views: Views, bands: Bands | None, observed: Observed, begin: int, end: int, sigma: float, loss2: float,
+    views: Views, bands: Bands | None, observed: Observed, begin: int, end: int, loss: Loss,
     x: Any, d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
 ) -> None:  # fmt: skip
     """V (6,) and gradient e (3,) of a point at x over its observations begin..end."""
@@ -66,7 +67,7 @@ def _point_system(
         band = 0 if bands is None else bands.of_observation[n]
         if not linearise(
             views.unit_r[u], views.unit_t[u], bands, band, False, c, views.cam_r[c], views.cam_t[c],
-            views.kind[c], views.params[c], x, observed.xy[n], sigma, loss2, d, rig, cam, work, proj, res, jx, jc,
+            views.kind[c], views.params[c], x, observed.xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
         ):  # fmt: skip
             continue
         a0, a1, a2 = jx[0, 0], jx[0, 1], jx[0, 2]
@@ -84,7 +85,7 @@ def _point_system(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def refine_points(
-    views: Views, bands: Bands | None, points: Any, observed: Observed, sigma: float, loss2: float,
+    views: Views, bands: Bands | None, points: Any, observed: Observed, loss: Loss,
     before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
 ) -> None:  # fmt: skip
     """Move points lo..hi, in place, to where the poses and the calibration of now want them; what they cost to costs.
@@ -96,7 +97,7 @@ def refine_points(
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     jx, jc, v, e, inv = np.empty((2, 3)), np.empty((2, 7)), np.empty(6), np.empty(3), np.empty(6)
     x, trial = np.empty(3), np.empty(3)
-    scale2 = loss2 * sigma * sigma
+    scale2 = loss.scale2 * loss.sigma * loss.sigma
     for p in range(lo, hi):
         begin, end = observed.first[p], observed.first[p + 1]
         for i in range(3):
@@ -124,7 +125,7 @@ def refine_points(
             enough = WORTH
             gained = 0.0
             _point_system(
-                views, bands, observed, begin, end, sigma, loss2, x, d, rig, cam, work, proj, res, jx, jc, v, e,
+                views, bands, observed, begin, end, loss, x, d, rig, cam, work, proj, res, jx, jc, v, e,
             )  # fmt: skip
             if not invert3(v, inv):
                 break

@@ -12,6 +12,7 @@ from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.bundle_adjustment.kernels import (
     Bands,
+    Loss,
     Motion,
     Observed,
     Slots,
@@ -61,7 +62,13 @@ class SolverOptions:
     initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most
     loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
     sigma_px: float = 1.0  # standard deviation of an observation
+    is_curved: bool = False  # see `kernels.Loss`
     threads: int = 1
+
+    @property
+    def loss(self) -> Loss:
+        """The loss as compiled functions take it."""
+        return Loss(self.sigma_px, self.loss_scale**2, self.is_curved)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +198,7 @@ class Problem:
             options.threads,
             len(costs),
             lambda lo, hi: refine_points(
-                *views, state.points_m, observed, options.sigma_px, options.loss_scale**2,
+                *views, state.points_m, observed, options.loss,
                 before.points_m, costs_before, steps, lo, hi, costs,
             ),
         )  # fmt: skip
@@ -221,8 +228,8 @@ class Problem:
         in_parts(
             structure.shares(parts),
             lambda lo, hi, t: accumulate(
-                *views, motion, state.points_m, observed, structure.image, free_slots, groups, options.sigma_px,
-                options.loss_scale**2, damping, lo, hi,
+                *views, motion, state.points_m, observed, structure.image, free_slots, groups, options.loss, damping,
+                lo, hi,
                 Sums(images[t], blocks[0][t], blocks[1][t], blocks[2][t], gradient[t], v_inverse, v_gradient),
             ),
         )  # fmt: skip
@@ -254,7 +261,7 @@ class Problem:
             options.threads,
             len(out),
             lambda lo, hi: substitute(
-                *views, motion, state.points_m, observed, free_slots, options.sigma_px, options.loss_scale**2,
+                *views, motion, state.points_m, observed, free_slots, options.loss,
                 step, system.v_inverse, system.v_gradient, lo, hi, out,
             ),
         )  # fmt: skip
@@ -277,8 +284,8 @@ class Problem:
         in_parts(
             even_bounds(o.num_points, self.options.threads),
             lambda lo, hi, part: add_scores(
-                *views, motion, state.points_m, observed, free_slots, self.options.sigma_px,
-                self.options.loss_scale**2, along, system.v_inverse, group, most, lo, hi, parts[part],
+                *views, motion, state.points_m, observed, free_slots, self.options.loss,
+                along, system.v_inverse, group, most, lo, hi, parts[part],
             ),
         )  # fmt: skip
         result: Floats = parts.sum(0)

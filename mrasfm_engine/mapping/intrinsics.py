@@ -16,7 +16,7 @@ import numpy as np
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.solver import SolverOptions
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
 from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
@@ -102,7 +102,8 @@ def assess_intrinsics(
         terms=[prior, *terms],
         options=options,
     )
-    sigma = covariances(problem, problem.state).sigma_camera[:, 6]
+    # At the solution: residuals of a focal length that is off would pass for errors that its observations share.
+    sigma = covariances(problem, solve(problem)[0]).sigma_camera[:, 6]
     observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
     return IntrinsicsDecision(
         free=_of_models(mapper) & observed[:, None], sigma_focal=sigma, prior_sigma_focal=prior.sigma[:, 0]

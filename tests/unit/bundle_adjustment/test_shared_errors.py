@@ -13,10 +13,11 @@ from mrasfm_engine.scene.state import State
 from tests.helpers.small_problems import make_case
 
 UNITS, CAMERAS, NOISE_PX, SHARED_PX = 24, 3, 0.5, 1.5
+NO_LOSS = 1e3  # of residuals of any size
 
 
 def adjusted(
-    seed: int, *, shared_px: float, units: int = UNITS, of_points: bool = False
+    seed: int, *, shared_px: float, units: int = UNITS, of_points: bool = False, loss_scale: float = NO_LOSS
 ) -> tuple[State, Problem, State]:
     """Truth, problem and solution of a drive whose images are shifted, each by an error of its own.
 
@@ -30,8 +31,7 @@ def adjusted(
         free_units=[False] + [True] * (units - 1),
         free_cameras=[True] * CAMERAS,
         seed=seed,
-        # Residuals this large are no outliers here.
-        options=SolverOptions(sigma_px=NOISE_PX, loss_scale=1e3),
+        options=SolverOptions(sigma_px=NOISE_PX, loss_scale=loss_scale, decrement_tolerance=1e-6),
     )
     truth, o = case.truth, case.problem.observations
     rows, columns = (o.point, np.zeros_like(o.point)) if of_points else (o.unit, o.camera)
@@ -80,6 +80,15 @@ def test_independent_errors_add_little(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (ratio >= 1.0 - 1e-9).all()
     assert ratio.max() < 1.5
     assert 1.0 <= found.sigma_scale / independent.sigma_scale < 1.2
+
+
+def test_sigmas_are_true_under_a_robust_loss() -> None:
+    """Weights that fall where residuals rise let a solution give way further than the normal equations say."""
+    found = []
+    for seed in range(12):
+        truth, problem, solution = adjusted(seed, shared_px=2 * NOISE_PX, loss_scale=2.0)
+        found.append(rotation_in_sigmas(truth, problem, solution, covariances(problem, solution)))
+    assert 0.8 < np.sqrt(np.mean(np.square(found))) < 1.25
 
 
 def test_few_units_tell_no_covariance_of_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
