@@ -19,7 +19,7 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.submaps import Span, Submap
 from mrasfm_engine.types import StageProgress
-from schemas.artifacts import CHECKPOINT_FOLDER, Stage
+from schemas.artifacts import Stage
 
 
 def reconstruct(
