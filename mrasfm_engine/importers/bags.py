@@ -101,9 +101,7 @@ def read(
         units=units,
         gnss=gnss,
         notes=[*notes, *camera_notes, *gnss_notes, READOUT_NOTE],
-        contents=lambda wanted: _contents(
-            paths, scratch, wanted, {t: found.shift for t, found in content.images.items()}
-        ),
+        contents=lambda wanted: _contents(paths, scratch, wanted, shifts),
     )
 
 
