@@ -22,9 +22,18 @@ const FORMATS: Record<ExportFormat, string> = {
 const CRS = "EPSG:[0-9]{4,6}(\\+[0-9]{4,6})?";
 type Component = NonNullable<Scene["summary"]["components"]>[number];
 
-export function Exports({ base, components = [] }: { base: string; components?: readonly Component[] }): Shown {
-  const loaded = useLoad((abort) => getAll<Export>(`${base}/exports`, abort), `exports ${base}`);
+interface Exported {
+  base: string;
+  components?: readonly Component[];
+}
+
+export function Exports(of: Exported): Shown {
   if (!session.value?.session_expires_at) return null; // a folder that is viewed: there is no service that could
+  return html`<${OfService} ...${of} />`;
+}
+
+function OfService({ base, components = [] }: Exported): Shown {
+  const loaded = useLoad((abort) => getAll<Export>(`${base}/exports`, abort), `exports ${base}`);
   return html`<h2>Exports</h2>
     <p class="muted">Formats that have the images in them, or a coordinate reference system of your choice, are made by a job.</p>
     <${Ask} base=${base} components=${components} asked=${loaded.again} />
