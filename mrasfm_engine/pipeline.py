@@ -19,7 +19,7 @@ from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.submaps import Span, Submap
 from mrasfm_engine.types import StageProgress
-from schemas.artifacts import CHECKPOINT_FOLDER, Stage
+from schemas.artifacts import Stage
 
 
 def reconstruct(
@@ -67,7 +67,7 @@ def reconstruct(
             remedy="Give the scene a folder of its own with --out.",
             code="not-a-scene",
         )
-    require_free_folder(out, CHECKPOINT_FOLDER)
+    require_free_folder(out)
     drive = read_drive(drive_folder, is_new=is_new)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
     run.report["drive"] = drive.manifest.name

@@ -156,7 +156,9 @@ class Camera(_Model):
         None, description="since version 2: how well the principal point is known, per axis"
     )
     sigma_distortion: Positive | None = Field(
-        None, description="since version 2: how well the radial terms of distortion are known"
+        None,
+        description="since version 2: how well the radial terms of distortion are known: k1 and k2, "
+        "of a fisheye k1 to k4; k3 to k6 of FULL_OPENCV stay as given",
     )
     sigma_time_offset_us: Annotated[Positive, Field(le=MAX_SIGMA_TIME_OFFSET_US)] | None = Field(
         None,

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from mrasfm_engine.errors import StorageError, storage_error
-from schemas.artifacts import REPORT_FILE
+from mrasfm_engine.errors import InputError, StorageError, storage_error
+from schemas.artifacts import CHECKPOINT_FOLDER, REPORT_FILE
 
 COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
@@ -62,6 +62,34 @@ def publishing(
     except OSError as error:
         remedy = "Free space on this disk, or choose a folder that can be written."
         raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
+
+
+def require_free(out: Path, names: Sequence[str], *, result: str) -> None:
+    """Refuse a folder in which files that no result has made would be replaced.
+
+    A folder with a result, or with finished stages of a run that was interrupted, is that result's.
+
+    Parameters
+    ----------
+    names
+        Files and folders directly in `out` that the result replaces.
+    result
+        The kind of result, for the message: `scene` or `map`.
+
+    Raises
+    ------
+    InputError
+        That names one of them.
+    """
+    if (out / COMPLETE_MARK).exists() or (out / CHECKPOINT_FOLDER).is_dir():
+        return
+    taken = [name for name in names if os.path.lexists(out / name)]
+    if taken:
+        raise InputError(
+            f"{out / taken[0]} was made by no {result}, and a {result} would replace it",
+            remedy=f"Give the {result} a new or empty folder with --out.",
+            code="bad-out-folder",
+        )
 
 
 @contextmanager

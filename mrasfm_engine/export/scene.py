@@ -11,7 +11,6 @@ with a `report.json` is complete.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.errors import InputError, MrasfmError
+from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
@@ -38,7 +37,7 @@ from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, com
 from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
-from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
+from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_free
 from mrasfm_engine.export.report_page import scene_page, write_page
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.scene.scene import Scene
@@ -111,28 +110,9 @@ def write_scene(
             _write(other, folder, own_report, NO_PICTURES)
 
 
-def require_free_folder(out: Path, checkpoints: str) -> None:
-    """Refuse a folder in which files that no scene has made would be replaced.
-
-    Parameters
-    ----------
-    checkpoints
-        Name of the folder of finished stages, which an interrupted run has left.
-
-    Raises
-    ------
-    InputError
-        That names one of them.
-    """
-    if (out / COMPLETE_MARK).exists() or (out / checkpoints).is_dir():
-        return
-    taken = [name for name in (*REPLACED, *ALWAYS) if os.path.lexists(out / name)]
-    if taken:
-        raise InputError(
-            f"{out / taken[0]} was made by no scene, and a scene would replace it",
-            remedy="Give the scene a new or empty folder with --out.",
-            code="bad-out-folder",
-        )
+def require_free_folder(out: Path) -> None:
+    """Refuse a folder in which files that no scene has made would be replaced, see `publishing.require_free`."""
+    require_free(out, (*REPLACED, *ALWAYS), result="scene")
 
 
 def component_list(scenes: Sequence[Scene]) -> list[dict[str, Any]]:

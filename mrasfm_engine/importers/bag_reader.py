@@ -10,9 +10,11 @@ import heapq
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mrasfm_engine.errors import InputError
+from mrasfm_engine.errors import InputError, MrasfmError
+from mrasfm_engine.importers.bag_unpacking import METADATA, unpacked
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 
 ROS1_SUFFIX = ".bag"
 SUFFIXES = (ROS1_SUFFIX, ".mcap", ".db3")
-METADATA = "metadata.yaml"  # of a ROS 2 bag, which is a folder
 # Recorders close a chunk of messages after some megabytes; only one message that is larger makes a larger one, and no
 # image that is read here has a gigabyte.
 MAX_CHUNK_BYTES = 1 << 30
@@ -73,17 +74,20 @@ class Bag:
     ----------
     paths
         As `bag_files` finds them.
+    scratch
+        Folder for the files of bags that are compressed file by file, see `bag_unpacking`.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[Path], scratch: Path) -> None:
         self.paths = paths
+        self.scratch = scratch
         self._readers: list[Reader1 | Reader2] = []
         self._open = ExitStack()
 
     def __enter__(self) -> Bag:
         for path in self.paths:
             with _defects_named(path):
-                reader = _reader(path)
+                reader = _reader(path, self.scratch)
                 self._open.enter_context(reader)
                 self._readers.append(reader)
         return self
@@ -110,27 +114,32 @@ class Bag:
         return heapq.merge(*streams, key=lambda entry: entry.received_ns)
 
 
-def _reader(path: Path) -> Reader1 | Reader2:
+def _reader(path: Path, scratch: Path) -> Reader1 | Reader2:
     from rosbags import rosbag1, rosbag2
 
     _bound_decompression()
-    return rosbag1.Reader(path) if path.suffix == ROS1_SUFFIX and path.is_file() else rosbag2.Reader(path)
+    if path.suffix == ROS1_SUFFIX and path.is_file():
+        return rosbag1.Reader(path)
+    return rosbag2.Reader(unpacked(path, scratch) if path.is_dir() else path)
 
 
 def _bound_decompression() -> None:
-    """Let rosbags take nothing larger than `MAX_CHUNK_BYTES` out of a chunk: a small file may say to fill the memory.
+    """Let rosbags take nothing larger than `MAX_CHUNK_BYTES` out of a chunk, or out of a message that is compressed by
+    itself: a small file may say to fill the memory.
 
-    rosbags looks its decompressors up in two tables, and gives them no limit.
+    rosbags looks its decompressors up in two tables and a module, and gives them no limit.
     """
     from bz2 import BZ2Decompressor
 
     from backports.zstd import ZstdDecompressor
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
     from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader as ros2
     from rosbags.rosbag2 import storage_mcap
 
     storage_mcap.DECOMPRESSORS.update(lz4=_bounded(LZ4FrameDecompressor), zstd=_bounded(ZstdDecompressor))
     ros1.decompressors.update(lz4=_bounded(LZ4FrameDecompressor), bz2=_bounded(BZ2Decompressor))
+    vars(ros2)["zstd"] = SimpleNamespace(decompress=_bounded(ZstdDecompressor))
 
 
 def _bounded(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
@@ -197,7 +206,7 @@ def _defects_named(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (InputError, OSError, MemoryError):
+    except (MrasfmError, OSError, MemoryError):
         raise
     except Exception as error:
         kind = next((s for s in SUFFIXES if path.suffix == s or (path.is_dir() and any(path.glob(f"*{s}")))), ".db3")

@@ -47,6 +47,7 @@ def recognises(path: Path) -> bool:
 def read(
     path: Path,
     *,
+    scratch: Path,
     topics: Sequence[str] = (),
     rig_frame: str | None = None,
     world_frame: str | None = None,
@@ -58,6 +59,8 @@ def read(
 
     Parameters
     ----------
+    scratch
+        Folder for files of the bag that are not compressed, made where they are needed; `contents` needs them too.
     topics
         Topics of images and of the receiver that are wanted; all others are left out. Empty: all.
     rig_frame
@@ -78,7 +81,7 @@ def read(
         If the bag is damaged, or lacks something that no option gives.
     """
     paths = bag_files(path)
-    with Bag(paths) as bag:
+    with Bag(paths, scratch) as bag:
         types = bag.types()
         images, fixes, notes = wanted_topics(types, topics, path)
         content = read_content(bag, types, images, fixes, keeps_motion=world_frame is not None)
@@ -89,6 +92,7 @@ def read(
         units = _rough_poses(content, units, world_frame, rig_frame or RIG_FRAME)
     # A rig.json has a frame of its own. That it is the transforms' one has to be said.
     is_placed = rig_frame is not None or calibration is None or calibration.suffix != ".json"
+    shifts = {topic: found.shift for topic, found in content.images.items()}
     gnss, gnss_notes = gnss_of_bag(content, (rig_frame or RIG_FRAME) if is_placed else None, antenna_m, gnss_sigma_m)
     return Recording(
         layout="ROS bag",
@@ -97,7 +101,7 @@ def read(
         units=units,
         gnss=gnss,
         notes=[*notes, *camera_notes, *gnss_notes, READOUT_NOTE],
-        contents=lambda wanted: _contents(paths, wanted, {t: found.shift for t, found in content.images.items()}),
+        contents=lambda wanted: _contents(paths, scratch, wanted, shifts),
     )
 
 
@@ -125,11 +129,11 @@ def _rough_poses(content: BagContent, units: list[SourceUnit], world_frame: str,
 
 
 def _contents(
-    paths: Sequence[Path], wanted: Collection[ImageKey], shifts: Mapping[str, int]
+    paths: Sequence[Path], scratch: Path, wanted: Collection[ImageKey], shifts: Mapping[str, int]
 ) -> Iterator[tuple[ImageKey, bytes]]:
     """Files of the wanted images, as the bag has them one after the other."""
     missing = set(wanted)
-    with Bag(paths) as bag:
+    with Bag(paths, scratch) as bag:
         for entry in bag.entries({topic for topic, _ in wanted}):
             key = (entry.topic, stamp_ns(entry))
             if key in missing:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,17 +60,25 @@ def write_recording(recording: Recording, out: Path, *, copy: bool = False, forc
     """
     out = Path(out).resolve()
     _check_target(out, force=force)
-    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}.partial")
-    try:
+    with folder_beside(out) as partial:
         try:
             partial.mkdir(parents=True)
             summary = _fill(recording, partial, drive=out, copy=copy)
             _put_in_place(partial, out)
         except OSError as error:
             raise storage_error(out, error) from error
-    finally:  # also on Ctrl-C: nothing half-written stays
-        shutil.rmtree(partial, ignore_errors=True)
     return summary
+
+
+@contextmanager
+def folder_beside(out: Path) -> Iterator[Path]:
+    """A free name beside `out`, on its disk; a folder of this name is gone when the `with` block ends."""
+    out = Path(out).resolve()
+    folder = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}.partial")
+    try:
+        yield folder
+    finally:  # also on Ctrl-C: nothing half-written stays
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _check_target(out: Path, *, force: bool) -> None:

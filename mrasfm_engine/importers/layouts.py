@@ -22,7 +22,7 @@ from mrasfm_engine.importers import (
     rig_folder,
     waymo,
 )
-from mrasfm_engine.importers.drive_writer import ImportSummary, write_recording
+from mrasfm_engine.importers.drive_writer import ImportSummary, folder_beside, write_recording
 from mrasfm_engine.importers.recording import Recording, RoughQuality, SourceUnit, select_cameras, select_units
 from mrasfm_engine.importers.rough_poses import with_rough_poses
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
@@ -103,17 +103,19 @@ def import_recording(
         raise InputError(
             f"the drive {out} would replace the recording {folder}", remedy="Give another folder.", code="output-in-use"
         )
-    recording = select_units(select_cameras(_read(folder, {**(options or {}), "scene": scene}), cameras), frames)
-    if vehicle is not None:
-        recording = replace(recording, vehicle=vehicle)
-    if rough_noise is not None:
-        recording = with_rough_poses(recording, rough_noise)
-    if recording.truth_is_gnss and not truth:
-        recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
-    return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
+    wanted = {**(options or {}), "scene": scene}
+    with folder_beside(out) as scratch:
+        recording = select_units(select_cameras(_read(folder, wanted, scratch), cameras), frames)
+        if vehicle is not None:
+            recording = replace(recording, vehicle=vehicle)
+        if rough_noise is not None:
+            recording = with_rough_poses(recording, rough_noise)
+        if recording.truth_is_gnss and not truth:
+            recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
+        return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
 
 
-def _read(path: Path, options: Mapping[str, Any]) -> Recording:
+def _read(path: Path, options: Mapping[str, Any], scratch: Path) -> Recording:
     given = {name: value for name, value in options.items() if value is not None}
     for layout in LAYOUTS if path.is_dir() else (bags,):
         if not layout.recognises(path):
@@ -126,7 +128,7 @@ def _read(path: Path, options: Mapping[str, Any]) -> Recording:
                 remedy="Leave it out.",
                 code="unused-option",
             )
-        recording: Recording = layout.read(path, **given)
+        recording: Recording = layout.read(path, **given, **({"scratch": scratch} if layout is bags else {}))
         return recording
     looked_for = "; ".join(layout.DESCRIPTION for layout in LAYOUTS)
     raise InputError(

@@ -20,11 +20,12 @@ from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
 from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
-from schemas.drive import CAMERA_MODELS
+from schemas.drive import CAMERA_MODELS, Camera
 from schemas.findings import Finding, warning
 
 OBSERVED_RATIO = 1.0 / 3.0  # a focal length is worth freeing when its posterior is below this share of the prior
 BEYOND_PRIOR_SIGMAS = 4.0
+HELD_TERMS = ("k3", "k4", "k5", "k6")  # of FULL_OPENCV: no prior of them is known, and k1 and k2 look nearly like them
 SIGMA_ASPECT = 5e-4  # of fy over fx: pixels are square
 TANGENTIAL_SHARE = 0.2  # of the sigma of radial distortion: lenses are centred better than they are modelled
 
@@ -53,7 +54,9 @@ class IntrinsicsDecision:
         return len(self.sigma_focal) > 0
 
     def findings(self, mapper: Mapper) -> list[Finding]:
-        """Focal lengths that the drive does not observe, and those that left their priors."""
+        """Focal lengths that the drive does not observe, those that left their priors, and lenses of which some terms
+        are held while the others vary.
+        """
         found = []
         off = np.log(mapper.state.camera_params[:, 0] / pack_cameras(mapper.drive.cameras)[1][:, 0])
         for c, camera in enumerate(mapper.drive.cameras if self.asked else ()):
@@ -73,6 +76,15 @@ class IntrinsicsDecision:
                         f"the focal length of camera {camera.name} is {off[c]:+.2%} off what is given, "
                         f"{abs(off[c]) / self.prior_sigma_focal[c]:.0f} sigmas of its prior",
                         "Check params and sigma_focal_px of the camera.",
+                    )
+                )
+            if self.free[c, 4] and (held := _held_terms(camera)):
+                found.append(
+                    warning(
+                        "distortion-held",
+                        f"{', '.join(held)} of camera {camera.name} are held as given while k1, k2, p1 and p2 vary, "
+                        "and sigma_distortion is that of k1 and k2 alone",
+                        "Give params with k3 to k6 from a good calibration, or a camera of model OPENCV.",
                     )
                 )
         return found
@@ -127,6 +139,14 @@ def intrinsics_prior(mapper: Mapper) -> IntrinsicsPrior:
         if mapper.camera_kind[c] != FISHEYE:
             sigma[c, 6:] *= TANGENTIAL_SHARE
     return IntrinsicsPrior(params=params, sigma=sigma)
+
+
+def _held_terms(camera: Camera) -> list[str]:
+    """Names of the camera's terms of distortion that are not zero and never vary."""
+    if camera.model != "FULL_OPENCV":
+        return []
+    values = dict(zip(CAMERA_MODELS[camera.model], camera.params, strict=True))
+    return [name for name in HELD_TERMS if values[name] != 0.0]
 
 
 def _of_models(mapper: Mapper) -> Bools:

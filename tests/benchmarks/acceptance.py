@@ -32,7 +32,7 @@
 | 28 | a real drive with grey images: parts that images, positions or nothing links, and a map that joins them |
 | 29 | a stop of a minute: what it costs, and where its units are |
 | 30 | drives cut into sub-maps, beside the same in one piece |
-| 31 | files for other programs, as readers of others read them; a COPC of five million points |
+| 31 | files for other programs, as readers of others read them; colours of points; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
 | 33 | exports of images for splatting; the client's wheel in an environment of its own |
 | 34 | recordings of other programs in, and scenes out to the development kits of data sets |

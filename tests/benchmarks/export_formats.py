@@ -26,7 +26,7 @@ from tests.helpers import splatting_rule
 
 LINE = "33"
 REPOSITORY = Path(__file__).resolve().parents[2]
-OPENCV = ("--cameras", 6, "--units", 12, "--seed", 7)
+OPENCV = ("--camera-model", "OPENCV", "--cameras", 6, "--units", 12, "--seed", 7)
 FISHEYE_UNITS, SEED = 8, 3
 MOST_OF_OWN = 1.1  # median reprojection error of the pinhole images, in that of the scene
 MOST_MB = 60.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.images import read_image_gray
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.preflight.drive_reader import read_drive
-from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.drive import Drive, matrix_from_pose
 from mrasfm_engine.types import Floats
+from schemas import Pose
 from tests.benchmarks.commands import evaluate, mrasfm
 from tests.benchmarks.foreign_readers import READERS, output_of, problem_of, python_readers
 from tests.benchmarks.real_drives import imported, reconstructed
@@ -25,6 +27,7 @@ LINE = "34"
 START_US = 1_700_000_000_000_000
 RENDERED = ("--cameras", 6, "--units", 20, "--seed", 7)
 CONVERTED, CONVERTED_DEG = 1e-6, 1e-9
+SAME = 1e-9
 
 
 def recordings(data: Path, work: Path) -> Iterator[Figure]:
@@ -98,6 +101,9 @@ def _nuscenes(scene: Path, drive_folder: Path, root: Path, work: Path, kits: Pat
     again, drive = read_drive(work / "drive of nuscenes"), read_drive(drive_folder)
     same = again.timestamps_us.tolist() == drive.timestamps_us.tolist() and len(again.images) == len(drive.images)
     yield exactly(LINE, "nuScenes tables: imported again, the same frames", int(same), 1)
+    off = _calibration_off(scene, again)
+    what = "nuScenes tables: imported again, calibration off the scene's"
+    yield Figure(line=LINE, what=what, value=off, unit="px or m", above=-1, most=SAME)
     if isinstance(kits, str):
         return
     said = output_of([kits, READERS / "read_datasets.py", "nuscenes", root, scene], work)
@@ -108,6 +114,21 @@ def _nuscenes(scene: Path, drive_folder: Path, root: Path, work: Path, kits: Pat
         line=LINE, what="nuScenes tables: the same without half a pixel", value=value, unit="px", above=0.5, most=5.0
     )
     yield exactly(LINE, "nuScenes tables: samples", said["samples"], len(drive.manifest.frames))
+
+
+def _calibration_off(scene: Path, again: Drive) -> float:
+    """Largest difference of parameters and poses of the cameras, which are pinholes, from those that a scene found."""
+    found = json.loads((scene / "calibration.json").read_text())["cameras"]
+    refined = {f"CAM_{name.upper()}": camera["refined"] for name, camera in found.items()}
+    off = 0.0
+    for camera, rig_from_cam in zip(again.cameras, again.rig_from_cam, strict=True):
+        own = refined.pop(camera.name)
+        pose = matrix_from_pose(Pose(**own["rig_from_cam"]))
+        off = max(off, float(np.abs(rig_from_cam - pose).max()))
+        off = max(off, float(np.abs(np.subtract(camera.params, own["params"])).max()))
+    if refined:
+        raise AssertionError(f"nuScenes tables: cameras are missing: {', '.join(refined)}")
+    return off
 
 
 def _mcap(file: Path, scene: Path, work: Path) -> Iterator[Figure]:

@@ -1,7 +1,7 @@
 """Pictures of all pages of the console, with what `mrasfm demo` made: `python -m tests.console.screenshots DEMO`.
 
-They are pages as somebody sees them: light at 1280 px, and with `--look` also dark and at the width of a phone, into
-another folder, to be looked at and not to be kept.
+They are pages as somebody sees them: light at 1280 px, long ones down to a heading or a row, and with `--look` whole,
+also dark and at the width of a phone, into another folder, to be looked at and not to be kept.
 """
 
 from __future__ import annotations
@@ -29,6 +29,13 @@ KEPT = REPOSITORY / "docs" / "images" / "console"
 MOST_BYTES = 150_000
 COLORS = (256, 128, 64, 32)
 SIZES = {"light": ("light", 1280, 860), "dark": ("dark", 1280, 860), "narrow": ("light", 400, 860)}
+MOST_HEIGHT_PX = 1500
+# Where a page that is longer than this ends in its picture: before a heading or a row, none of which is cut.
+END_PX = """most => {
+  const whole = document.documentElement.scrollHeight;
+  const tops = [...document.querySelectorAll('main h2, main tr')].map(one => one.getBoundingClientRect().top + scrollY);
+  return whole <= most ? whole : Math.floor(Math.max(...tops.filter(top => top <= most)));
+}"""
 READY_WITHIN_S = 60.0
 
 
@@ -114,6 +121,7 @@ def addresses(url: str, key: str) -> dict[str, str]:
         "scene-map": f"{scene_page}/place",
         "calibration": f"{scene_page}/calibration",
         "scene-files": f"{scene_page}/files",
+        "scene-exports": f"{scene_page}/files",
         "maps": "maps",
         "map": map_page,
         "map-3d": f"{map_page}/3d",
@@ -143,6 +151,8 @@ def pictures(
         if only and name not in only:
             continue
         go(page, url, address)
+        if name == "scene-exports":  # they are below the files
+            page.get_by_label("Find a file").fill("points.")
         _let_load(page)
         yield name, keep(page, folder / f"{name}.png", whole)
     context.close()
@@ -166,7 +176,9 @@ def _let_load(page: Page) -> None:
 
 def keep(page: Page, path: Path, whole: bool) -> int:
     """Write what is seen as a PNG with few colours, which is small; its bytes."""
-    picture = Image.open(io.BytesIO(page.screenshot(full_page=whole))).convert("RGB")
+    picture = Image.open(io.BytesIO(page.screenshot(full_page=True))).convert("RGB")
+    if not whole:
+        picture = picture.crop((0, 0, picture.width, page.evaluate(END_PX, MOST_HEIGHT_PX)))
     for colors in COLORS:
         stream = io.BytesIO()
         picture.quantize(colors, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)

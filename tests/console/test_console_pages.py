@@ -6,6 +6,7 @@ import json
 import re
 import time
 from pathlib import Path
+from typing import Any
 
 import axe_playwright_python
 import pytest
@@ -137,12 +138,8 @@ def test_a_revoked_key_ends_the_page_in_time(open_console: Open, world: World) -
     assert time.monotonic() - revoked_s < 5.0
 
 
-def test_calibration_shows_what_the_file_says(open_console: Open, world: World) -> None:
-    page = open_console(world.api.url).new_page()
-    log_in(page, world.api.url, world.client.key)
-    go(page, world.api.url, world.pages["calibration"])
-    page.locator("[data-corrections=rotation]").wait_for()
-    document = json.loads((world.folder / "calibration.json").read_text())
+def corrections_agree(page: Page, document: dict[str, Any]) -> None:
+    """Each correction and its sigma is the file's, exact in an attribute and rounded to the digits that are shown."""
     for name, camera in document["cameras"].items():
         for kind, field, of_sigma in (
             ("rotation", "rotation_vector_deg", "rotation_deg"),
@@ -163,6 +160,16 @@ def test_calibration_shows_what_the_file_says(open_console: Open, world: World) 
                     assert (first, more[0]) == (f"{value:.{decimals}f}", f"{sigma:.{decimals}f}")
                 else:
                     assert float(first) == pytest.approx(value, rel=6e-3)
+
+
+def test_calibration_shows_what_the_file_says(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, world.pages["calibration"])
+    page.locator("[data-corrections=rotation]").wait_for()
+    document = json.loads((world.folder / "calibration.json").read_text())
+    corrections_agree(page, document)
+    for name, camera in document["cameras"].items():
         for param, given in zip(camera["param_names"], camera["refined"]["params"], strict=True):
             cell = page.locator(f"[data-intrinsics] tr[data-camera={name}][data-param={param}] td[data-value]").last
             assert float(cell.get_attribute("data-value") or "nan") == given

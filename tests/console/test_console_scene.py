@@ -16,6 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from mrasfm_engine.export.report_page._read_back import MOST_BYTES
 from tests.console.conftest import Open, World, go, log_in, wait_for
+from tests.console.test_console_pages import corrections_agree
 
 SCENE_COLOR = (0xFF, 0xB0, 0x00)
 NEAR_PX = 2
@@ -170,3 +171,10 @@ def test_the_report_says_what_the_calibration_says(world: World, tmp_path: Path)
     ]
     assert len(values) == 12
     assert all(f'data-value="{value!r}"' in page for value in values)
+
+
+def test_the_report_shows_the_corrections_in_enough_digits(browser: Browser, world: World) -> None:
+    page = browser.new_context(offline=True).new_page()
+    page.goto((world.folder / "report.html").as_uri())
+    corrections_agree(page, json.loads((world.folder / "calibration.json").read_text()))
+    page.context.close()

@@ -40,6 +40,11 @@ def test_a_scene_is_shown_with_its_images(open_console: Open, world: World, driv
         expect(page.get_by_role("button", name="Log out")).to_have_count(0)
         refused = httpx.get(f"{host}v1/scenes", headers={"Host": "evil.example"})
         assert refused.status_code == 400, "another site's name leads nowhere"
+        for name in ("127.0.0.1.evil.example", "evil.example:80", "10.0.0.1", ""):
+            for path in ("", "v1/session", "v1/scenes/local/files/points.ply", "console/files/console.js"):
+                assert httpx.get(f"{host}{path}", headers={"Host": name}).status_code == 400
+        with pytest.raises(httpx.ConnectError):  # another address of this machine, also on loopback
+            httpx.get(host.replace("127.0.0.1", "127.0.0.2"))
         for path in (
             "drives/drive-0/files/secret.txt",
             "drives/drive-0/files/../secret.txt",

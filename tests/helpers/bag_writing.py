@@ -119,8 +119,12 @@ class Messages:
             return path
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         with rosbag2.Writer(path, version=9, storage_plugin=plugin) as bag:
-            self._write(bag, self.store.serialize_cdr, late_us)
+            self.write_into_ros2(bag, late_us=late_us)
         return path
+
+    def write_into_ros2(self, bag: rosbag2.Writer, *, late_us: int = 3000) -> None:
+        """Write all into an open bag of ROS 2."""
+        self._write(bag, self.store.serialize_cdr, late_us)
 
     def write_into(self, bag: rosbag1.Writer, *, late_us: int = 3000) -> None:
         """Write all into an open bag of ROS 1."""

@@ -15,6 +15,9 @@ export type Problem = Pick<Schemas["Problem"], "title" | "detail" | "remedy"> & 
 export type Finding = Schemas["Finding"];
 export type Upload = Schemas["UploadResource"];
 export type FileResource = Schemas["SceneFileResource"];
+export type Export = Schemas["ExportResource"];
+export type ExportRequest = Schemas["ExportRequest"];
+export type ExportFormat = ExportRequest["formats"][number];
 export interface Page<Item> {
   items: Item[];
   next?: string | null;

@@ -34,7 +34,10 @@ _LOCAL = struct.Struct("<4s5H3L2H")
 _LOCAL_SIGNATURE, _DIRECTORY_SIGNATURES = b"PK\x03\x04", (b"PK\x01\x02", b"PK\x06\x08")
 _ENCRYPTED, _SIZES_FOLLOW = 0x0001, 0x0008
 _STORED, _DEFLATED = 0, 8
-_DESCRIPTOR_BYTES = (16, 24, 12, 20)  # with or without a signature, and with sizes of 4 or of 8 bytes
+# CRC, packed and unpacked size behind an entry: with or without a signature, and with sizes of 4 or of 8 bytes.
+_DESCRIPTORS = {16: "<4xL2L", 24: "<4xL2Q", 12: "<L2L", 20: "<L2Q"}
+_LONGEST_DESCRIPTOR = max(_DESCRIPTORS)
+_AFTER_ENTRY = re.compile(b"|".join(map(re.escape, (_LOCAL_SIGNATURE, *_DIRECTORY_SIGNATURES))))
 _UNKNOWN = 0xFFFFFFFF
 _ZIP64_FIELD = 1
 _PAX_RECORD = re.compile(rb"([0-9]{1,9}) ([^=]{1,200})=")
@@ -368,14 +371,42 @@ def _zip_steps(max_ratio: float) -> _Steps:
             yield from _inflated(raw_name, max_ratio)
         elif packed_bytes or raw_name.endswith(b"/"):
             yield _Pass(packed_bytes)
+        elif method == _STORED:
+            yield from _stored()
+            continue
         else:
-            return  # stored, and nothing says where it ends
-        ahead = yield _Read(_DESCRIPTOR_BYTES[1] + len(_LOCAL_SIGNATURE))
-        following = (_LOCAL_SIGNATURE, *_DIRECTORY_SIGNATURES)
-        found = next((n for n in _DESCRIPTOR_BYTES if ahead[n : n + 4] in following), None)
+            return  # another method, and nothing says where it ends
+        ahead = yield _Read(_LONGEST_DESCRIPTOR + len(_LOCAL_SIGNATURE))
+        found = next((n for n in _DESCRIPTORS if _AFTER_ENTRY.match(ahead, n)), None)
         if found is None:
             return
         yield _Pass(found - len(ahead))
+
+
+def _stored() -> _Steps:
+    """Pass over content that is stored as it is, whose length only the descriptor behind it says, and over that.
+
+    The descriptor is where its size is the distance from the content's begin and another entry, or the directory,
+    follows. Content that looks so itself leads to a refusal, or to names that only the check of the whole finds.
+    """
+    data, passed_bytes = b"", 0
+    while True:
+        data += yield _ReadSome(_CHUNK_BYTES)
+        for following in _AFTER_ENTRY.finditer(data):
+            if any(_describes(data, following.start() - size, passed_bytes, size) for size in _DESCRIPTORS):
+                yield _Pass(following.start() - len(data))
+                return
+        kept = data[-(_LONGEST_DESCRIPTOR + len(_LOCAL_SIGNATURE)) :]
+        passed_bytes += len(data) - len(kept)
+        data = kept
+
+
+def _describes(data: bytes, at: int, passed_bytes: int, size_bytes: int) -> bool:
+    """Return whether a descriptor of this size lies at a place, for content of as many bytes as there are before it."""
+    if at < 0:
+        return False
+    _, packed_bytes, unpacked_bytes = struct.unpack_from(_DESCRIPTORS[size_bytes], data, at)
+    return bool(packed_bytes == unpacked_bytes == passed_bytes + at)
 
 
 def _inflated(raw_name: bytes, max_ratio: float) -> _Steps:

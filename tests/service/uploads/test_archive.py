@@ -72,7 +72,7 @@ def tar_of(members: Members, mode: str = "w", tar_format: int = tarfile.PAX_FORM
     return stream.getvalue()
 
 
-def streamed_zip_of(members: Members) -> bytes:
+def streamed_zip_of(members: Members, compression: int = zipfile.ZIP_DEFLATED, *, has_long_sizes: bool = True) -> bytes:
     """As `zip -` writes to a pipe: sizes come behind the content."""
 
     class Pipe(io.RawIOBase):
@@ -86,9 +86,9 @@ def streamed_zip_of(members: Members) -> bytes:
             return len(data)
 
     pipe = Pipe()
-    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(pipe, "w", compression) as archive:
         for name, data in members:
-            with archive.open(name, "w", force_zip64=True) as entry:
+            with archive.open(name, "w", force_zip64=has_long_sizes) as entry:
                 entry.write(data)
     return pipe.data
 
@@ -97,6 +97,8 @@ PACKERS: dict[str, Pack] = {
     "zip stored": lambda members: zip_of(members, zipfile.ZIP_STORED),
     "zip deflated": zip_of,
     "zip streamed": streamed_zip_of,
+    "zip streamed stored": lambda members: streamed_zip_of(members, zipfile.ZIP_STORED, has_long_sizes=False),
+    "zip streamed stored, long": lambda members: streamed_zip_of(members, zipfile.ZIP_STORED),
     "tar pax": tar_of,
     "tar gnu": lambda members: tar_of(members, tar_format=tarfile.GNU_FORMAT),
     "tar ustar": lambda members: tar_of(members, tar_format=tarfile.USTAR_FORMAT),

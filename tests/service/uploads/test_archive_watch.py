@@ -129,7 +129,21 @@ def test_what_is_no_archive(tmp_path: Path) -> None:
     assert refused(tmp_path / "archive", b"no archive" * 1000, "not-an-archive") <= PIECE_BYTES
 
 
-def test_entries_that_are_stored_and_declare_no_size_end_the_watch(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_signature", [True, False])
+def test_a_stored_archive_within_a_stored_entry_without_sizes(tmp_path: Path, has_signature: bool) -> None:
+    """The entry ends at its own descriptor, not at one of its content; a descriptor may have no signature."""
+    inner = streamed_zip_of(images("inner/0.png", "inner/1.png"), zipfile.ZIP_STORED, has_long_sizes=False)
+    names = ["front/1.png", "notes/mine.txt", *(f"front/{n}.png" for n in range(2, 80))]
+    members: Members = [("front/0.png", inner), *images(*names)]
+    data = streamed_zip_of(members, zipfile.ZIP_STORED, has_long_sizes=False)
+    if not has_signature:
+        head, _, rest = data.partition(inner)
+        data = head + inner + rest.replace(b"PK\x07\x08", b"")
+    came = refused(tmp_path / "archive", data, "unexpected-file", "notes/mine.txt")
+    assert len(inner) + PNG_BYTES < came < len(inner) + 4 * PNG_BYTES < 0.5 * len(data)
+
+
+def test_a_stored_entry_whose_end_nothing_says(tmp_path: Path) -> None:
     """The whole archive is checked all the same."""
     data = bytearray(zip_of(images("front/0.png", "mine.txt"), zipfile.ZIP_STORED))
     data[6] |= 8

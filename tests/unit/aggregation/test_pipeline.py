@@ -12,11 +12,14 @@ from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.export.map import ALWAYS, REPLACED
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.pipeline import reconstruct
 from tests.helpers.export_example import make_scene
 
+# The example has 50 points; its scenes lie upon one another.
+CONFIG = EngineConfig.model_validate({"aggregation": {"min_inliers": 20}, "threads": 1})
 REPORT = {"settings": {"features": {"extractor": "sift"}}}
 
 
@@ -35,6 +38,30 @@ def test_no_map_over_a_scene_and_no_scene_over_a_map(tmp_path: Path) -> None:
     (one / "map.json").write_text("{}")
     with pytest.raises(InputError, match="holds a map"):
         reconstruct(tmp_path / "nowhere", one, EngineConfig())
+
+
+def test_a_folder_with_files_that_no_map_has_made_is_refused(tmp_path: Path) -> None:
+    """Most of all the folder in which somebody keeps scenes in `scenes/`: a map would replace it."""
+    for name in ("one", "two"):
+        write_scene(make_scene(folder=name), tmp_path / "scenes" / name, REPORT)
+    scenes, before = [tmp_path / "scenes" / name for name in ("one", "two")], contents(tmp_path)
+    with pytest.raises(InputError, match="scenes was made by no map") as found:
+        aggregate(scenes, tmp_path, CONFIG)
+    assert found.value.code == "bad-out-folder"
+    assert contents(tmp_path) == before
+
+
+def test_a_map_is_replaced_by_the_next_and_no_name_of_it_is_unknown(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        write_scene(make_scene(folder=name), tmp_path / name, REPORT)
+    out = tmp_path / "map"
+    out.mkdir()
+    (out / "notes.txt").touch()  # what is no map's stays
+    for _ in range(2):
+        aggregate([tmp_path / "one", tmp_path / "two"], out, CONFIG)
+        made = {path.name for path in out.iterdir()} - {"notes.txt", ".stages", "report.json"}
+        assert made <= {*REPLACED, *ALWAYS}
+        assert set(ALWAYS) <= made
 
 
 def test_a_map_of_another_version_is_refused_by_name(tmp_path: Path) -> None:

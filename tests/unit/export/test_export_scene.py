@@ -598,14 +598,14 @@ def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
 def test_a_folder_with_files_that_no_scene_has_made_is_refused(scene: Scene, tmp_path: Path) -> None:
     """Somebody's own pictures, say, would be replaced; other files are kept beside a scene."""
     (tmp_path / "notes.txt").touch()
-    require_free_folder(tmp_path, ".stages")
-    require_free_folder(tmp_path / "new", ".stages")
+    require_free_folder(tmp_path)
+    require_free_folder(tmp_path / "new")
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "mine.jpg").touch()
     with pytest.raises(InputError, match=r"pictures was made by no scene") as found:
         reconstruct(tmp_path / "no drive", tmp_path, EngineConfig())
     assert found.value.code == "bad-out-folder"
     (tmp_path / ".stages").mkdir()
-    require_free_folder(tmp_path, ".stages")  # of a run that was interrupted
+    require_free_folder(tmp_path)  # of a run that was interrupted
     write_scene(scene, tmp_path / "scene", {})
-    require_free_folder(tmp_path / "scene", ".stages")
+    require_free_folder(tmp_path / "scene")

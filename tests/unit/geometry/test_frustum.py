@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 import pytest
 
 from mrasfm_engine.geometry import se3
@@ -51,6 +52,33 @@ def test_views_in_other_directions_do_not_overlap(yaw_deg: float) -> None:
 
 def test_cameras_back_to_back_apart_do_not_overlap() -> None:
     assert overlap(camera_at(), camera_at(x_m=-2.0, yaw_deg=180.0))[0] == 0.0
+
+
+def test_folded_distortion_sees_nothing_beyond_its_fold() -> None:
+    """Two cameras of 50 deg that look 60 deg apart: their frustums do not meet, but the formula of the distortion maps
+    what lies 58 deg off an axis back into the image."""
+    params = [1000.0, 1000.0, 466.0, 350.0, -0.32, 0.0, 0.0, 0.0]
+    kind, packed = pack_camera("OPENCV", params)
+    width, height = 932, 700
+    camera = pycolmap.Camera(model="OPENCV", width=width, height=height, params=params)
+    off = np.radians(58.0)
+    u, v = camera.img_from_cam(np.array([[np.sin(off), 0.0, np.cos(off)]]))[0]
+    assert 0 < u < width, "the formula alone is fooled"
+    assert 0 < v < height
+    found = {
+        yaw_deg: view_overlap(
+            np.array([[0, 1]]),
+            world_from_cam=np.stack([camera_at(), camera_at(yaw_deg=yaw_deg)]),
+            camera=np.zeros(2, dtype=np.int64),
+            kind=np.array([kind], dtype=np.int64),
+            params=packed[None],
+            size_px=np.array([[width, height]], dtype=np.int64),
+            max_depth_m=DEPTH_M,
+        )[0]
+        for yaw_deg in (10.0, 55.0, 60.0, 75.0)
+    }
+    assert found[10.0] > 0.4
+    assert [found[yaw_deg] for yaw_deg in (55.0, 60.0, 75.0)] == [0.0] * 3
 
 
 def test_a_turn_by_half_the_view_halves_the_overlap() -> None:

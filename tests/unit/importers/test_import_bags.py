@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -9,9 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from backports.zstd import ZstdCompressor
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from rosbags import rosbag1
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import StoragePlugin
 
 from mrasfm_engine.cli import main
 from mrasfm_engine.errors import InputError
@@ -698,6 +702,75 @@ def test_a_chunk_is_not_taken_to_the_end_of_the_memory(
         assert tracemalloc.get_traced_memory()[1] < 14e6
     finally:
         tracemalloc.stop()
+
+
+def zstd_bag(made: Messages, path: Path, mode: str, *, storage: str = "sqlite") -> Path:
+    """The messages as `ros2 bag record --compression-mode file` (or message) writes them."""
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(rosbag2.CompressionMode[mode.upper()], rosbag2.CompressionFormat.ZSTD)
+    with writer as bag:
+        made.write_into_ros2(bag)
+    return path
+
+
+@pytest.mark.parametrize(("mode", "storage"), [("file", "sqlite"), ("file", "mcap"), ("message", "sqlite")])
+def test_bags_of_ros_2_in_zstd(tmp_path: Path, mode: str, storage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = stereo()
+    bag = zstd_bag(made, tmp_path / "recorded", mode, storage=storage)
+    (tmp_path / "there").mkdir()
+    # What rosbags itself would take out of zstd lies there, and nowhere else.
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "no such folder"))
+    before = sorted(bag.iterdir())
+    assert import_recording(bag, tmp_path / "there" / "drive").images == 8
+    assert read_drive(tmp_path / "there" / "drive").manifest.name == "recorded"
+    assert [path.name for path in (tmp_path / "there").iterdir()] == ["drive"]
+    assert sorted(bag.iterdir()) == before
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_a_file_in_zstd_does_not_fill_the_disk(
+    tmp_path: Path, is_stated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some kilobytes say, or are, 200 MB more: they are refused by name, and nothing is left."""
+    bag = zstd_bag(stereo(), tmp_path / "recorded", "file")
+    (file,) = bag.glob("*.zstd")
+    packer = ZstdCompressor()
+    if is_stated:
+        packer.set_pledged_input_size(200_000_000)
+    with file.open("wb") as sink:
+        for _ in range(200):
+            sink.write(packer.compress(bytes(1_000_000)))
+        sink.write(packer.flush())
+    assert file.stat().st_size < 1e6
+    usage = shutil.disk_usage(tmp_path)._replace(free=20_000_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    (tmp_path / "there").mkdir()
+    with pytest.raises(InputError, match=rf"bag file .*{file.name} is compressed.* over 10 MB") as found:
+        import_recording(bag, tmp_path / "there" / "drive")
+    assert found.value.code == "bag-too-large"
+    assert [*(tmp_path / "there").iterdir()] == []
+
+
+def test_a_message_in_zstd_does_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = stereo()
+    made.image("/left/image_raw", START_US + 350_000, "left", np.zeros((4000, 4000), np.uint8))
+    bag = zstd_bag(made, tmp_path / "recorded", "message")
+    assert sum(file.stat().st_size for file in bag.iterdir()) < 1e6
+    monkeypatch.setattr(bag_reader, "MAX_CHUNK_BYTES", 4_000_000)
+    with pytest.raises(InputError, match=r"bag .*recorded cannot be read: .*holds over 4 MB"):
+        import_recording(bag, tmp_path / "none")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 0.5])
+def test_a_damaged_file_in_zstd_is_refused(tmp_path: Path, keep: float) -> None:
+    bag = zstd_bag(stereo(), tmp_path / "recorded", "file")
+    (file,) = bag.glob("*.zstd")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(keep if keep > 1 else keep * len(whole))])
+    with pytest.raises(InputError, match=r"bag .*recorded cannot be read: "):
+        import_recording(bag, tmp_path / "drive")
+    assert not (tmp_path / "drive").exists()
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -86,6 +86,24 @@ def test_leaving_the_prior_is_a_finding() -> None:
     assert held_intrinsics(mapper).findings(mapper) == []
 
 
+def test_terms_of_distortion_that_never_vary_are_said() -> None:
+    mapper, simulated = model(straight=False, cameras=2)
+    rig = simulated.drive.manifest.rig
+    wide = {"model": "FULL_OPENCV", "params": [*rig.cameras[0].params, 0.1, -0.02, 0.0, 0.0, 0.003, 0.0, 0.04, 0.0]}
+    plain = {"model": "FULL_OPENCV", "params": [*rig.cameras[1].params, 0.1, -0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]}
+    cameras = [camera.model_copy(update=to) for camera, to in zip(rig.cameras, (wide, plain), strict=True)]
+    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
+    mapper.drive = replace(simulated.drive, manifest=manifest)
+    decision = IntrinsicsDecision(
+        free=np.ones((2, 8), dtype=np.bool_), sigma_focal=np.full(2, 1e-3), prior_sigma_focal=np.full(2, SIGMA_FOCAL)
+    )
+    (said,) = decision.findings(mapper)
+    assert said.code == "distortion-held"
+    assert said.what.startswith(f"k3, k5 of camera {cameras[0].name} are held as given")
+    assert replace(decision, free=np.zeros((2, 8), dtype=np.bool_)).findings(mapper)[0].code == "focal-not-observed"
+    assert held_intrinsics(mapper).findings(mapper) == []
+
+
 def test_the_prior_is_the_manifests_where_it_says_one() -> None:
     mapper, simulated = model(straight=False, cameras=2)
     rig = simulated.drive.manifest.rig

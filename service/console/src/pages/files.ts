@@ -30,6 +30,8 @@ const MEANINGS: [RegExp, string][] = [
   [/^map\.json$/, "scenes, seams and verdicts"],
   [/^manifest\.json$/, "the drive's manifest, in the engine's axes"],
   [/^(scenes|seams)\//, "data for the map's next version"],
+  [/^own_car\//, "where the camera shows its own car"],
+  [/^components\//, "of a part of the drive that nothing links to the rest"],
 ];
 
 export function Files({ files }: { files: readonly FileResource[] }): Shown {
@@ -41,10 +43,14 @@ export function Files({ files }: { files: readonly FileResource[] }): Shown {
     <label class="filter">Find a file <input type="search" value=${wanted} onInput=${(event: Event) => setWanted((event.target as HTMLInputElement).value)} /></label>
     ${shown.length === 0
       ? html`<${Empty}>No file of this name.<//>`
-      : html`<div class="scroll" tabindex="0" role="region" aria-label="Files"><table>
-          <thead><tr><th scope="col">File</th><th scope="col" class="number">Size</th><th scope="col">Content</th></tr></thead>
-          <tbody>${shown.map(
-            (file) => html`<tr key=${file.path}><td><a href=${file.url.replace(/^\//, "")} download>${file.path}</a></td>
-              <td class="number">${bytes(file.size_bytes)}</td><td>${MEANINGS.find(([name]) => name.test(file.path))?.[1] ?? ""}</td></tr>`,
-          )}</tbody></table></div>`}`;
+      : html`<${FileTable} files=${shown} label="Files" />`}`;
+}
+
+export function FileTable({ files, label }: { files: readonly FileResource[]; label: string }): Shown {
+  return html`<div class="scroll" tabindex="0" role="region" aria-label=${label}><table>
+    <thead><tr><th scope="col">File</th><th scope="col" class="number">Size</th><th scope="col">Content</th></tr></thead>
+    <tbody>${files.map(
+      (file) => html`<tr key=${file.path}><td><a href=${file.url.replace(/^\//, "")} download>${file.path}</a></td>
+        <td class="number">${bytes(file.size_bytes)}</td><td>${MEANINGS.find(([name]) => name.test(file.path))?.[1] ?? ""}</td></tr>`,
+    )}</tbody></table></div>`;
 }

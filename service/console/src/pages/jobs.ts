@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { get, getAll, send, type Drive, type Job } from "../client";
+import { get, getAll, send, type Drive, type Export, type Job } from "../client";
 import { Badge, Bar, Confirm, Content, Empty, eta, Heading, KINDS, ProblemBox, stageOf, Tile, Time, useLoad } from "../components";
 import { duration } from "../format";
 import { html, type Children, type Shown } from "../html";
@@ -109,7 +109,14 @@ function JobActions({ job }: { job: Job }): Shown {
 function Results({ job }: { job: Job }): Shown {
   if (job.scene_id) return html`<p><a class="button primary" href=${link("scenes", job.scene_id)}>Open the scene</a></p>`;
   if (job.map_id && job.map_version) return html`<p><a class="button primary" href=${link("maps", job.map_id)}>Open the map</a></p>`;
+  if (job.export_id) return html`<${ExportOf} id=${job.export_id} />`;
   return null;
+}
+
+function ExportOf({ id }: { id: string }): Shown {
+  const loaded = useLoad((abort) => get<Export>(`v1/exports/${id}`, abort), `export ${id}`, false);
+  return html`<${Content} of=${loaded}>${({ scene_id: scene, map_id: map, formats }: Export) => html`<p>Formats: ${formats.join(", ")}.</p>
+    <p><a class="button primary" href=${scene ? link("scenes", scene, "files") : link("maps", map ?? "", "files")}>Open the exports of the ${scene ? "scene" : "map"}</a></p>`}<//>`;
 }
 
 interface Branch {

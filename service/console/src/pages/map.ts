@@ -6,6 +6,7 @@ import { html, type Children, type Shown } from "../html";
 import { Lazy } from "../lazy";
 import { link } from "../router";
 import { Slider } from "../slider";
+import { Exports } from "./exports";
 import { Files } from "./files";
 import { hasFile, ReportParts, type Report } from "./scene";
 
@@ -54,7 +55,7 @@ function WithVersion({ map, number, tab }: { map: MapResource; number: number; t
 }
 
 function versionTab(version: MapVersion, base: string, tab: string): Children {
-  if (tab === "files") return html`<${Files} files=${version.files} />`;
+  if (tab === "files") return html`<${Files} files=${version.files} /><${Exports} base=${base} />`;
   if (tab === "seams") return html`<${Seams} version=${version} base=${base} />`;
   if (tab === "calibration") {
     const files = version.files.map((file) => file.path).filter((path) => /^calibration\/[^/]+\.json$/.test(path));

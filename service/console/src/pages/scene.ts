@@ -6,6 +6,7 @@ import { Lazy } from "../lazy";
 import { go, link } from "../router";
 import { Slider } from "../slider";
 import { SceneTable } from "./drives";
+import { Exports } from "./exports";
 import { Files } from "./files";
 
 export interface Report {
@@ -62,7 +63,7 @@ function sceneTab(scene: Scene, tab: string): Children {
     return html`<${Lazy} load=${() => import("../place/page")} name="Place" of=${{ base }} />`;
   }
   if (tab === "calibration") return html`<${Lazy} load=${() => import("../calibration/page")} name="CalibrationPage" of=${{ base, driveId: scene.drive_id, hasPictures: hasFile(scene, "pictures/birds_eye_before.png") }} />`;
-  if (tab === "files") return html`<${Files} files=${scene.files} />`;
+  if (tab === "files") return html`<${Files} files=${scene.files} /><${Exports} base=${base} components=${scene.summary.components ?? []} />`;
   return html`<${Overview} scene=${scene} />`;
 }
 
