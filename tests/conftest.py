@@ -23,6 +23,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# Tests start hundreds of processes, each of which would compile all sources first. Where bytecode goes, in __pycache__,
+# numba writes its kernels in any case.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Kernels are compiled once for all test processes, while these run the tests that need none.
 _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
 _WITHOUT_KERNELS = (REPOSITORY / "tests" / "service", REPOSITORY / "tests" / "unit" / "schemas")
