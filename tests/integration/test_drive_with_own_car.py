@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.synthetic.drive_writer import TRUE_OWN_CAR_FOLDER
-from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, synth
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, synth
 
 SEEN_BY = ("front", "back")
 UNITS = 16
@@ -42,12 +42,11 @@ def test_the_own_car_is_left_out(tmp_path: Path, mrasfm: Callable[..., CommandRe
     assert (scene / "own_car" / "front.png").is_file()
 
 
-def test_the_search_can_be_switched_off(
-    surround_drive: Path, tmp_path: Path, mrasfm: Callable[..., CommandResult]
-) -> None:
+def test_the_search_can_be_switched_off(variant: Variant, tmp_path: Path, mrasfm: Callable[..., CommandResult]) -> None:
     config, scene = tmp_path / "off.toml", tmp_path / "scene"
     config.write_text("[features]\nown_car = false\n[output]\npictures = false\n", encoding="utf-8")
-    assert mrasfm("reconstruct", surround_drive, "--out", scene, "--config", config).code == 0
+    drive = variant.keep(cameras=["front", "left"], units=3).save().root
+    assert mrasfm("reconstruct", drive, "--out", scene, "--config", config).code == 0
     assert json.loads((scene / "report.json").read_text(encoding="utf-8"))["own_car"] == {}
     assert not (scene / "own_car").exists()
 

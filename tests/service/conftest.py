@@ -14,11 +14,12 @@ from typing import Any
 import pytest
 from sqlalchemy import create_engine, make_url, text
 
-from service.database.connections import Database, migrate
+from service.database.connections import Database
 from service.database.tables import new_id
 from service.domain.keys import create_project
 from service.settings import Settings
 from tests.helpers.live_api import Api, Client, api_in_thread, settings_of
+from tests.helpers.migrated import migrated
 
 StartApi = Callable[..., Api]
 
@@ -138,7 +139,7 @@ def _on_server(url: str, statement: str) -> None:
 @pytest.fixture
 def database(database_settings: Settings) -> Iterator[Database]:
     """A migrated database, of either kind."""
-    migrate(database_settings)
+    migrated(database_settings)
     opened = Database.from_settings(database_settings)
     yield opened
     opened.close()
