@@ -78,9 +78,15 @@ def _kernel_version() -> str:
     return digest.hexdigest()
 
 
+# Files of these take up to two minutes each. What comes last are the many short ones of `tests/unit`: with long files
+# at the end one test process would work alone.
+_LONG = tuple(REPOSITORY / "tests" / name for name in ("integration", "worker", "console"))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests first that need no kernels."""
-    items.sort(key=_needs_kernels)
+    """Put the tests first that need no kernels, and of the others the long ones."""
+    needing = {item.path for item in items if _needs_kernels(item)}  # files go to test processes in one piece
+    items.sort(key=lambda item: (item.path in needing, not any(item.path.is_relative_to(folder) for folder in _LONG)))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
