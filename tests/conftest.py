@@ -23,6 +23,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# Tests start hundreds of processes, each of which would compile all sources first. Where bytecode goes, in __pycache__,
+# numba writes its kernels in any case.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Kernels are compiled once for all test processes, while these run the tests that need none.
 _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
 _WITHOUT_KERNELS = (REPOSITORY / "tests" / "service", REPOSITORY / "tests" / "unit" / "schemas")
@@ -73,9 +78,15 @@ def _kernel_version() -> str:
     return digest.hexdigest()
 
 
+# Files of these take up to two minutes each. What comes last are the many short ones of `tests/unit`: with long files
+# at the end one test process would work alone.
+_LONG = tuple(REPOSITORY / "tests" / name for name in ("integration", "worker", "console"))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests first that need no kernels."""
-    items.sort(key=_needs_kernels)
+    """Put the tests first that need no kernels, and of the others the long ones."""
+    needing = {item.path for item in items if _needs_kernels(item)}  # files go to test processes in one piece
+    items.sort(key=lambda item: (item.path in needing, not any(item.path.is_relative_to(folder) for folder in _LONG)))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

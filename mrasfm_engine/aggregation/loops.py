@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri  # scipy.stats takes half a second to import
 
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
@@ -27,14 +27,14 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
 
 GATE_SIGMAS = 4.0  # of a loop and of positions: of right loops one in 16,000 is beyond
-MAX_MISCLOSURE = float(chi2.isf(chi2.sf(GATE_SIGMAS**2, 1), 6))  # squared: as likely as one value beyond the gate
+MAX_MISCLOSURE = float(chdtri(6, chdtrc(1, GATE_SIGMAS**2)))  # squared: as likely as one value beyond the gate
 # A loop that closes no worse than most right ones do confirms its seams; between the two it says nothing.
-CONFIRMING = float(chi2.isf(chi2.sf(2.0**2, 1), 6))
+CONFIRMING = float(chdtri(6, chdtrc(1, 2.0**2)))
 # What images leave of a path: heading and tilt drift like a random walk. The similarity errors of reconstructed drives
 # (0.01 to 0.07 m after 50 to 100 m, see docs/benchmarks/accuracy.md) are of this size.
 DRIFT_RAD_PER_SQRT_M = np.radians(0.02) / np.sqrt(10.0)
 # So many loops tell whether scenes of this map are bent by more, of which most have to be right.
-MIN_LOOPS, USUAL_MISCLOSURE = 10, float(chi2.median(6))
+MIN_LOOPS, USUAL_MISCLOSURE = 10, float(chdtri(6, 0.5))
 UNKNOWN_SCALE_SHARE = 1.0 / 3.0  # of the largest difference between scenes that seams allow: a gate is several sigmas
 STRAIGHT_PARTS = 32  # of a path of which only the ends are known
 LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # of a seam: it averages over the bends of both scenes there
@@ -349,8 +349,8 @@ def _error_at(first_from_scene: Floats, at_m: Floats, covariance: Floats) -> tup
 
 def _as_normal(squared: float, freedoms: int) -> float:
     """The size of a normal variable that is as unlikely as a chi-squared one."""
-    beyond = float(chi2.sf(squared, freedoms))
-    return float(np.sqrt(chi2.isf(beyond, 1))) if beyond > 0.0 else float(np.sqrt(squared))
+    beyond = float(chdtrc(freedoms, squared))
+    return float(np.sqrt(chdtri(1, beyond))) if beyond > 0.0 else float(np.sqrt(squared))
 
 
 def _words(loop: Loop) -> str:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri  # scipy.stats takes half a second to import
 
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import BundleAdjustmentConfig
@@ -375,7 +375,7 @@ def _contradictions(
 
 def _as_normal(squared: float, dof: int) -> float:
     """A normal variable as unlikely as a sum of squares."""
-    return float(-norm.ppf(chi2.sf(squared, dof) / 2.0)) if squared < FAR else float(np.sqrt(squared))
+    return float(-ndtri(chdtrc(dof, squared) / 2.0)) if squared < FAR else float(np.sqrt(squared))
 
 
 def _expected(

@@ -89,6 +89,7 @@ def test_a_frustum_opens_its_image_with_its_observations(viewer: Page, world: Wo
     expect(aside.get_by_role("img")).to_have_attribute("src", f"v1/drives/{world.drive_id}/files/{file}")
     wait_for(viewer, "document.querySelector('.photo img').naturalWidth === 960")
     viewer.locator("[data-observations='50']").wait_for()
+    wait_for(viewer, "document.querySelector('.photo canvas').width === 960")  # it is drawn after the page is
     drawn = viewer.evaluate(
         """() => { const c = document.querySelector('.photo canvas');
              const d = c.getContext('2d').getImageData(0, 0, c.width, c.height), drawn = [];

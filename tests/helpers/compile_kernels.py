@@ -1,7 +1,8 @@
 """Compiles the engine's kernels once for all test processes: `python -m tests.helpers.compile_kernels`.
 
 numba compiles a function in each process that calls it before another has left the result on the disk. Two drives are
-rendered, reconstructed and aggregated here; that calls nearly all of them.
+rendered, reconstructed and aggregated here, and one whose cameras are not simultaneous, for which the adjustment is
+compiled another time; that calls nearly all of them.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from pathlib import Path
 
 from mrasfm_engine.cli import main
 
+WITHOUT_PICTURES = Path(__file__).parents[1] / "integration" / "without_pictures.toml"
+
 
 def compile_kernels(folder: Path) -> None:
     """Run the commands on drives that are as small as they may be."""
@@ -21,6 +24,9 @@ def compile_kernels(folder: Path) -> None:
     for drive, scene in zip(sorted(path.parent for path in drives.glob("*/drive.json")), scenes, strict=True):
         _run("reconstruct", drive, "--out", scene)
     _run("aggregate", *scenes, "--out", folder / "map")
+    apart = folder / "apart"
+    _run("synth", "--out", apart, "--time-skew-ms", "40", "--cameras", "2", "--units", "6", *options[4:])
+    _run("reconstruct", apart, "--out", folder / "c", "--config", WITHOUT_PICTURES)
 
 
 def _run(*arguments: object) -> None:

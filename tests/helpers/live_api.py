@@ -23,7 +23,7 @@ from schemas.api.scenes import SceneSummary
 from schemas.exports import EXPORTED_OF_MAP, EXPORTED_OF_SCENE
 from service.api.app import create_app
 from service.api.server import server_of
-from service.database.connections import Database, migrate
+from service.database.connections import Database
 from service.database.tables import Project, new_id
 from service.domain import drives, jobs, maps, scenes
 from service.domain.keys import create_key, create_project
@@ -32,6 +32,7 @@ from service.settings import Settings
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile, store_file
 from service.storage.durability import secure_drive
+from tests.helpers.migrated import migrated
 from tests.helpers.tiny_drive import TinyDrive, tiny_drive
 
 HOST = "127.0.0.1"
@@ -250,7 +251,7 @@ def forget_all(api: Api) -> list[str]:
 @contextmanager
 def api_in_thread(settings: Settings) -> Iterator[Api]:
     """The API served by uvicorn in a thread of this process: a real socket, without the start of a process."""
-    migrate(settings)
+    migrated(settings)
     app = create_app(settings)
     server = server_of(app, host=HOST, port=0, timeout_graceful_shutdown=2)
     thread = threading.Thread(target=server.run, name="api", daemon=True)
@@ -279,7 +280,7 @@ class ApiProcess(Api):
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        migrate(self.settings)
+        migrated(self.settings)
         own = {name: value for name, value in os.environ.items() if not name.startswith("MRASFM_")}
         given = {
             "MRASFM_DATA_DIR": str(self.settings.data_dir),

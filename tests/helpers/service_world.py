@@ -15,7 +15,7 @@ import psutil
 
 from schemas.api.jobs import JobKind
 from schemas.parsing import parse_manifest
-from service.database.connections import Database, migrate
+from service.database.connections import Database
 from service.database.tables import Drive, Job, JobAttempt, JobEvent, Scene, WorkerSeen, new_id
 from service.domain import drive_files, drives, jobs
 from service.domain.keys import create_project
@@ -25,6 +25,7 @@ from service.settings import Settings
 from service.standalone import broker
 from service.storage.artifacts import ArtifactStore
 from service.storage.blob_writer import StoredFile, file_sha256, store_file
+from tests.helpers.migrated import migrated
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEADLINE_S = 120.0
@@ -74,7 +75,7 @@ class World:
             redis_url=self.broker.url,
             **{**SHORT_TIMES, **changed},
         )
-        migrate(self.settings)
+        migrated(self.settings)
         self.database = Database.from_settings(self.settings)
         self.artifacts = ArtifactStore(self.settings)
         self._logs = folder / "logs"

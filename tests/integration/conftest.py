@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from mrasfm_engine.cli import main
+from tests.helpers.made_once import made_once
 
 Document = dict[str, Any]
 # Pictures take seconds, and most tests look at none.
@@ -87,16 +88,19 @@ def mrasfm_process(*arguments: object, **options: Any) -> subprocess.Popen[str]:
 
 @pytest.fixture(scope="session")
 def surround_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered drive of 4 cameras (front, back, left, right) and 8 units."""
-    return synth(tmp_path_factory.mktemp("rendered") / "drive", "--cameras", 4, "--units", 8, "--seed", 3)
+    """A rendered drive of 4 cameras (front, back, left, right) and 8 units. Tests only read it."""
+    options = ("--cameras", 4, "--units", 8, "--seed", 3)
+    return made_once(tmp_path_factory, "surround-drive", lambda out: synth(out, *options))
 
 
 @pytest.fixture(scope="session")
-def surround_scene(surround_drive: Path) -> Path:
+def surround_scene(surround_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """That drive's scene, with GNSS. Tests only read it."""
-    out = surround_drive.parent / "scene"
-    assert main(["reconstruct", str(surround_drive), "--out", str(out)]) == 0
-    return out
+
+    def make(out: Path) -> None:
+        assert main(["reconstruct", str(surround_drive), "--out", str(out)]) == 0
+
+    return made_once(tmp_path_factory, "surround-scene", make)
 
 
 @pytest.fixture

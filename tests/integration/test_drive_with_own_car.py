@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.synthetic.drive_writer import TRUE_OWN_CAR_FOLDER
-from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, synth
+from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, synth
 
 SEEN_BY = ("front", "back")
 UNITS = 16
@@ -19,7 +19,8 @@ UNITS = 16
 
 def test_the_own_car_is_left_out(tmp_path: Path, mrasfm: Callable[..., CommandResult]) -> None:
     drive, scene = tmp_path / "drive", tmp_path / "scene"
-    synth(drive, "--cameras", 4, "--units", UNITS, "--spacing-m", 1.5, "--own-car", "--no-masks", "--seed", 3)
+    size = ("--width", 384, "--height", 216)  # of smaller images, the car's edge is not found well enough
+    synth(drive, *size, "--cameras", 4, "--units", UNITS, "--spacing-m", 1.5, "--own-car", "--no-masks", "--seed", 3)
     assert mrasfm("reconstruct", drive, "--out", scene, *WITHOUT_PICTURES).code == 0
     report = json.loads((scene / "report.json").read_text(encoding="utf-8"))
     assert set(report["own_car"]) == {"front", "left", "right", "back"}
@@ -42,12 +43,11 @@ def test_the_own_car_is_left_out(tmp_path: Path, mrasfm: Callable[..., CommandRe
     assert (scene / "own_car" / "front.png").is_file()
 
 
-def test_the_search_can_be_switched_off(
-    surround_drive: Path, tmp_path: Path, mrasfm: Callable[..., CommandResult]
-) -> None:
+def test_the_search_can_be_switched_off(variant: Variant, tmp_path: Path, mrasfm: Callable[..., CommandResult]) -> None:
     config, scene = tmp_path / "off.toml", tmp_path / "scene"
     config.write_text("[features]\nown_car = false\n[output]\npictures = false\n", encoding="utf-8")
-    assert mrasfm("reconstruct", surround_drive, "--out", scene, "--config", config).code == 0
+    drive = variant.keep(cameras=["front", "left"], units=3).save().root
+    assert mrasfm("reconstruct", drive, "--out", scene, "--config", config).code == 0
     assert json.loads((scene / "report.json").read_text(encoding="utf-8"))["own_car"] == {}
     assert not (scene / "own_car").exists()
 

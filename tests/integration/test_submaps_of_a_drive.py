@@ -31,7 +31,9 @@ STAGES = ("features", "matches", "mapping")
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synth(tmp_path_factory.mktemp("cut") / "drive", "--cameras", 2, "--units", UNITS, "--seed", 4, "--no-masks")
+    size = ("--width", 320, "--height", 180)
+    out = tmp_path_factory.mktemp("cut") / "drive"
+    return synth(out, *size, "--cameras", 2, "--units", UNITS, "--seed", 4, "--no-masks")
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from service.database.tables import new_id
 from service.domain.keys import create_project
 from service.settings import Settings
 from tests.helpers.live_api import Api, Client, api_in_thread, settings_of
+from tests.helpers.migrated import migrated
 
 StartApi = Callable[..., Api]
 
@@ -119,6 +120,14 @@ def postgres_database(postgres_url: str) -> Iterator[str]:
         yield url
 
 
+@pytest.fixture(scope="session")
+def postgres_template(postgres_url: str) -> Iterator[str]:
+    """Name of a migrated PostgreSQL database that nobody is connected to, so that it can be copied."""
+    with _postgres_database(postgres_url) as url:
+        migrate(Settings(database_url=url))
+        yield make_url(url).database or ""
+
+
 @contextmanager
 def _postgres_database(server: str) -> Iterator[str]:
     """URL of an empty database."""
@@ -136,9 +145,15 @@ def _on_server(url: str, statement: str) -> None:
 
 
 @pytest.fixture
-def database(database_settings: Settings) -> Iterator[Database]:
+def database(database_settings: Settings, request: pytest.FixtureRequest) -> Iterator[Database]:
     """A migrated database, of either kind."""
-    migrate(database_settings)
+    url = make_url(database_settings.resolved_database_url)
+    if url.get_backend_name() == "postgresql":
+        template, server = request.getfixturevalue("postgres_template"), request.getfixturevalue("postgres_url")
+        _on_server(server, f'DROP DATABASE "{url.database}"')
+        _on_server(server, f'CREATE DATABASE "{url.database}" TEMPLATE "{template}"')
+    else:
+        migrated(database_settings)
     opened = Database.from_settings(database_settings)
     yield opened
     opened.close()

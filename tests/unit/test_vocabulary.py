@@ -42,9 +42,14 @@ def _trees() -> dict[str, ast.Module]:
     return {str(path.relative_to(REPOSITORY)): ast.parse(path.read_text(encoding="utf-8")) for path in sorted(paths)}
 
 
+@cache
+def _nodes(tree: ast.Module) -> list[ast.AST]:
+    return list(ast.walk(tree))
+
+
 def _names(path: str, tree: ast.Module) -> Iterator[tuple[str, int]]:
     yield from ((part.removesuffix(".py"), 0) for part in Path(path).parts[1:])
-    for node in ast.walk(tree):
+    for node in _nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node.name, node.lineno
         elif isinstance(node, ast.ClassDef):
@@ -76,7 +81,7 @@ def test_docstrings_begin_with_what_they_describe(package: str) -> None:
         f"{path}: {docstring.splitlines()[0]}"
         for path, tree in _trees().items()
         if path.startswith(f"{package}/")
-        for node in ast.walk(tree)
+        for node in _nodes(tree)
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         if (docstring := ast.get_docstring(node)) and docstring.split()[0] in NO_BEGINNINGS
     ]
@@ -117,10 +122,10 @@ def _members(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> set[str]:
 
 
 def test_documented_arguments_and_attributes_exist() -> None:
-    classes = {n.name: n for tree in _trees().values() for n in ast.walk(tree) if isinstance(n, ast.ClassDef)}
+    classes = {n.name: n for tree in _trees().values() for n in _nodes(tree) if isinstance(n, ast.ClassDef)}
     unknown = []
     for path, tree in _trees().items():
-        for node in ast.walk(tree):
+        for node in _nodes(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 known = _arguments(node)
             elif isinstance(node, ast.ClassDef):
@@ -136,7 +141,7 @@ def _module_of(path: str) -> str:
 
 
 def _imports(tree: ast.Module, modules: frozenset[str]) -> Iterator[str]:
-    for node in ast.walk(tree):  # those of functions and those for type checkers too
+    for node in _nodes(tree):  # those of functions and those for type checkers too
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in modules)
         elif isinstance(node, ast.ImportFrom) and node.module in modules:

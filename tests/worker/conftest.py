@@ -13,6 +13,7 @@ import pytest
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from service.settings import Settings
+from tests.helpers.made_once import made_once
 from tests.helpers.service_world import World
 from worker.child_protocol import Work
 from worker.progress import ProgressMeter
@@ -24,19 +25,15 @@ DEADLINE_S = 60.0
 @pytest.fixture(scope="session")
 def small_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered drive of 2 cameras and 6 units. Tests only read it."""
-    out = tmp_path_factory.mktemp("rendered") / "drive"
     options = SynthOptions(cameras=2, units=6, seed=3, width=480, height=270, texture_px=256)
-    (folder,) = render_drives(options, out)
-    return folder
+    return made_once(tmp_path_factory, "small-drive", lambda out: render_drives(options, out))
 
 
 @pytest.fixture(scope="session")
 def brief_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered drive of 2 cameras and 4 units, reconstructed in seconds. Tests only read it."""
-    out = tmp_path_factory.mktemp("rendered") / "drive"
     options = SynthOptions(cameras=2, units=4, seed=3, width=320, height=180, texture_px=128)
-    (folder,) = render_drives(options, out)
-    return folder
+    return made_once(tmp_path_factory, "brief-drive", lambda out: render_drives(options, out))
 
 
 @pytest.fixture

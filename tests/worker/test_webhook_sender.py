@@ -19,11 +19,12 @@ import pytest
 
 from schemas.api.jobs import JobKind
 from schemas.api.webhooks import WebhookRequest
-from service.database.connections import Database, migrate
+from service.database.connections import Database
 from service.database.tables import Job, Webhook, WebhookDelivery, new_id
 from service.domain import jobs, webhooks
 from service.domain.keys import create_project
 from service.settings import Settings
+from tests.helpers.migrated import migrated
 from tests.helpers.service_world import World, kill, wait_until
 from worker import checked_connections, webhook_sender
 from worker.checked_connections import CheckedBackend, resolved
@@ -80,7 +81,7 @@ def receiver() -> Iterator[Receiver]:
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     made = Settings(data_dir=tmp_path, webhook_private_addresses=True, webhook_seconds=0.1)
-    migrate(made)
+    migrated(made)
     return made
 
 
