@@ -12,9 +12,10 @@ with T the information of all terms that are no image observations, and D the de
 sandwich of Huber and White, by clusters: Liang and Zeger, Longitudinal Data Analysis Using Generalized Linear Models,
 Biometrika 1986]. Under a robust loss D is less than the matrix of the normal equations, as weights fall where residuals
 rise [Huber, Robust Statistics, 1981, section 7.6]: little in all, but much in directions that other unknowns can nearly
-make up for. Scores of points are those of independent errors, and of what a point's share; scores of images add what
-exceeds them [two ways of clustering: Cameron, Gelbach and Miller, Robust Inference With Multiway Clustering, Journal of
-Business and Economic Statistics 2011]. They are of whole units: a unit's pose has absorbed what its images share.
+make up for. Scores of points are those of independent errors, and of what a point's share; scores of images widen that
+as far as they exceed it [two ways of clustering: Cameron, Gelbach and Miller, Robust Inference With Multiway
+Clustering, Journal of Business and Economic Statistics 2011]. They are of whole units: a unit's pose has absorbed what
+its images share.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats
 
 MIN_UNITS = 10  # beyond those that units and cameras absorb: fewer tell no covariance
+LEVELS = 10  # rounds, in which directions that stood out no longer do
+SINGULAR = 1e-9  # eigenvalues of a correlation below this are rounding
 POINT_GROUPS = 4096  # points that share nothing add up to as much as one by one; so many tell a variance to 2 %
 
 
@@ -51,14 +54,35 @@ def shared_error_covariance(
         return None
     of_units = problem.scores(state, system, columns, unit)
     of_points = problem.scores(state, system, columns, problem.observations.point % POINT_GROUPS)
-    by_points = of_points.T @ of_points
-    more = units / (units - 1) * of_units.T @ of_units - by_points
-    covariance = by_points + _of_terms(problem, state, columns)
+    covariance = of_points.T @ of_points + _of_terms(problem, state, columns)
+    known = np.diagonal(covariance) > 0.0
+    covariance[np.ix_(known, known)] = _widened(covariance[np.ix_(known, known)], of_units[:, known])
+    return covariance
+
+
+def _widened(covariance: Floats, scores: Floats) -> Floats:
+    """Covariance (k, k) with what it lacks of the scores (n, k) of units: in directions that stand out as much as they
+    have, in all others their mean.
+
+    Few units scatter far in some directions although they share nothing: the eigenvalues of their covariance over the
+    true one reach (1 + sqrt(k / n))^2 [Marchenko and Pastur, Mathematics of the USSR-Sbornik 1967]. One that stands out
+    is l (1 + k / n / (l - 1)), where l is the true one [Baik and Silverstein, Journal of Multivariate Analysis 2006].
+    """
+    count, ratio = len(scores), scores.shape[1] / len(scores)
     sigma = np.sqrt(np.diagonal(covariance))
-    by_sigma = np.where(sigma > 0.0, 1.0 / np.where(sigma > 0.0, sigma, 1.0), 0.0)
-    values, vectors = np.linalg.eigh(more * by_sigma * by_sigma[:, None])
-    spread = vectors * np.sqrt(np.maximum(values, 0.0)) * sigma[:, None]
-    result: Floats = covariance + spread @ spread.T
+    values, vectors = np.linalg.eigh(covariance / sigma / sigma[:, None])
+    root = sigma[:, None] * vectors * np.sqrt(np.maximum(values, SINGULAR))  # times its transpose: the covariance
+    white = scores @ (vectors / np.sqrt(np.maximum(values, SINGULAR)) / sigma[:, None])
+    found, directions = np.linalg.eigh(white.T @ white * (count / (count - 1)))
+    edge, level = (1.0 + np.sqrt(ratio)) ** 2, 1.0
+    for _ in range(LEVELS):
+        others = found[found <= edge * level]
+        level = max(float(others.mean()), level) if len(others) else level
+    found = found / level
+    half = np.maximum(found + 1.0 - ratio, 0.0) / 2.0
+    own = np.where(found > edge, half + np.sqrt(np.maximum(half**2 - found, 0.0)), 1.0)
+    spread = root @ directions * np.sqrt(level * own)
+    result: Floats = spread @ spread.T
     return result
 
 
