@@ -14,7 +14,7 @@ import os
 import secrets
 import weakref
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -206,6 +206,14 @@ class StageStore:
         for path in self._folder.glob(checkpoint_file(self._prefix + pattern)):
             with suppress(OSError):  # what stays is found under no fingerprint any more
                 path.unlink()
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Remove finished stages of a run that came to nothing, and the folders that hold nothing else."""
+        for name in names:
+            self.remove(name)
+        with suppress(OSError):  # something else is in them
+            self._folder.rmdir()
+            self._folder.parent.rmdir()
 
     def has(self, name: str, key: str) -> bool:
         """Return whether a stage has been finished with this fingerprint, without reading its arrays."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.matching.calibration_check import require_calibration_direction
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
@@ -9,7 +10,7 @@ from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.stages._run import Run
-from schemas.artifacts import Stage
+from schemas.artifacts import PLAN_CHECKPOINTS, Stage
 from schemas.findings import as_json
 
 PROBE_UNITS = 5
@@ -64,4 +65,8 @@ def probe(run: Run) -> None:
     }
     if all(f.left_out for f in features):
         return  # the extraction says whether there are others
-    require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)
+    try:
+        require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)
+    except InputError:
+        run.store.forget(PLAN_CHECKPOINTS)  # the drive with another calibration is another one
+        raise
