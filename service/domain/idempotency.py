@@ -128,6 +128,7 @@ def _take(session: Session, hold: Hold, *, request_sha256: str, keep_us: int, he
     replay = _replay(row)
     if replay is not None:
         return replay
+    now = clock_us(session)  # again: a renewal for which the row was waited for is later
     # A hold that ends later than any that begins now is from before the clock was set back.
     if now < row.held_until_us <= now + held_for_us:
         raise _in_flight(key)

@@ -15,7 +15,7 @@ import pytest
 from sqlalchemy import update
 from sqlalchemy.orm import Session
 
-from service.database.connections import Database
+from service.database.connections import Database, clock_us
 from service.database.tables import Drive, IdempotencyKey, Project, now_us
 from service.domain.idempotency import Answer, once
 from service.domain.request_holds import HELD_FOR_S, RENEW_EVERY_S, HoldKeeper
@@ -98,6 +98,26 @@ def test_a_hold_is_renewed_while_its_request_goes_on(
     assert [answer.replayed for answer in slow.answers if isinstance(answer, Answer)] == [False]
     assert slow.post().replayed
     assert effects(database, project_id, places) == 1
+
+
+def test_a_hold_stays_that_is_renewed_while_another_request_waits_for_its_row(
+    database: Database, keeper: HoldKeeper, slow: Request
+) -> None:
+    refused: list[ServiceError] = []
+
+    def post() -> None:
+        with pytest.raises(ServiceError) as problem:
+            slow.post()
+        refused.append(problem.value)
+
+    other = threading.Thread(target=post)
+    with database.write() as session:
+        session.execute(update(IdempotencyKey).values(created_us=IdempotencyKey.created_us))  # the row is locked
+        other.start()
+        time.sleep(2 * SOON_S)
+        session.execute(update(IdempotencyKey).values(held_until_us=clock_us(session) + keeper.held_for_us))
+    other.join()
+    assert [error.code for error in refused] == ["request-in-flight"]
 
 
 def test_a_request_that_lost_its_hold_commits_nothing(
