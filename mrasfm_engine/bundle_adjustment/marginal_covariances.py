@@ -122,7 +122,7 @@ def _with_shared_errors(problem: Problem, state: State, unseen: Bools, covarianc
     eliminated = system.eliminate(unseen.astype(np.float64))
     if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
         return covariance
-    columns = _of_functionals(curved, state, eliminated, eliminated.inverse()[1])[0]
+    columns = _of_functionals(curved, state, eliminated, eliminated.inverse_of_border())[0]
     found = shared_error_covariance(curved, state, system, columns)
     return covariance if found is None else found
 

@@ -239,11 +239,16 @@ class Eliminated:
             smallest = min(smallest, float((np.diagonal(self.cameras[0]) ** 2 / own).min()))
         return smallest
 
+    def inverse_of_border(self) -> Floats:
+        """The border's part (f + x, f + x) of the matrix's inverse, without the long work for the units'."""
+        if self.cameras is None:
+            return np.zeros((0, 0))
+        return np.asarray(scipy.linalg.cho_solve(self.cameras, np.eye(len(self.border))), dtype=np.float64)
+
     def inverse(self) -> tuple[Floats, Floats]:
         """Diagonal blocks (units, 6, 6) of the units and the border's part (f + x, f + x) of the matrix's inverse."""
-        units = self.factor.inverse_diagonal()
+        units, border = self.factor.inverse_diagonal(), self.inverse_of_border()
         if self.cameras is None:
-            return units, np.zeros((0, 0))
-        border = scipy.linalg.cho_solve(self.cameras, np.eye(len(self.border)))
+            return units, border
         coupled = self.coupled.reshape(-1, UNIT_DOF, len(self.border))
         return units + coupled @ border @ np.swapaxes(coupled, 1, 2), border

@@ -71,8 +71,9 @@ def _widened(covariance: Floats, scores: Floats) -> Floats:
     count, ratio = len(scores), scores.shape[1] / len(scores)
     sigma = np.sqrt(np.diagonal(covariance))
     values, vectors = np.linalg.eigh(covariance / sigma / sigma[:, None])
-    root = sigma[:, None] * vectors * np.sqrt(np.maximum(values, SINGULAR))  # times its transpose: the covariance
-    white = scores @ (vectors / np.sqrt(np.maximum(values, SINGULAR)) / sigma[:, None])
+    lengths = np.sqrt(np.maximum(values, SINGULAR))
+    root = sigma[:, None] * vectors * lengths  # times its transpose: the covariance
+    white = scores @ (vectors / lengths / sigma[:, None])
     found, directions = np.linalg.eigh(white.T @ white * (count / (count - 1)))
     edge, level = (1.0 + np.sqrt(ratio)) ** 2, 1.0
     for _ in range(LEVELS):

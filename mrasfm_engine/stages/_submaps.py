@@ -270,6 +270,7 @@ def _do_in_processes(
     sent = replace(
         run,
         config=config,
+        probed={},  # sub-maps extract their own images
         key=run.key or run.drive_key,
         progress=_report_to_nobody,
         cancel=_is_never_cancelled,
