@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.learned.network import Network
-from mrasfm_engine.types import Bytes, Ints32
+from mrasfm_engine.types import Bytes, Floats32, Ints32
 
 IR_VERSION, OPERATORS_VERSION = 8, 13  # of ONNX
 UINT8, INT8, INT32 = 2, 3, 6  # element types of ONNX
@@ -34,10 +34,10 @@ def product_of_bytes(a: Bytes, b: NDArray[np.int8] | Bytes) -> Ints32:
     return np.asarray(_operator(b.dtype == np.int8).run({"a": a, "b": b})["y"], dtype=np.int32)
 
 
-def missing(a: Bytes) -> Ints32:
-    """Shortfall (n,) of all products with a row of bytes (n, k)."""
-    sums = a.sum(axis=1, dtype=np.int32)
-    return SIGN * sums if _signs_are_exact() else np.zeros_like(sums)
+def missing(a: Bytes) -> Floats32:
+    """Shortfall (n,) of all products with a row of bytes (n, k): a whole number, exact up to 512 bytes."""
+    sums = a.sum(axis=1, dtype=np.float32)
+    return np.float32(SIGN) * sums if _signs_are_exact() else np.zeros_like(sums)
 
 
 @cache

@@ -16,30 +16,69 @@ from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints32
 
 ROWS = 256  # of a product that exist at one time: as many as a core's cache holds
-LANES = 64  # columns that are taken at once, in vector registers; a column belongs to lane column % LANES
+LANES = 128  # columns that are taken at once, in vector registers; a column belongs to lane column % LANES
+SCALAR_LANES = 8  # from here on a loop of one by one is as fast
 
-
-@njit(cache=True, nogil=True, fastmath=True)
-def _take_lanes(values: Any, top: Any, second: Any) -> None:
-    """Take values (k,) into the two largest ones of their lanes."""
-    for k in range(len(values)):
-        v, t = values[k], top[k]
-        second[k] = max(second[k], min(t, v))
-        top[k] = max(t, v)
-
-
-@njit(cache=True, nogil=True, fastmath=True)
-def _take_columns(row: Any, col_top: Any) -> None:
-    """Take a row (m,) into the largest values of the columns."""
-    for j in range(len(row)):
-        col_top[j] = max(col_top[j], row[j])
+# Loops of these kernels have neither branches nor indices of what is best, and write to other arrays than they read:
+# only so do compilers keep them in vector registers. In place, a maximum becomes a store under a condition.
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _scale(products: Any, missing: Any, factor: Any, factors: Any, out: Any) -> None:
-    """Cosines (m,) of products, of what all of them are short of, and of the inverse lengths of both sides."""
+    """Cosines (m,) of products, of what all of them are short of, and of the inverse lengths of both sides.
+
+    All are floats before they are added: few processors convert integers of 64 bits, which a sum of two of 32 bits is
+    here. The floats are exact up to 2^24, beyond any sum of 512 bytes times bytes.
+    """
+    for j in range(len(factors)):
+        out[j] = (np.float32(products[j]) + missing) * (factor * factors[j])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _larger(a: Any, b: Any, out: Any) -> None:
+    """The larger ones (m,) of two rows."""
     for j in range(len(out)):
-        out[j] = np.float32(products[j] + missing) * (factor * factors[j])
+        out[j] = max(a[j], b[j])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _take_lanes(values: Any, top: Any, second: Any, new_top: Any, new_second: Any) -> None:
+    """The two largest ones of lanes and values (k,)."""
+    for k in range(len(values)):
+        v, t = values[k], top[k]
+        new_second[k] = max(second[k], min(t, v))
+        new_top[k] = max(t, v)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _fold_lanes(top: Any, second: Any, new_top: Any, new_second: Any) -> None:
+    """The two largest ones (k,) of the first and second halves of lanes (2 k,)."""
+    half = len(new_top)
+    for k in range(half):
+        t, u = top[k], top[half + k]
+        new_second[k] = max(max(second[k], second[half + k]), min(t, u))
+        new_top[k] = max(t, u)
+
+
+@njit(cache=True, nogil=True)
+def _two_largest(row: Any, top: Any, second: Any, new_top: Any, new_second: Any) -> Any:
+    """The largest value of a row (whole LANES), and the largest of the others; the rest is work space (LANES,)."""
+    top[:] = -2.0
+    second[:] = -2.0
+    for start in range(0, len(row), LANES):
+        _take_lanes(row[start : start + LANES], top, second, new_top, new_second)
+        top, new_top, second, new_second = new_top, top, new_second, second
+    lanes = LANES
+    while lanes > SCALAR_LANES:
+        half = lanes // 2
+        _fold_lanes(top[:lanes], second[:lanes], new_top[:half], new_second[:half])
+        top, new_top, second, new_second = new_top, top, new_second, second
+        lanes = half
+    largest, next_largest = np.float32(-2.0), np.float32(-2.0)
+    for k in range(lanes):
+        next_largest = max(next_largest, max(second[k], min(largest, top[k])))
+        largest = max(largest, top[k])
+    return largest, next_largest
 
 
 @njit(cache=True, nogil=True)
@@ -57,32 +96,25 @@ def _take_rows(
 
     Rows whose best column does not pass the ratio test of distances have none (-1). `missing` (n,) is added to the
     products, (n,) and (m,) are inverse lengths.
-
-    The loops over a row have neither branches nor indices of what is best: that runs in vector registers, and the best
-    column is found in its lane afterwards.
     """
     n, m = products.shape
-    top, second, row = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(m, np.float32)
+    row = np.full((m + LANES - 1) // LANES * LANES, np.float32(-2.0))
+    top, second = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    new_top, new_second = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    columns, new_columns = col_top.copy(), np.empty_like(col_top)
     for i in range(n):
         _scale(products[i], missing[i], factors_a[i], factors_b, row)
-        top[:] = -2.0
-        second[:] = -2.0
-        for start in range(0, m, LANES):
-            stop = min(start + LANES, m)
-            _take_lanes(row[start:stop], top[: stop - start], second[: stop - start])
-        _take_columns(row, col_top)
-        largest, next_largest, lane = np.float32(-2.0), np.float32(-2.0), 0
-        for k in range(LANES):
-            next_largest = max(next_largest, max(second[k], min(largest, top[k])))
-            if top[k] > largest:
-                largest, lane = top[k], k
+        _larger(columns, row, new_columns)
+        columns, new_columns = new_columns, columns
+        largest, next_largest = _two_largest(row, top, second, new_top, new_second)
         row_best[i] = -1
         # For unit vectors the squared distance is 2 - 2 similarity.
         if (1.0 - largest) < ratio2 * (1.0 - next_largest):
-            for j in range(lane, m, LANES):
+            for j in range(m):
                 if row[j] == largest:
                     row_top[i], row_best[i] = largest, j
                     break
+    col_top[:] = columns
 
 
 @njit(cache=True, nogil=True)
@@ -109,7 +141,7 @@ class Prepared:
 
     rows: NDArray[Any]  # (n, D) bytes or floats
     columns: NDArray[Any]  # (D, n), of bytes as `integer_products.right_side` makes them
-    missing: Ints32 | Floats32  # (n,) what products of bytes with a row are short of
+    missing: Floats32  # (n,) what products of bytes with a row are short of
     inverse_lengths: Floats32  # (n,)
 
     def __len__(self) -> int:
