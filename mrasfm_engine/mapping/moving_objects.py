@@ -9,6 +9,7 @@ import numpy as np
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MIXTURE, SHARED, group
+from mrasfm_engine.mapping.single_unit_tracks import moving_in_single_units
 from mrasfm_engine.scene.semantics import UNKNOWN
 from mrasfm_engine.triangulation.point_hypotheses import Views
 from mrasfm_engine.triangulation.track_motion import TrackMotion, weigh_tracks
@@ -19,11 +20,13 @@ from schemas import SemanticClass
 SIGMA_PX_RANGE = (0.1, 3.0)
 QUANTILE = 0.85  # of residuals, from which the noise is
 MIN_OBSERVATIONS = 3  # of a point, whose residuals tell the noise
+IN_ONE_UNIT = 5  # beside the reasons of `motion_groups`
 REASONS = {
     ALONE: "its observations show a motion",
     SHARED: "it fits the motion of its neighbours",
     MIXTURE: "its observations contradict one another, and its neighbours move",
     BESIDE: "most of its neighbours move, and it hardly tells",
+    IN_ONE_UNIT: "one unit alone sees it and what is around it",
 }
 
 
@@ -58,15 +61,20 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
 
     weigh(np.flatnonzero(may_move), only_unsure=True)
     found = group(motion, mapper.keypoints, mapper.tracks, mapper.state.camera_params[:, :2].mean(1), weigh)
-    moves = may_move[found.tracks]
-    tracks = found.tracks[moves]
+    moves = np.zeros(len(mapper.tracks), dtype=np.bool_)
+    moves[found.tracks] = may_move[found.tracks]
+    reasons = np.full(len(mapper.tracks), IN_ONE_UNIT)
+    reasons[found.tracks] = found.reason
+    in_one_unit = moving_in_single_units(mapper, moves)
+    moves[in_one_unit] = may_move[in_one_unit]
+    tracks = np.flatnonzero(moves)
     points = int(mapper.triangulated[tracks].sum())
     mapper.drop(tracks)
     posed = np.flatnonzero((mapper.registered[mapper.image_unit] & ~mapper.missing)[mapper.keypoints.image])
     of_keypoint = mapper.tracks.of_keypoint[posed]
     seen = np.bincount(of_keypoint[of_keypoint >= 0], minlength=len(mapper.tracks))
     judged = int((may_move & (seen > 1)).sum())
-    return MovingTracks(tracks=tracks, reason=found.reason[moves], points=points, judged=judged)
+    return MovingTracks(tracks=tracks, reason=reasons[tracks], points=points, judged=judged)
 
 
 def views_of(mapper: Mapper) -> Views:

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.moving_objects import IN_ONE_UNIT, drop_moving
+from mrasfm_engine.mapping.single_unit_tracks import moving_in_single_units
+from mrasfm_engine.scene.scene import PairMatches
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    true_matches,
+    with_true_poses,
+)
+from tests.helpers.simulated_traffic import Car, with_cars
+
+ONCOMING = Car(place_m=(25.0, 3.5), velocity_m_s=(-9.0, 0.0))
+PARKED = Car(place_m=(8.0, 3.5), velocity_m_s=(0.0, 0.0))
+
+
+def street(car: Car) -> SimulatedDrive:
+    """A straight street: what one camera sees of a car that comes along it, an object that stands explains as well."""
+    return with_cars(make_simulated_drive(units=12, points=6000, straight=True), [car], points=80)
+
+
+def mapped(simulated: SimulatedDrive, only_within_units: Callable[[np.ndarray], np.ndarray]) -> Mapper:
+    """The mapper at the true poses. Between units no point (n,) is matched for which `only_within_units` is true, as
+    matches between units contradict the poses where something moves."""
+
+    def kept(pair: PairMatches) -> PairMatches:
+        units = [simulated.drive.images[i].unit for i in (pair.image_a, pair.image_b)]
+        shown = simulated.point_of_keypoint[pair.image_a][pair.matches[:, 0]]
+        return pair if units[0] == units[1] else replace(pair, inliers=pair.inliers & ~only_within_units(shown))
+
+    pairs = [pair for pair in map(kept, true_matches(simulated, min_matches=4)) if pair.inliers.any()]
+    return with_true_poses(make_model(simulated, pairs), simulated, range(len(simulated.world_from_rig)))
+
+
+def on_car(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
+    """Which tracks (tracks,) show the car."""
+    shown = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[:-1]]]
+    result: np.ndarray = shown >= len(simulated.truth.points_m)
+    return result
+
+
+def test_points_of_a_car_that_two_cameras_see_at_one_instant_go() -> None:
+    simulated = street(ONCOMING)
+    mapper = mapped(simulated, lambda shown: shown >= len(simulated.truth.points_m))
+    before, car = mapper.triangulated.copy(), on_car(mapper, simulated)
+    assert (before & car).sum() > 30
+    found = drop_moving(mapper)
+    assert (mapper.triangulated & car).sum() <= 0.1 * (before & car).sum()
+    assert (before & ~mapper.triangulated & ~car).sum() <= 0.02 * (before & ~car).sum()
+    assert IN_ONE_UNIT in found.reason
+
+
+def test_points_of_a_parked_car_stay_as_other_units_see_it_too() -> None:
+    simulated = street(PARKED)
+    mapper = mapped(simulated, lambda shown: np.random.default_rng(3).random(len(shown)) < 0.3)
+    assert len(moving_in_single_units(mapper, np.zeros(len(mapper.tracks), np.bool_))) <= 0.01 * len(mapper.tracks)
+
+
+def test_nothing_is_said_where_hardly_any_point_is_seen_by_two_units() -> None:
+    """Units far apart, as of a vehicle that is fast and takes few images."""
+    simulated = street(PARKED)
+    lucky = np.random.default_rng(4).random(len(simulated.truth.points_m) + 80) < 0.1
+    mapper = mapped(simulated, lambda shown: ~lucky[shown])
+    assert mapper.triangulated.sum() > 500
+    assert not len(moving_in_single_units(mapper, np.zeros(len(mapper.tracks), np.bool_)))
+
+
+def test_points_alone_in_their_surroundings_stay() -> None:
+    simulated = make_simulated_drive(units=12, points=300, straight=True)
+    mapper = mapped(simulated, lambda shown: shown % 4 == 0)
+    assert not len(moving_in_single_units(mapper, np.zeros(len(mapper.tracks), np.bool_)))
