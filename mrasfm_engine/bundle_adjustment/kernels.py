@@ -25,6 +25,10 @@ band that is held to its unit has no other support, and the derivatives above. W
 unit's time, `bands` and `motion` are None: numba compiles the kernels without them, so that nobody pays for what is
 not there.
 
+Small functions of the inner loops are `forceinline`: LLVM puts them into their callers. With `inline="always"` numba
+would copy their code before it infers types, and compile every copy anew, which takes several times as long. Constants
+among a kernel's arguments are wrapped (`np.bool_(False)`): a literal is a type of its own, and compiled for itself.
+
 Products of Jacobians need not be formed one observation at a time. With d = X - t_u and V = N' N all that an
 observation adds to its unit's block follows from V and V [d]x, and as d/dcamera = d/dunit T with a T that all
 observations of an image share (`add_images`), these sums by image make the unreduced matrix of units and cameras.
@@ -139,7 +143,7 @@ class Sums(NamedTuple):
     v_gradient: Floats
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def camera_point(
     unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
     from_unit: Any, rig: Any, cam: Any,
@@ -177,7 +181,7 @@ def squared_errors(
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]
         camera_point(
-            views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c],
+            views.unit_r[u], views.unit_t[u], bands, band, np.bool_(False), views.cam_r[c], views.cam_t[c],
             points[observed.point[n]], d, rig, cam,
         )  # fmt: skip
         if not project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj):
@@ -276,13 +280,13 @@ def intrinsics_derivatives(kind: int, k: Any, cam: Any, proj: Any, s: float, jc:
         jc[0, 15], jc[1, 15] = fx * (r2 + 2.0 * a * a), fy * 2.0 * a * b
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def image_sums_gradient(inner: int) -> int:
     """Place of the gradient of a camera's `inner` unknowns among an image's sums."""
     return UNIT_SUMS + 6 * inner + inner * (inner + 1) // 2
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def _find(blocks: Any, begin: int, end: int, block: int) -> int:
     """Index of a block in blocks[begin:end], counted from begin; -1 where it is not there."""
     for i in range(begin, end):
@@ -291,7 +295,7 @@ def _find(blocks: Any, begin: int, end: int, block: int) -> int:
     return -1
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def invert3(v: Any, out: Any) -> bool:
     """Inverse of a symmetric 3x3 matrix [00, 01, 02, 11, 12, 22]; False where it is singular."""
     c0, c1, c2 = v[3] * v[5] - v[4] * v[4], v[2] * v[4] - v[1] * v[5], v[1] * v[4] - v[2] * v[3]
@@ -346,7 +350,7 @@ def accumulate(
         for n in range(first[p], first[p + 1]):
             u, c = obs_unit[n], obs_camera[n]
             band = 0 if bands is None else bands.of_observation[n]
-            follows = False if motion is None else motion.weight[band, 0] != 1.0
+            follows = np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
                 unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], loss,
@@ -464,7 +468,7 @@ def accumulate(
         )  # fmt: skip
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _add_unit(
     w: Any, weight: float, t00: float, t01: float, t02: float, t10: float, t11: float, t12: float, t20: float,
     t21: float, t22: float, v00: float, v01: float, v02: float, v11: float, v12: float, v22: float,
@@ -649,7 +653,7 @@ def _camera_from_unit(
                 r[i, j] = unit_r[i, j]
                 q[i] += unit_r[i, j] * cam_t[j]
     else:
-        follows = False if motion is None else motion.weight[band, 0] != 1.0
+        follows = np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
         for i in range(3):
             q[i] = 0.0
             for j in range(3):
@@ -688,7 +692,7 @@ def substitute(
             if motion is None and su < 0 and sc < 0:
                 continue
             band = 0 if bands is None else bands.of_observation[n]
-            follows = False if motion is None else motion.weight[band, 0] != 1.0
+            follows = np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
             if not linearise(
                 unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c],
                 kind[c], params[c], points[p], obs_xy[n], loss,
@@ -744,7 +748,7 @@ def add_scores(
         for n in range(begin, end):
             u, c = observed.unit[n], observed.camera[n]
             band = 0 if bands is None else bands.of_observation[n]
-            follows = False if motion is None else motion.weight[band, 0] != 1.0
+            follows = np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
             normal[n - begin] = 0.0
             if not linearise(
                 unit_r[u], unit_t[u], bands, band, follows, c, cam_r[c], cam_t[c], kind[c], params[c],

@@ -42,8 +42,9 @@ def _point_cost(
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]
         camera_point(
-            views.unit_r[u], views.unit_t[u], bands, band, False, views.cam_r[c], views.cam_t[c], x, d, rig, cam
-        )
+            views.unit_r[u], views.unit_t[u], bands, band, np.bool_(False), views.cam_r[c], views.cam_t[c],
+            x, d, rig, cam,
+        )  # fmt: skip
         r2 = BEHIND_PX * BEHIND_PX
         if project(views.kind[c], views.params[c], cam[0], cam[1], cam[2], work, proj):
             r2 = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
@@ -66,7 +67,7 @@ def _point_system(
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]
         if not linearise(
-            views.unit_r[u], views.unit_t[u], bands, band, False, c, views.cam_r[c], views.cam_t[c],
+            views.unit_r[u], views.unit_t[u], bands, band, np.bool_(False), c, views.cam_r[c], views.cam_t[c],
             views.kind[c], views.params[c], x, observed.xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
         ):  # fmt: skip
             continue

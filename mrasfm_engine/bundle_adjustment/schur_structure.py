@@ -110,7 +110,7 @@ def _images(o: Observations, layout: Layout) -> tuple[Ints, Ints, Ints, Ints]:
     return number[name], o.unit[row], o.camera[row], band
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def _insert(out: Any, begin: int, end: int, block: int) -> int:
     """Put a block into the ascending list out[begin:end], unless it is there or the list is full; the new end."""
     at = end

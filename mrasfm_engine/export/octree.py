@@ -51,7 +51,7 @@ def _sorted_into_nodes(steps: Any, order: Any, seen: Any, side: int, depth: int,
     nodes[0, 5] = len(order)
     known = min(len(order), 1)
     rest, octant = np.empty(len(order), np.int32), np.empty(len(order), np.int8)
-    node = 0
+    node = np.int64(0)  # a literal has the kernel that it is given to compiled once more
     while node < known:
         first, end = nodes[node, 4], nodes[node, 5]
         if end - first > leaf_points and nodes[node, 0] < depth:

@@ -131,7 +131,7 @@ def largest_angle_rad(params: Floats) -> float:
     return math.acos(float(params[LIMIT]))
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
     """Distorted (a', b') of (a, b) into out[0:2] and d(a', b')/d(a, b), row by row, into out[2:6]; of no fisheye."""
     out[0], out[1], out[2], out[3], out[4], out[5] = a, b, 1.0, 0.0, 0.0, 1.0
@@ -155,7 +155,7 @@ def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
         out[5] = radial + b * b * slope + 2.0 * p2 * a + 6.0 * p1 * b
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def inverse_depth(kind: int, k: Any, z: float, d2: float) -> float:
     """Factor from x and y to (a, b) of a point at a squared distance d2; of no fisheye."""
     if kind == 4:
@@ -163,7 +163,7 @@ def inverse_depth(kind: int, k: Any, z: float, d2: float) -> float:
     return 1.0 / z
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any) -> bool:
     """Pixel of a point in camera axes into out[0:2] and d(pixel)/d(x, y, z), row by row, into out[2:8].
 

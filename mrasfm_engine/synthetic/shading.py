@@ -20,7 +20,7 @@ _DONE = -2
 _SKY_DEPTH = 1e9
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
     """Red, green and blue (0..255) of a texture's level at texture coordinates, which repeat with period 1."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
@@ -39,7 +39,7 @@ def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, 
     return red, green, blue
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
     """The first channel of `_bilinear`."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
@@ -54,7 +54,7 @@ def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: 
     return (1 - ay) * upper + ay * lower
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, log2_h: Any, levels: Any) -> Any:
     """Number of taps, the edge along which they lie, the mip level and the share of the next coarser one.
 
@@ -77,7 +77,7 @@ def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, 
     return taps, du, dv, level, fraction
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _filtered(
     t: int,
     u: float,
@@ -105,7 +105,7 @@ def _filtered(
     return red / taps, green / taps, blue / taps
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _filtered_grey(
     t: int,
     u: float,
@@ -133,7 +133,7 @@ def _filtered_grey(
     return total / taps
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _sun_reaches(
     x: float,
     y: float,
@@ -197,7 +197,7 @@ def _sun_reaches(
     return lit
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _sky(
     x: float,
     y: float,
@@ -226,7 +226,7 @@ def _sky(
     return red, green, blue
 
 
-@njit(inline="always", error_model="numpy", fastmath=True)
+@njit(forceinline=True, error_model="numpy", fastmath=True)
 def _surface(
     i: int,
     x: float,

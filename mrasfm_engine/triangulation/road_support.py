@@ -135,7 +135,7 @@ def _judge(
             if away[n, a] < np.inf:
                 reach = max(reach, away[n, a])
         reach *= 1.05  # the farthest one counts a little
-        m = 0
+        m = np.int64(0)  # a literal has the kernels that it is given to compiled once more
         for a in range(k):
             j = index[n, a]
             if away[n, a] == np.inf or j == i or not counted[j]:

@@ -302,7 +302,7 @@ def _weigh(
         # Errors of poses and of the calibration look like a small velocity: what stands may have one as well.
         p[3] = p[4] = mean[3] = mean[4] = 0.0
         weight[3] = weight[4] = 1.0 / (max(p[2], 1.0 / FARTHEST_M) * DRIFT_M_S) ** 2
-        stands, _, is_sound = fit(n, MOVES, True, p, mean, weight, least, nearest, sight, views, scratch)
+        stands, _, is_sound = fit(n, MOVES, np.bool_(True), p, mean, weight, least, nearest, sight, views, scratch)
         if not is_sound:
             continue
         log_priors = math.log(weight[2]) + math.log(weight[3]) + math.log(weight[4])

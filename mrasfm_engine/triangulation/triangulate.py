@@ -97,7 +97,7 @@ def _triangulate(
     for n in range(len(which)):
         track = which[n]
         triangulated[track] = False
-        count = 0
+        count: Any = np.int64(0)  # a literal has the kernels that it is given to compiled once more
         for s in range(first[track], first[track + 1]):
             k = track_keypoints[s]
             is_inlier[k] = False

@@ -189,7 +189,7 @@ def _empty(grid: Grid) -> Mosaic:
     )
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: float) -> int:
     """Layer that a camera's view of this score belongs to, -1 if to none; the best is moved down where it must."""
     if owner[0, row, column] == camera:

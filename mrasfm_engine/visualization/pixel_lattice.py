@@ -65,7 +65,7 @@ def place_nodes(
     return rows, columns, nodes
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def _nodes(begin: int, end: int, step: int) -> Any:
     count = (end - begin + step - 1) // step
     result = begin + step * np.arange(count + 1)
@@ -73,7 +73,7 @@ def _nodes(begin: int, end: int, step: int) -> Any:
     return result
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def square_kind(nodes: Any, i: int, j: int, width: int, height: int, focal: float, centre_z: float) -> int:
     """Treatment of a square: see `SKIPPED`."""
     shown, nearest, farthest = 0, 1e300, 0.0
@@ -101,14 +101,14 @@ def square_kind(nodes: Any, i: int, j: int, width: int, height: int, focal: floa
     return LINEAR
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def all_shown(nodes: Any, i: int, j: int) -> bool:
     """Return whether the camera shows all corners of a square."""
     total = nodes[i, j, 0] + nodes[i, j + 1, 0] + nodes[i + 1, j, 0] + nodes[i + 1, j + 1, 0]
     return bool(total == total)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def between_nodes(nodes: Any, rows: Any, columns: Any, i: int, j: int, row: int, column: int) -> Any:
     """Pixel u, v and height z of a cell, bilinear between the corners of its square."""
     a = (row - rows[i]) / (rows[i + 1] - rows[i])

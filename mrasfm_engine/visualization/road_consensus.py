@@ -138,7 +138,7 @@ def _decide(
             places[row, column] = apart
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def _likeness(color: Any, row: int, column: int, i: int, j: int) -> float:
     """1 for views that agree, 0 for views that differ by twice the tolerance, linear between."""
     apart, level = 0.0, 0.0

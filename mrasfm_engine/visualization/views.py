@@ -150,7 +150,7 @@ def _footprint(view: View, lowest_m: float) -> tuple[Floats, Floats] | None:
     return at.min(0) - FOOTPRINT_MARGIN_M, at.max(0) + FOOTPRINT_MARGIN_M
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def height_at(heights: Any, right_m: float, up_m: float) -> float:
     """Bilinear between the corners of the height grid."""
     a, b = up_m / HEIGHT_STEP_M, right_m / HEIGHT_STEP_M
@@ -161,7 +161,7 @@ def height_at(heights: Any, right_m: float, up_m: float) -> float:
     return float(here * (1 - a) + next_up * a)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -> bool:
     """Return whether a place of the plan frame lies in a rectangle (2, 2) of the rig's x and y, lowest first."""
     for i in range(2):
@@ -171,7 +171,7 @@ def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -
     return True
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def find_pixel(
     rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, rig_from_plan: Any, own_car: Any, kind: int,
     params: Any, x: float, y: float, z: float, dx: float, dy: float, above: float, work: Any,
@@ -189,7 +189,7 @@ def find_pixel(
     return not hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def shows(rgb: Any, usable: Any, has_mask: bool, u: float, v: float) -> bool:
     """Return whether a pixel is in the image, and usable."""
     if not (0.0 <= u < rgb.shape[1] and 0.0 <= v < rgb.shape[0]):
@@ -197,7 +197,7 @@ def shows(rgb: Any, usable: Any, has_mask: bool, u: float, v: float) -> bool:
     return bool(not has_mask or usable[int(v), int(u)])
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def hidden_by_car(
     rig_from_plan: Any, own_car: Any, x: float, y: float, z: float, dx: float, dy: float, above: float
 ) -> bool:
@@ -209,7 +209,7 @@ def hidden_by_car(
     )
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def sample(rgb: Any, u: float, v: float, gain: Any, out: Any) -> None:
     """Bilinear colour at a pixel position whose top left pixel has its centre at (0.5, 0.5)."""
     height, width = rgb.shape[0], rgb.shape[1]
