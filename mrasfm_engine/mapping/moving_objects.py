@@ -65,7 +65,7 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
     moves[found.tracks] = may_move[found.tracks]
     reasons = np.full(len(mapper.tracks), IN_ONE_UNIT)
     reasons[found.tracks] = found.reason
-    in_one_unit = moving_in_single_units(mapper, moves)
+    in_one_unit = moving_in_single_units(mapper, moves, path)
     moves[in_one_unit] = may_move[in_one_unit]
     tracks = np.flatnonzero(moves)
     points = int(mapper.triangulated[tracks].sum())

@@ -5,6 +5,9 @@ tells is the next unit. Points of what stands go on being observed, most of them
 between units contradict the poses. The share of points around a track that other units observe as well is compared
 with that share around all points that two cameras of one unit observe [Beta-binomial of both hypotheses]. Where units
 lie so far apart that few points go on, the share says nothing, and no track is taken to move.
+
+Points are not judged that neither the unit before nor that after has in view, and not those on the ground: the road in
+front of a vehicle looks so different a metre later that few of its points go on.
 """
 
 from __future__ import annotations
@@ -15,7 +18,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import betaln
 
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.triangulation.track_motion import GroundPath
 from mrasfm_engine.types import Bools, Floats, Ints
 
 NEIGHBOURS = 12
@@ -31,11 +37,12 @@ class _Shares:
     """Neighbourhoods of points in units of which two cameras observe them."""
 
     track: Ints  # (n,)
+    unit: Ints  # (n,)
     neighbours: Ints  # (n,)
     going_on: Ints  # (n,) of the neighbours, those that other units observe as well
 
 
-def moving_in_single_units(mapper: Mapper, moves: Bools) -> Ints:
+def moving_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> Ints:
     """Tracks with points that one unit alone observes, and that move by what their neighbourhood shows.
 
     `moves` (tracks,) are known to move, and are no neighbours.
@@ -44,11 +51,45 @@ def moving_in_single_units(mapper: Mapper, moves: Bools) -> Ints:
     if len(shares.track) < LEAST_ROWS:
         return np.zeros(0, dtype=np.int64)
     stands = _distribution(shares)
-    asked = single[shares.track] & (shares.neighbours > 0)
+    asked = np.flatnonzero(single[shares.track] & (shares.neighbours > 0))
     # The track itself is one more of the neighbourhood that does not go on.
     count, going_on = shares.neighbours[asked] + 1, shares.going_on[asked]
     gain = _log_likelihood(going_on, count, *MOVING) - _log_likelihood(going_on, count, *stands)
-    return np.unique(shares.track[asked][gain + PRIOR > 0.0])
+    asked = asked[gain + PRIOR > 0.0]
+    track = shares.track[asked]
+    points_m = mapper.state.points_m[track]
+    return np.unique(track[_off_the_ground(points_m, path) & _seen_by_next(mapper, points_m, shares.unit[asked])])
+
+
+def _off_the_ground(points_m: Floats, path: GroundPath) -> Bools:
+    """Return whether points (n, 3) are higher than the path's ground at the nearest station.
+
+    Far from the path the ground may be higher, too. What is meant is the road before the vehicle, which is near.
+    """
+    if not len(points_m):
+        return np.zeros(0, dtype=np.bool_)
+    station = np.asarray(cKDTree(path.ground_m).query(points_m)[1], dtype=np.int64)
+    height_m = ((points_m - path.ground_m[station]) * path.up[station]).sum(1)
+    result: Bools = height_m > path.tolerance_m
+    return result
+
+
+def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
+    """Return whether the registered unit before or that after has points (n, 3) of units (n,) in view."""
+    registered, state = np.flatnonzero(mapper.registered), mapper.state
+    place, result = np.searchsorted(registered, unit), np.zeros(len(unit), dtype=np.bool_)
+    for step in (-1, 1):
+        there = np.flatnonzero((place + step >= 0) & (place + step < len(registered)))
+        rig_from_world = se3.inverse(state.world_from_rig[registered[place[there] + step]])
+        in_rig_m = np.einsum("nij,nj->ni", rig_from_world[:, :3, :3], points_m[there]) + rig_from_world[:, :3, 3]
+        for camera, rig_from_cam in enumerate(state.rig_from_cam):
+            pixels = project_points(
+                int(mapper.camera_kind[camera]),
+                state.camera_params[camera],
+                se3.apply(se3.inverse(rig_from_cam), in_rig_m),
+            )
+            result[there] |= ((pixels >= 0.0) & (pixels < mapper.image_size_px[camera])).all(1)
+    return result
 
 
 def _neighbourhoods(mapper: Mapper, moves: Bools) -> tuple[_Shares, Bools]:
@@ -63,24 +104,25 @@ def _neighbourhoods(mapper: Mapper, moves: Bools) -> tuple[_Shares, Bools]:
     unit, track = np.divmod(seen, tracks)
     single = np.bincount(track, minlength=tracks) == 1
     begins = np.searchsorted(unit, np.arange(units + 1))
-    found: list[tuple[Ints, Ints, Ints]] = []
+    found: list[tuple[Ints, Ints, Ints, Ints]] = []
     for u in range(units):
         here = slice(begins[u], begins[u + 1])
         asked = np.flatnonzero(images[here] > 1)
         if len(asked):
-            found.append(_around(mapper.state.points_m[track[here]], ~single[track[here]], track[here], asked))
-    columns = [np.concatenate(each) for each in zip(*found, strict=True)] if found else [np.zeros(0, np.int64)] * 3
-    return _Shares(track=columns[0], neighbours=columns[1], going_on=columns[2]), single
+            around = _around(mapper.state.points_m[track[here]], ~single[track[here]], asked)
+            found.append((track[here][asked], unit[here][asked], *around))
+    columns = [np.concatenate(each) for each in zip(*found, strict=True)] if found else [np.zeros(0, np.int64)] * 4
+    return _Shares(track=columns[0], unit=columns[1], neighbours=columns[2], going_on=columns[3]), single
 
 
-def _around(points_m: Floats, goes_on: Bools, track: Ints, asked: Ints) -> tuple[Ints, Ints, Ints]:
-    """Tracks, neighbours and those going on, around the points `asked` (n,) of all points (m, 3) of a unit."""
+def _around(points_m: Floats, goes_on: Bools, asked: Ints) -> tuple[Ints, Ints]:
+    """Neighbours and those of them that go on, around the points `asked` (n,) of all points (m, 3) of a unit."""
     count = min(NEIGHBOURS + 1, len(points_m))
     _, index = cKDTree(points_m).query(points_m[asked], k=count, distance_upper_bound=REACH_M)
     index = np.asarray(index, dtype=np.int64).reshape(len(asked), count)
     is_other = (index < len(points_m)) & (index != asked[:, None])
     going_on = is_other & np.append(goes_on, False)[index]
-    return track[asked], is_other.sum(axis=1), going_on.sum(axis=1)
+    return is_other.sum(axis=1), going_on.sum(axis=1)
 
 
 def _distribution(shares: _Shares) -> tuple[float, float]:
