@@ -141,6 +141,15 @@ def _fill(first: Any, row: Any) -> Any:
     return out_first, out[:count].copy()
 
 
+@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _subtract_product(out: Any, x: Any, y: Any) -> None:
+    """Subtract x y from a block; written out by rows of y, that are next to one another in memory."""
+    for a in range(BLOCK):
+        x0, x1, x2, x3, x4, x5 = x[a, 0], x[a, 1], x[a, 2], x[a, 3], x[a, 4], x[a, 5]
+        for b in range(BLOCK):
+            out[a, b] -= x0 * y[0, b] + x1 * y[1, b] + x2 * y[2, b] + x3 * y[3, b] + x4 * y[4, b] + x5 * y[5, b]
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _factorise(first: Any, row: Any, l: Any) -> bool:  # noqa: E741
     """Turn blocks of A in l (blocks, 6, 6) into those of L; False where A is not positive definite."""
@@ -148,6 +157,7 @@ def _factorise(first: Any, row: Any, l: Any) -> bool:  # noqa: E741
     place = np.empty(n, np.int64)  # of a row within the current column
     begin = np.empty(n, np.int64)  # of a column: its first block that is not used yet
     head, following = np.full(n, -1, np.int64), np.full(n, -1, np.int64)  # columns whose next row is j, as a list
+    of_row = np.empty((BLOCK, BLOCK))
     for j in range(n):
         for s in range(first[j], first[j + 1]):
             place[row[s]] = s
@@ -155,14 +165,11 @@ def _factorise(first: Any, row: Any, l: Any) -> bool:  # noqa: E741
         while k >= 0:
             after = following[k]
             p = begin[k]
+            for b in range(BLOCK):
+                for c in range(BLOCK):
+                    of_row[c, b] = l[p, b, c]
             for s in range(p, first[k + 1]):
-                target = place[row[s]]
-                for a in range(BLOCK):
-                    for b in range(BLOCK):
-                        v = 0.0
-                        for c in range(BLOCK):
-                            v += l[s, a, c] * l[p, b, c]
-                        l[target, a, b] -= v
+                _subtract_product(l[place[row[s]]], l[s], of_row)
             begin[k] = p + 1
             if p + 1 < first[k + 1]:
                 following[k] = head[row[p + 1]]
@@ -232,7 +239,7 @@ def _selected_inverse(first: Any, row: Any, l: Any, z: Any) -> None:  # noqa: E7
     """The inverse's blocks z (blocks, 6, 6) in the places of the factor l."""
     n = len(first) - 1
     place = np.zeros(n, np.int64)  # of a row within the current column; of other rows anything
-    inverse = np.zeros((BLOCK, BLOCK))
+    inverse, transposed = np.zeros((BLOCK, BLOCK)), np.empty((BLOCK, BLOCK))
     for j in range(n - 1, -1, -1):
         d, end = first[j], first[j + 1]
         inverse[:] = 0.0
@@ -260,12 +267,12 @@ def _selected_inverse(first: Any, row: Any, l: Any, z: Any) -> None:  # noqa: E7
                 r = place[i]
                 if r >= m or row[d + 1 + r] != i:
                     continue
-                for a in range(BLOCK):
-                    for b in range(BLOCK):
+                _subtract_product(z[d + 1 + r], z[t], g[s])
+                if r != s:
+                    for a in range(BLOCK):
                         for c in range(BLOCK):
-                            z[d + 1 + r, a, b] -= z[t, a, c] * g[s, c, b]
-                            if r != s:
-                                z[d + 1 + s, a, b] -= z[t, c, a] * g[r, c, b]
+                            transposed[a, c] = z[t, c, a]
+                    _subtract_product(z[d + 1 + s], transposed, g[r])
         for a in range(BLOCK):
             for b in range(BLOCK):
                 for c in range(max(a, b), BLOCK):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -69,7 +70,12 @@ def walk(streets: int, rng: np.random.Generator) -> list[Junction]:
 
 def city_route(travelled_m: float, rng: np.random.Generator) -> CityRoute:
     """A route of at least `travelled_m` through a city that is small enough for it to come back."""
-    junctions = walk(math.ceil(travelled_m / 90.0) + 2, rng)  # a street less what corners cut off is longer than 90 m
+    # A street less what corners cut off is longer than 90 m.
+    return route_over(walk(math.ceil(travelled_m / 90.0) + 2, rng), rng)
+
+
+def route_over(junctions: Sequence[Junction], rng: np.random.Generator) -> CityRoute:
+    """A route over junctions, from the first to the last; each is a street from the one before."""
     middle = _middle_of_street(np.array(junctions, dtype=np.float64) * BLOCK_M)
     along = _lengths(middle)
     right = -LANE_M + SWAY_M * np.sin(along / 17.0 + rng.uniform(0, 2 * np.pi))

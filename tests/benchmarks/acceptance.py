@@ -31,7 +31,7 @@
 | 27 | the road's picture of the best views: markings against the painted ones |
 | 28 | a real drive with grey images: parts that images, positions or nothing links, and a map that joins them |
 | 29 | a stop of a minute: what it costs, and where its units are |
-| 30 | drives cut into sub-maps, beside the same in one piece |
+| 30 | drives cut into sub-maps, beside the same in one piece; a loop of 600 units that closes over their borders |
 | 31 | files for other programs, as readers of others read them; colours of points; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
 | 33 | exports of images for splatting; the client's wheel in an environment of its own |
@@ -95,7 +95,7 @@ from tests.benchmarks.sigmas import halves, simulated
 from tests.benchmarks.simulated_routes import simulated_routes
 from tests.benchmarks.speed import from_descriptors, long_routes, speed, surround_speed
 from tests.benchmarks.stops import stops
-from tests.benchmarks.submaps import submaps
+from tests.benchmarks.submaps import loop_over_borders, submaps
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, save, show
 from tests.benchmarks.vehicles import vehicles
@@ -146,7 +146,7 @@ LINES = {
     "27": Line(by_seed=(rendered_markings,), untimed=(real_pictures,)),
     "28": Line(untimed=(gaps, components_in_map)),
     "29": Line(timed=(stops,)),
-    "30": Line(untimed=(submaps,)),
+    "30": Line(untimed=(submaps, loop_over_borders)),
     "31": Line(timed=(foreign_readers,)),
     "32": Line(by_seed=(fisheyes,)),
     "33": Line(untimed=(exports_of_images, client_wheel)),

@@ -1,4 +1,6 @@
-"""Line 30: drives that are cut into sub-maps, beside the same drives in one piece, and the joins between sub-maps."""
+"""Line 30: drives that are cut into sub-maps, beside the same drives in one piece; the joins between sub-maps; a long
+path that closes over their borders.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mrasfm_engine.evaluation.trajectory import end_error_m
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.preflight.drive_reader import read_drive
@@ -20,6 +23,9 @@ SIZE = ("--width", 640, "--height", 360)
 # A real drive has 51 units: in three parts they are so short that they may share only four.
 REAL, REAL_SUBMAPS, REAL_OVERLAP = "kitti06", 3, 4
 MOST_TIMES, JOIN_M, JOIN_DEG = 1.2, 0.01, 0.02
+LOOP_UNITS, LOOP_SPACING_M, LOOP_END_PERCENT = 600, 1.0, 0.05
+LOOP_CAMERAS = 2  # rendering takes longer than all else
+LOOP_TIMEOUT_S = 3600.0  # a bound against a hang, not of the time that it takes
 
 
 def submaps(data: Path, work: Path) -> Iterator[Figure]:
@@ -33,6 +39,29 @@ def submaps(data: Path, work: Path) -> Iterator[Figure]:
     cut = _settings(work / "three.toml", count=REAL_SUBMAPS, overlap_units=REAL_OVERLAP)
     for title, options in (("without GNSS", ("--no-gnss",)), ("with GNSS", ())):
         yield from _both(f"{REAL} {title}", original, cut, REAL_SUBMAPS, work, *options)
+
+
+def loop_over_borders(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 30: once around a block, without GNSS: the last sub-map ends where the first one begins."""
+    del data
+    drive, scene = work / "a loop, to be cut", work / "a loop, cut"
+    path = ("--world", "loop", "--units", LOOP_UNITS, "--spacing-m", LOOP_SPACING_M)
+    mrasfm("synth", "--cameras", LOOP_CAMERAS, "--seed", SEED, *path, *SIZE, "--no-masks", "--tight", "--out", drive)
+    cut = _settings(work / "four.toml", count=SUBMAPS)
+    mrasfm("reconstruct", drive, "--config", cut, "--out", scene, "--no-gnss", timeout_s=LOOP_TIMEOUT_S)
+    what = f"a loop of {LOOP_UNITS} units"
+    yield exactly("30", f"{what}: sub-maps", len(read_report(scene)["submaps"]), SUBMAPS)
+    errors = evaluate(scene, drive)
+    yield exactly("30", f"{what}: units with a pose", errors["registered_units"], LOOP_UNITS)
+    truth, found = (read_tum(path).world_from_rig for path in (drive / "truth.tum", scene / "poses.tum"))
+    length_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    yield Figure(line="30", what=f"{what}: length", value=length_m, unit="m")
+    yield Figure(line="30", what=f"{what}: metric RMSE", value=errors["metric"]["rmse_m"], unit="m")
+    end_m = end_error_m(found, truth)
+    percent = float("nan") if end_m is None else 100.0 * end_m / length_m
+    yield Figure(
+        line="30", what=f"{what}: error at the end, of its length", value=percent, unit="%", most=LOOP_END_PERCENT
+    )
 
 
 def _settings(path: Path, **values: int) -> Path:
