@@ -139,6 +139,6 @@ def _distribution(shares: _Shares) -> tuple[float, float]:
 
 
 def _log_likelihood(successes: Ints, trials: Ints, a: float, b: float) -> Floats:
-    """Of a Beta-binomial distribution, less the binomial coefficient."""
+    """Logarithm of a Beta-binomial probability, less that of the binomial coefficient."""
     result: Floats = betaln(a + successes, b + trials - successes) - betaln(a, b)
     return result
