@@ -141,7 +141,7 @@ def _fill(first: Any, row: Any) -> Any:
     return out_first, out[:count].copy()
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
 def _subtract_product(out: Any, x: Any, y: Any) -> None:
     """Subtract x y from a block; written out by rows of y, that are next to one another in memory."""
     for a in range(BLOCK):

@@ -48,7 +48,7 @@ def moving_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> In
     `moves` (tracks,) are known to move, and are no neighbours.
     """
     shares, single = _neighbourhoods(mapper, moves)
-    if len(shares.track) < LEAST_ROWS:
+    if len(shares.track) < LEAST_ROWS or not (shares.neighbours > 1).any():
         return np.zeros(0, dtype=np.int64)
     stands = _distribution(shares)
     asked = np.flatnonzero(single[shares.track] & (shares.neighbours > 0))
@@ -66,8 +66,6 @@ def _off_the_ground(points_m: Floats, path: GroundPath) -> Bools:
 
     Far from the path the ground may be higher, too. What is meant is the road before the vehicle, which is near.
     """
-    if not len(points_m):
-        return np.zeros(0, dtype=np.bool_)
     station = np.asarray(cKDTree(path.ground_m).query(points_m)[1], dtype=np.int64)
     height_m = ((points_m - path.ground_m[station]) * path.up[station]).sum(1)
     result: Bools = height_m > path.tolerance_m
@@ -81,7 +79,7 @@ def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
     for step in (-1, 1):
         there = np.flatnonzero((place + step >= 0) & (place + step < len(registered)))
         rig_from_world = se3.inverse(state.world_from_rig[registered[place[there] + step]])
-        in_rig_m = np.einsum("nij,nj->ni", rig_from_world[:, :3, :3], points_m[there]) + rig_from_world[:, :3, 3]
+        in_rig_m = se3.apply(rig_from_world, points_m[there, None])[:, 0]
         for camera, rig_from_cam in enumerate(state.rig_from_cam):
             pixels = project_points(
                 int(mapper.camera_kind[camera]),
@@ -126,14 +124,14 @@ def _around(points_m: Floats, goes_on: Bools, asked: Ints) -> tuple[Ints, Ints]:
 
 
 def _distribution(shares: _Shares) -> tuple[float, float]:
-    """The Beta distribution of the share, by its moments."""
+    """The Beta distribution of the share, by its moments; some point has two neighbours."""
     told = shares.neighbours > 1
     n, share = shares.neighbours[told], shares.going_on[told] / shares.neighbours[told]
-    mean = float(np.clip(np.average(share, weights=n), 0.01, 0.99)) if told.any() else 0.5
+    mean = float(np.clip(np.average(share, weights=n), 0.01, 0.99))
     # The variance of a share of n is mean (1 - mean) (1 + (n - 1) correlation) / n.
     binomial = mean * (1.0 - mean)
-    excess = float(np.mean((share - mean) ** 2 - binomial / n)) if told.any() else 0.0
-    correlation = float(np.clip(excess / (binomial * np.mean(1.0 - 1.0 / n)), *CORRELATION)) if told.any() else 0.5
+    excess = float(np.mean((share - mean) ** 2 - binomial / n))
+    correlation = float(np.clip(excess / (binomial * np.mean(1.0 - 1.0 / n)), *CORRELATION))
     both = (1.0 - correlation) / correlation
     return mean * both, (1.0 - mean) * both
 

@@ -92,6 +92,13 @@ def _with_true_calibration(drive: Path, out: Path) -> Path:
     return out
 
 
+def error_of_the_end(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Length of a path in metres, and the error of its end in per cent of that; NaN where the end is missing."""
+    length_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    error_m = end_error_m(found, truth)
+    return length_m, float("nan") if error_m is None else 100 * error_m / length_m
+
+
 def loop(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:
     """Line 3c: a route that returns, without GNSS."""
     mrasfm("reconstruct", drive, "--out", scene, "--no-gnss")
@@ -100,8 +107,7 @@ def loop(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:
     if len(poses.trajectory.timestamps_us) < LOOP_UNITS:
         return
     truth = read_tum(drive / "truth.tum").world_from_rig
-    length_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
-    error_m = end_error_m(poses.trajectory.world_from_rig, truth)
+    length_m, percent = error_of_the_end(poses.trajectory.world_from_rig, truth)
     # The end lies beside the start, so the error there shows that the loop closed and nothing of the way between.
     whole_m = evaluate(scene, drive)["metric"]["rmse_m"]
     yield Figure(line="3c", what=f"loop {seed}: metric RMSE of the whole way", value=whole_m, unit="m")
@@ -109,7 +115,7 @@ def loop(drive: Path, scene: Path, seed: int) -> Iterator[Figure]:
     yield Figure(
         line="3c",
         what=f"loop {seed}: error at the end, of the way's length (aligned on the first {FIRST_UNITS} units)",
-        value=float("nan") if error_m is None else 100 * error_m / length_m,
+        value=percent,
         unit="%",
         most=0.2,
     )

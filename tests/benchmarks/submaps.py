@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mrasfm_engine.evaluation.trajectory import end_error_m
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.preflight.drive_reader import read_drive
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import imported
+from tests.benchmarks.rendered_drives import error_of_the_end
 from tests.benchmarks.table import Figure, exactly
 
 CAMERAS, UNITS, SUBMAPS, SEED = 6, 150, 4, 1
@@ -54,11 +54,9 @@ def loop_over_borders(data: Path, work: Path) -> Iterator[Figure]:
     errors = evaluate(scene, drive)
     yield exactly("30", f"{what}: units with a pose", errors["registered_units"], LOOP_UNITS)
     truth, found = (read_tum(path).world_from_rig for path in (drive / "truth.tum", scene / "poses.tum"))
-    length_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    length_m, percent = error_of_the_end(found, truth)
     yield Figure(line="30", what=f"{what}: length", value=length_m, unit="m")
     yield Figure(line="30", what=f"{what}: metric RMSE", value=errors["metric"]["rmse_m"], unit="m")
-    end_m = end_error_m(found, truth)
-    percent = float("nan") if end_m is None else 100.0 * end_m / length_m
     yield Figure(
         line="30", what=f"{what}: error at the end, of its length", value=percent, unit="%", most=LOOP_END_PERCENT
     )

@@ -240,6 +240,13 @@ def with_true_poses(mapper: Mapper, simulated: SimulatedDrive, units: Iterable[i
     return mapper
 
 
+def shown_points(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
+    """The true point (tracks,) of every track; -1 for one of nothing."""
+    first = mapper.tracks.keypoints[mapper.tracks.first[:-1]]
+    result: np.ndarray = np.concatenate(simulated.point_of_keypoint)[first]
+    return result
+
+
 def metric_errors_m(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
     """Distances (registered units,) after a rigid alignment, without scale, by positions and rotations."""
     units = np.flatnonzero(mapper.registered)

@@ -21,6 +21,7 @@ from tests.helpers.simulated_drive import (
     make_simulated_drive,
     metric_errors_m,
     rmse,
+    shown_points,
     true_matches,
     with_true_poses,
 )
@@ -41,12 +42,6 @@ def mapped(simulated: SimulatedDrive, config: EngineConfig | None = None) -> Map
     return with_true_poses(mapper, simulated, range(len(simulated.world_from_rig)))
 
 
-def shows(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
-    """The true point (tracks,) of every track."""
-    result: np.ndarray = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[:-1]]]
-    return result
-
-
 def drive(*, straight: bool = True, **kwargs: object) -> SimulatedDrive:
     return make_simulated_drive(units=12, points=1200, straight=straight, **kwargs)
 
@@ -64,7 +59,7 @@ def test_the_points_of_a_car_that_moves_go_and_those_of_the_street_stay(car: Car
     mapper = mapped(simulated)
     before = mapper.triangulated.copy()
     found = drop_moving(mapper)
-    on_car = shows(mapper, simulated) >= len(simulated.truth.points_m)
+    on_car = shown_points(mapper, simulated) >= len(simulated.truth.points_m)
     assert on_car.sum() > 20
     left = (on_car & mapper.triangulated).sum() / on_car.sum()
     lost = (before & ~mapper.triangulated & ~on_car).sum() / (before & ~on_car).sum()
@@ -78,7 +73,7 @@ def test_the_ground_reveals_a_car_ahead() -> None:
     """No residual does, as its keypoints stay where they are in the image: a point far away explains them."""
     simulated = with_cars(make_simulated_drive(units=30, points=2000, straight=True), [AHEAD])
     mapper = mapped(simulated)
-    on_car = np.flatnonzero(shows(mapper, simulated) >= len(simulated.truth.points_m))
+    on_car = np.flatnonzero(shown_points(mapper, simulated) >= len(simulated.truth.points_m))
     views, path = views_of(mapper), ground_path(mapper)
     abyss = path._replace(ground_m=path.ground_m - 1000.0 * path.up)
     with_ground, without = (weighed(mapper, on_car, views, ground) for ground in (path, abyss))
@@ -129,7 +124,7 @@ def test_a_refined_scene_has_no_points_of_a_car_ahead() -> None:
     simulated = with_cars(drive(straight=False), [AHEAD, ONCOMING])
     mapper = mapped(simulated)
     result = refine(mapper)
-    on_car = shows(mapper, simulated) >= len(simulated.truth.points_m)
+    on_car = shown_points(mapper, simulated) >= len(simulated.truth.points_m)
     assert (mapper.triangulated & on_car).sum() <= 0.1 * on_car.sum()
     assert len(result.moving.tracks) >= 0.5 * on_car.sum()
     assert rmse(metric_errors_m(mapper, simulated)) < 0.02

@@ -19,6 +19,7 @@ from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
     make_simulated_drive,
+    shown_points,
     true_matches,
     with_true_poses,
 )
@@ -63,8 +64,8 @@ def mapped(simulated: SimulatedDrive, config: EngineConfig = ON) -> Mapper:
 
 
 def is_moving(mapper: Mapper, simulated: SimulatedDrive, moving: np.ndarray, tracks: np.ndarray) -> np.ndarray:
-    point = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[tracks]]]
-    return moving[point]
+    result: np.ndarray = moving[shown_points(mapper, simulated)[tracks]]
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +202,7 @@ def test_classes_of_tracks_are_those_of_most_of_their_keypoints(shadows: tuple[S
     keypoints = Keypoints.from_features(simulated.drive, simulated.features)
     assert len(keypoints.classes) == len(keypoints.image)
     mapper = mapped(simulated)
-    point = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[:-1]]]
+    point = shown_points(mapper, simulated)
     expected = np.where(simulated.truth.points_m[point, 2] == 0.0, ROAD, 1)
     assert (mapper.track_class == expected).mean() > 0.999
 

@@ -14,6 +14,7 @@ from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
     make_simulated_drive,
+    shown_points,
     true_matches,
     with_true_poses,
 )
@@ -47,8 +48,7 @@ def found_in(mapper: Mapper) -> np.ndarray:
 
 def on_car(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
     """Which tracks (tracks,) show the car."""
-    shown = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[:-1]]]
-    result: np.ndarray = shown >= len(simulated.truth.points_m)
+    result: np.ndarray = shown_points(mapper, simulated) >= len(simulated.truth.points_m)
     return result
 
 
@@ -93,6 +93,6 @@ def test_the_road_in_front_of_the_vehicle_stays_though_few_of_its_points_go_on()
     height_m = (points_m - first[:3, 3]) @ first[:3, 2]
     on_ground = height_m < np.quantile(height_m, 0.01) + 0.1
     mapper = mapped(simulated, lambda shown: on_ground[shown])
-    shown = np.concatenate(simulated.point_of_keypoint)[mapper.tracks.keypoints[mapper.tracks.first[:-1]]]
+    shown = shown_points(mapper, simulated)
     assert (mapper.triangulated & on_ground[shown]).sum() > 100
     assert not on_ground[shown[found_in(mapper)]].any()
