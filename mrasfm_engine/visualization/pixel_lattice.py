@@ -18,6 +18,7 @@ from mrasfm_engine.visualization.views import MIN_RESOLUTION_PX, OWN_CAR_LEVEL, 
 
 NODE_CELLS = 8  # of a square's side
 MAX_NODE_M = 0.2  # the same, where cells are larger
+ROUNDING_M = 1e-9  # the two sides of a comparison are summed in different orders
 SKIPPED, EXACT, LINEAR = 0, 1, 2  # a square: nothing is seen, cell by cell, interpolated
 
 
@@ -147,7 +148,7 @@ def meets_car(
                 at += m[0] * (x + lift * (centre[0] - x)) + m[1] * (y + lift * (centre[1] - y))
                 at += m[2] * (z + lift * (centre[2] - z))
                 low, high = min(low, at), max(high, at)
-            apart = apart or high <= own_car[0, k] or low >= own_car[1, k]
+            apart = apart or high < own_car[0, k] - ROUNDING_M or low > own_car[1, k] + ROUNDING_M
         if not apart:
             return True
     return False
