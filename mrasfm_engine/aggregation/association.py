@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -80,12 +79,30 @@ def _pairs(scenes: Sequence[SourceScene], placed: Sequence[int], config: Aggrega
     """Pairs of placed scenes that are to be compared, of those within reach, by how much their footprints overlap."""
     reach = config.position_error_m + SIGHT_SHIFT_M
     scores: dict[tuple[int, int], tuple[float, float]] = {}
-    for i, j in combinations(placed, 2):
+    for i, j in _near(scenes, placed, reach):
         a_from_b = coarse_transform(scenes[i], scenes[j])
         apart = nearest_distance_m(scenes[i], scenes[j], a_from_b)
         if apart <= reach:
             scores[i, j] = (common_view(scenes[i], scenes[j], a_from_b, config), -apart)
     return choose_pairs(len(scenes), scores, config.candidates)
+
+
+def _near(scenes: Sequence[SourceScene], placed: Sequence[int], reach_m: float) -> Iterator[tuple[int, int]]:
+    """Pairs of placed scenes, the smaller index first, whose trajectories may come within reach of one another.
+
+    A ball around a trajectory holds all of it, so that of a city's scenes few pairs are compared place by place.
+    """
+    middle, radius = np.zeros((len(placed), 3)), np.zeros(len(placed))
+    for row, k in enumerate(placed):
+        trajectory = scenes[k].trajectory_m
+        centre = 0.5 * (trajectory.min(0) + trajectory.max(0))
+        middle[row] = se3.apply(scenes[k].ecef_from_local, centre[None])[0]
+        radius[row] = np.linalg.norm(trajectory - centre, axis=1).max()
+    for row, i in enumerate(placed):
+        between = (middle[row + 1 :] - middle[row]) @ scenes[i].ecef_from_local[:3, :2]  # horizontal, as reach is
+        apart = np.linalg.norm(between, axis=1) - radius[row + 1 :] - radius[row]
+        for later in np.flatnonzero(apart <= reach_m).tolist():
+            yield i, placed[row + 1 + later]
 
 
 def choose_pairs(
@@ -98,8 +115,12 @@ def choose_pairs(
     """
     best_first = sorted(scores, key=lambda pair: scores[pair], reverse=True)
     chosen: set[tuple[int, int]] = set()
-    for k in range(count):
-        chosen.update([pair for pair in best_first if k in pair][:candidates])
+    taken = [0] * count
+    for pair in best_first:
+        if min(taken[k] for k in pair) < candidates:
+            chosen.add(pair)
+        for k in pair:
+            taken[k] += 1
     group = component_labels(count, chosen)
     between: dict[tuple[int, int], int] = {}
     for i, j in best_first:

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+from mrasfm_engine.aggregation import association
 from mrasfm_engine.aggregation.association import associate, choose_pairs, coarse_transform
 from mrasfm_engine.aggregation.load import read_scene
+from mrasfm_engine.aggregation.pairs import SIGHT_SHIFT_M, nearest_distance_m
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.export.scene import write_scene
@@ -37,6 +39,32 @@ def test_two_streets_that_cross_are_compared_with_one_another() -> None:
 def test_what_is_out_of_reach_is_compared_with_nothing() -> None:
     assert choose_pairs(3, {(0, 1): (0.5, -1.0)}, 3) == [(0, 1)]
     assert choose_pairs(3, {}, 3) == []
+
+
+def test_what_is_compared_place_by_place_is_what_may_come_near(
+    scene: SourceScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scenes along a street of 60 degrees, one of them 400 m up: only neighbours are measured, and none is missed."""
+    compared: list[tuple[str, str]] = []
+
+    def counted(a: SourceScene, b: SourceScene, a_from_b: np.ndarray) -> float:
+        compared.append((a.name, b.name))
+        return nearest_distance_m(a, b, a_from_b)
+
+    monkeypatch.setattr(association, "nearest_distance_m", counted)
+    scenes = [
+        at(scene, f"{k:02d}", [48.1 + 0.00015 * k, 11.5 + 0.0004 * k, 520.0 + 400.0 * (k == 7)]) for k in range(30)
+    ]  # fmt: skip
+    config = AggregationConfig(position_error_m=60.0, candidates=30)
+    near = {
+        (a.name, b.name)
+        for a, b in combinations(scenes, 2)
+        if nearest_distance_m(a, b, coarse_transform(a, b)) <= 60.0 + SIGHT_SHIFT_M
+    }
+    found = {(scenes[i].name, scenes[j].name) for i, j in associate(scenes, config).pairs}
+    assert found == near >= {(f"{k:02d}", f"{k + 1:02d}") for k in range(29)}
+    assert near <= set(compared)
+    assert len(compared) < 30 * 8
 
 
 @pytest.fixture(scope="module")
