@@ -207,14 +207,16 @@ class _Statistics:
         detail = (smooth - _smoothed(image, FINE_PX)) / (smooth + DARK)
         energy = _channel_sum(gradient[0] ** 2 + gradient[1] ** 2)
         if self.count == 0:
-            self._energy, self._detail, self._detail_squared = energy, detail, detail**2
+            self._energy = energy
+            self._detail, self._detail_squared = (np.zeros((2, *detail.shape), np.float32) for _ in range(2))
             self._lowest, self._highest = image.copy(), image.copy()
         else:
             self._energy += energy
-            self._detail += detail
-            self._detail_squared += detail**2
             np.minimum(self._lowest, image, out=self._lowest)
             np.maximum(self._highest, image, out=self._highest)
+        half = self.count % 2
+        self._detail[half] += detail
+        self._detail_squared[half] += detail**2
         self._add_to_part(gradient)
         self.last = outlines
         self.count += 1
@@ -244,10 +246,13 @@ class _Statistics:
         return np.asarray(self._energy / self.count, dtype=np.float32)
 
     @property
-    def change(self) -> Floats32:
-        """Standard deviation (h, w) over time of each pixel's fine detail, relative to its brightness."""
-        mean = self._detail / self.count
-        variance = np.maximum(self._detail_squared / self.count - mean**2, 0.0).mean(-1)
+    def changes(self) -> Floats32:
+        """Standard deviations (2, h, w) over time of each pixel's fine detail, relative to its brightness.
+
+        The first is that of every other image, the second that of those between.
+        """
+        counts = np.array([(self.count + 1) // 2, self.count // 2])[:, None, None, None]
+        variance = np.maximum(self._detail_squared / counts - (self._detail / counts) ** 2, 0.0).mean(-1)
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     @property
@@ -292,7 +297,7 @@ def _static_region(drive: Drive, camera: int, statistics: _Statistics) -> Bools:
     """Pixels (h, w) of the small images that show the own car or never change."""
     fall, flow, side = _world_motion(drive, camera, statistics.energy.shape)
     edges = StaticEdges.from_sums(
-        statistics.gradients, statistics.energy, statistics.change, statistics.count, fall=fall, flow=flow
+        statistics.gradients, statistics.energy, statistics.changes, statistics.count, fall=fall, flow=flow
     )
     block_px = math.ceil(JPEG_BLOCK_PX * fall.shape[1] / drive.cameras[camera].width)
     # The dark around an image circle is no part of a sky that it touches, and its rim, which stays, none of the car.

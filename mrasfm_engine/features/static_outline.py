@@ -30,6 +30,7 @@ WINDOW_PX = 0.7  # sigma of the neighbourhood whose gradients count together
 CHANGE_WINDOW_PX = 1.5  # sigma
 CHANGE_RATIO = 2.0
 MIN_CHANGE_STEP = 0.3  # of that ratio, on a logarithmic scale; less is how much the change of one surface varies
+STEP_SIGMAS = 3.0  # of a step that few images alone make: a tenth of a thousand pixels without any has more
 RIM_PX = 5  # from the outline, where the surfaces on its two sides are compared
 
 ALONG_MOTION = 0.6  # worth of an edge along the motion, which the world has too, against one across it
@@ -63,7 +64,7 @@ class StaticEdges:
 
     @classmethod
     def from_sums(
-        cls, gradients: Floats32, energy: Floats32, change: Floats32, count: int, *, fall: Floats, flow: Floats
+        cls, gradients: Floats32, energy: Floats32, changes: Floats32, count: int, *, fall: Floats, flow: Floats
     ) -> StaticEdges:
         """Judge mean gradients.
 
@@ -72,8 +73,8 @@ class StaticEdges:
         gradients, energy
             Means (parts, 2, h, w, channels) over parts of the way, and mean square (h, w) over all of it, of the
             gradients of a number `count` of images.
-        change
-            Standard deviation (h, w) of fine detail over time.
+        changes
+            Standard deviations (2, h, w) of fine detail over time, of every other image and of those between.
         fall, flow
             See `StaticEdges.fall`; directions (h, w, 2) in which the world moves.
         """
@@ -84,10 +85,12 @@ class StaticEdges:
         least = max(MIN_LASTING_SHARE, NOISE_SHARES / count)
         edge = _without_rim(np.clip(share / least - 1, 0, 1))
         near = fall > 0
-        smooth = np.log(cv2.GaussianBlur(change, (0, 0), CHANGE_WINDOW_PX) + 1e-3)
-        slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1))])
-        steepness = np.hypot(*slope) * 2 * CHANGE_WINDOW_PX / math.log(CHANGE_RATIO)
-        step = _without_rim(np.clip(steepness - MIN_CHANGE_STEP, 0, 1) * near)
+        change = np.asarray(np.sqrt((changes**2).mean(0)), dtype=np.float32)
+        slope = _change_slope(change)
+        # Halves differ by twice the error of the whole; the median length of two normal errors is 1.18 sigmas.
+        error = np.median(np.hypot(*(_change_slope(changes[0]) - _change_slope(changes[1])))) / (2 * 1.18)
+        least_step = math.hypot(MIN_CHANGE_STEP, STEP_SIGMAS * float(error))
+        step = _without_rim(np.clip(np.hypot(*slope) - least_step, 0, 1) * near)
         return cls(
             edge=edge,
             evidence=edge * near * _across(gradient, flow),
@@ -158,6 +161,13 @@ def trace_outline(edges: StaticEdges) -> Outline:
 
 def _windowed(values: Floats32) -> Floats32:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), WINDOW_PX), dtype=np.float32)
+
+
+def _change_slope(change: Floats32) -> Floats32:
+    """Slope (2, h, w) of a logarithm of the change, in steps of `CHANGE_RATIO` across the window."""
+    smooth = np.log(cv2.GaussianBlur(change, (0, 0), CHANGE_WINDOW_PX) + 1e-3)
+    slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1))])
+    return np.asarray(slope * (2 * CHANGE_WINDOW_PX / math.log(CHANGE_RATIO)), dtype=np.float32)
 
 
 def _without_rim(values: Floats32) -> Floats32:
