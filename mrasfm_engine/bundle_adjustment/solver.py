@@ -10,21 +10,16 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from mrasfm_engine.bundle_adjustment.kernels import (
-    Bands,
-    Loss,
-    Motion,
-    Observed,
+from mrasfm_engine.bundle_adjustment.elimination_kernels import (
     Slots,
     Sums,
-    Views,
     accumulate,
     add_images,
     add_scores,
     image_sums,
-    squared_errors,
     substitute,
 )
+from mrasfm_engine.bundle_adjustment.kernels import Bands, Loss, Motion, Observed, Views, squared_errors
 from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, refine_points
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import DISTORTION, UNIT_DOF, Layout, Observations, RowBandMotion, retract
