@@ -23,7 +23,7 @@ demo: setup ## render two drives of a street, get their scenes and the map of bo
 	$(BIN)/mrasfm demo --out demo
 
 test: setup ## the fast suite and one real drive
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
 
 check: setup ## lint, types, import contracts, links and generated pages of the documentation
 	$(BIN)/ruff check .

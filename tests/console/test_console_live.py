@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
 from playwright.sync_api import Page, expect
 
 from schemas.api.problems import Problem
@@ -85,6 +86,7 @@ def test_a_failed_job_shows_its_problem_and_the_end_of_its_log(open_console: Ope
     expect(box.locator("pre")).to_have_text("line one\nline two")
 
 
+@pytest.mark.slow
 def test_a_page_outlives_the_service(open_console: Open, tmp_path: Path) -> None:
     """The service is killed and started again: the page reaches the job's end by itself."""
     settings = settings_of(tmp_path / "data")

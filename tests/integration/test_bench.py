@@ -21,6 +21,7 @@ Run = Callable[..., CommandResult]
 UNITS = 6
 
 
+@pytest.mark.slow
 def test_a_simulated_route(mrasfm: Run) -> None:
     ran = mrasfm("bench", "--simulate", "stereo", "--units", 30, "--json")
     assert ran.code == 0, ran.err

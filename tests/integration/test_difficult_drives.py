@@ -55,6 +55,7 @@ def test_units_of_a_stop_are_posed_between_its_ends(tmp_path: Path, mrasfm: Run)
     assert all(b > a for a, b in zip(at_end, between, strict=True))
 
 
+@pytest.mark.slow
 def test_moving_cars_and_an_occluded_camera(tmp_path: Path, mrasfm: Run) -> None:
     drive = synth(
         tmp_path / "drive", "--cameras", 4, "--units", 8, "--moving-cars", 8, "--occlude", "left", "--seed", 6

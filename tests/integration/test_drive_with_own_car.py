@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from mrasfm_engine.synthetic.drive_writer import TRUE_OWN_CAR_FOLDER
 from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, synth
@@ -17,6 +18,7 @@ SEEN_BY = ("front", "back")
 UNITS = 16
 
 
+@pytest.mark.slow
 def test_the_own_car_is_left_out(tmp_path: Path, mrasfm: Callable[..., CommandResult]) -> None:
     drive, scene = tmp_path / "drive", tmp_path / "scene"
     size = ("--width", 384, "--height", 216)  # of smaller images, the car's edge is not found well enough

@@ -34,6 +34,7 @@ def small(variant: Variant) -> Variant:
     return variant.keep(cameras=["front", "left"], units=3).save()
 
 
+@pytest.mark.slow
 def test_stages_begin_and_end_in_lines(small: Variant) -> None:
     lines = run(small)
     assert [(stage, what) for stage, what, _ in lines] == [(s, what) for s in STAGES for what in ("begins", "done")]

@@ -58,6 +58,7 @@ def errors(mrasfm: Run, scene: Path, drive: Path) -> dict:  # type: ignore[type-
     return result
 
 
+@pytest.mark.slow
 def test_the_scene_is_as_good_as_in_one_piece(drive: Path, scene: Path, tmp_path: Path, mrasfm: Run) -> None:
     assert mrasfm("reconstruct", drive, "--no-gnss", "--out", tmp_path / "one", *WITHOUT_PICTURES).code == 0
     cut, one = (errors(mrasfm, out, drive) for out in (scene, tmp_path / "one"))

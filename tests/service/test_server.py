@@ -69,6 +69,7 @@ def test_a_parent_that_is_killed_leaves_nobody(api: ApiProcess) -> None:
     assert list(api.settings.metrics_dir.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_parent_that_lives_keeps_its_counts(api: ApiProcess, tmp_path: Path) -> None:
     """Another API on the same data folder removes nothing of it."""
     (own,) = api.settings.metrics_dir.iterdir()

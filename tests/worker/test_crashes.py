@@ -194,6 +194,7 @@ def test_killed_worker_leaves_no_temporary_files(
     assert list(of_machine.iterdir()) == list(of_workers.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_stage_gives_way_to_the_service(world: World, brief_drive: Path) -> None:
     worker = world.start_worker()
     world.start_reconciler()
@@ -231,6 +232,7 @@ def test_stage_that_dies_every_time(world: World, brief_drive: Path) -> None:
     assert world.scenes() == []
 
 
+@pytest.mark.slow
 def test_kills_alone_fail_no_job(world: World, brief_drive: Path) -> None:
     """More of them than a job has retries."""
     world.start_worker()
@@ -241,6 +243,7 @@ def test_kills_alone_fail_no_job(world: World, brief_drive: Path) -> None:
     assert_one_scene(world, job_id, [*["engine-killed"] * number, "succeeded"])
 
 
+@pytest.mark.slow
 def test_worker_that_was_silent_publishes_nothing(world: World, brief_drive: Path) -> None:
     """It is stopped with all that it started until another has done the job, and then goes on."""
     first = world.start_worker()
@@ -262,6 +265,7 @@ def test_worker_that_was_silent_publishes_nothing(world: World, brief_drive: Pat
     assert first.poll() is None
 
 
+@pytest.mark.slow
 def test_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:
     """The job is given back at once, and the attempt does not count."""
     first = world.start_worker()

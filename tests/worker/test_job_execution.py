@@ -59,6 +59,7 @@ def as_accepted_before(drive: Path, folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_drive_that_was_accepted_before_stricter_rules(world: World, brief_drive: Path, tmp_path: Path) -> None:
     """It is checked and reconstructed, and its scene can be aggregated."""
     drive_id, check = world.add_unchecked_drive(as_accepted_before(brief_drive, tmp_path / "old"))
@@ -410,6 +411,7 @@ def test_memory_kills_of_a_lost_attempt(world: World, brief_drive: Path, noted: 
     assert world.job(job_id).memory_kills == found
 
 
+@pytest.mark.slow
 def test_an_attempt_notes_memory_kills(world: World, brief_drive: Path) -> None:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     thread = threading.Thread(target=run, args=(world, job_id))
@@ -440,6 +442,7 @@ def test_folders_left_behind(world: World, brief_drive: Path) -> None:
     assert list(scratch.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_truncated_images_are_named_in_findings_and_report(world: World, own_drive: Path) -> None:
     """Of three images the pixels end at a third, and the end marker is there: the job succeeds without them."""
     images = sorted((own_drive / "images").rglob("*.jpg"))[1:12:4]

@@ -116,6 +116,7 @@ def test_files_of_the_map_name_them(result: tuple[dict[str, Any], Path]) -> None
     assert (points["component"] == 0).all()
 
 
+@pytest.mark.slow
 def test_adding_to_the_map_reuses_seams_and_removing_a_drive_takes_its_components(
     result: tuple[dict[str, Any], Path], folders: dict[str, Path], street: Street, tmp_path: Path
 ) -> None:
@@ -157,6 +158,7 @@ def test_a_component_that_nothing_places_is_an_error_where_all_are_required(
     assert not (tmp_path / "map" / "map.json").exists()
 
 
+@pytest.mark.slow
 def test_a_component_keeps_its_place_whatever_is_added(
     result: tuple[dict[str, Any], Path], street: Street, folders: dict[str, Path], tmp_path: Path
 ) -> None:

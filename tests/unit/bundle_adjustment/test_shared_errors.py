@@ -82,6 +82,7 @@ def test_independent_errors_change_little(monkeypatch: pytest.MonkeyPatch) -> No
     assert 0.9 < found.sigma_scale / independent.sigma_scale < 1.1
 
 
+@pytest.mark.slow
 def test_sigmas_are_true_under_a_robust_loss() -> None:
     """Weights that fall where residuals rise let a solution give way further than the normal equations say."""
     found = []

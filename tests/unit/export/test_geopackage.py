@@ -163,7 +163,7 @@ def test_every_flipped_bit_that_changes_what_it_says_is_found(tmp_path: Path) ->
     write_geopackage(scene, NAMES, path)
     data, dump = path.read_bytes(), dumped(path)
     found = 0
-    for at in range(0, len(data), 19):
+    for at in range(0, len(data), 61):
         flipped = bytearray(data)
         flipped[at] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)
@@ -171,7 +171,7 @@ def test_every_flipped_bit_that_changes_what_it_says_is_found(tmp_path: Path) ->
             assert dumped(path) == dump, at
         else:
             found += 1
-    assert found > 200
+    assert found > 60
 
 
 def dumped(path: Path) -> list[str]:

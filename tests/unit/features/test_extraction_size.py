@@ -107,7 +107,10 @@ def test_keypoints_of_reduced_images_lie_where_those_of_full_ones_do(tmp_path: P
     assert drive.images
 
 
-@pytest.mark.parametrize(("size", "side_px"), [((1242, 375), 621), ((1920, 1208), 800), ((1920, 1208), 1131)])
+@pytest.mark.parametrize(
+    ("size", "side_px"),
+    [((1242, 375), 621), ((1920, 1208), 800), pytest.param((1920, 1208), 1131, marks=pytest.mark.slow)],
+)
 def test_reducing_moves_nothing_up_or_down(size: tuple[int, int], side_px: int) -> None:
     """Sides that do not come out whole are rounded, and content must follow the rounded side to the last row."""
     image, (width, height) = np.full((size[1], size[0], 3), 60, np.uint8), size

@@ -167,6 +167,7 @@ def test_spans_of_units() -> None:
     assert gaps.spans(np.zeros(3, dtype=np.bool_)) == []
 
 
+@pytest.mark.slow
 def test_a_group_without_a_scene_does_not_keep_others_from_growing(simulated: SimulatedDrive) -> None:
     """Units 2 to 5 match one another alone, and in a way that no pose explains."""
     pairs = without_dark(simulated, true_matches(simulated))

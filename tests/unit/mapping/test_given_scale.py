@@ -73,6 +73,7 @@ def rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 def test_scale_is_better_known_than_by_either_and_as_well_as_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors of lens models and of rotations show in no residual."""
     drives = [drive(seed) for seed in range(8)]

@@ -43,6 +43,7 @@ def decide(mapper: Mapper, simulated: SimulatedDrive) -> IntrinsicsDecision:
     )
 
 
+@pytest.mark.slow
 def test_a_turn_observes_focal_lengths_and_frees_what_the_model_has() -> None:
     mapper, simulated = model(straight=False)
     found = decide(mapper, simulated)

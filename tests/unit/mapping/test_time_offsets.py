@@ -87,6 +87,7 @@ def test_a_camera_that_is_late_no_longer_bends_the_trajectory(late: tuple[Mapper
     assert not mapper.state.camera_time_offset_s.any()
 
 
+@pytest.mark.slow
 def test_the_mean_is_that_of_most_cameras_unless_positions_tell_it() -> None:
     for sigma_m, expected_ms in ((None, [0, 0, 0, 4]), (0.02, [0, 0, 0, 4]), (0.005, [4, 4, 4, 8])):
         mapper, simulated = model([4, 4, 4, 8])
@@ -98,6 +99,7 @@ def test_the_mean_is_that_of_most_cameras_unless_positions_tell_it() -> None:
         assert (np.abs(off_s) < 3 * result.times.sigma_s).all()
 
 
+@pytest.mark.slow
 def test_a_readout_that_is_not_declared_may_be_what_passes_for_an_offset(
     late: tuple[Mapper, SimulatedDrive, Refinement],
 ) -> None:

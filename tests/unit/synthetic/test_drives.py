@@ -361,6 +361,7 @@ def test_command_line_reaches_the_options() -> None:
     assert options.ramp_percent == 6.0
 
 
+@pytest.mark.slow
 def test_own_car(tmp_path: Path) -> None:
     """The front camera sees the bonnet, the back camera the boot lid; only there images change."""
     options = SynthOptions(cameras=4, **TINY)
