@@ -22,6 +22,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri  # scipy.stats takes half a second to import
 
 from mrasfm_engine.aggregation.seam import Seam
+from mrasfm_engine.aggregation.significance import in_sigmas
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Floats
@@ -251,7 +252,7 @@ class LoopConsistency:
         key = frozenset(path)
         if squared <= MAX_MISCLOSURE or key in self._open:
             return False
-        self._open[key] = replace(loop, sigmas=_as_normal(squared, 6))
+        self._open[key] = replace(loop, sigmas=in_sigmas(squared, 6))
         return True
 
     def _measured(self, path: list[int]) -> tuple[Loop, float]:
@@ -347,12 +348,6 @@ def _error_at(first_from_scene: Floats, at_m: Floats, covariance: Floats) -> tup
     return se3.apply(first_from_scene, at_m[None])[0], turned @ covariance @ turned.T
 
 
-def _as_normal(squared: float, freedoms: int) -> float:
-    """The size of a normal variable that is as unlikely as a chi-squared one."""
-    beyond = float(chdtrc(freedoms, squared))
-    return float(np.sqrt(chdtri(1, beyond))) if beyond > 0.0 else float(np.sqrt(squared))
-
-
 def _words(loop: Loop) -> str:
     return f"a loop of {len(loop.seams)} seams that is {loop.shift_m:.2f} m and {loop.turn_deg:.2f} deg off"
 
@@ -377,4 +372,4 @@ def off_positions(seam: Seam, sigma_a_m: Floats, sigma_b_m: Floats) -> float:
     a_from_b = seam.a_from_b[:3, :3]
     covariance = of_a + a_from_b @ of_b @ a_from_b.T + seam_covariance(seam)[3:, 3:]
     squared = float(shift_m @ np.linalg.solve(covariance, shift_m))
-    return _as_normal(squared, 3)
+    return in_sigmas(squared, 3)

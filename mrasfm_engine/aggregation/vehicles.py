@@ -21,8 +21,8 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtrc, ndtri  # scipy.stats takes half a second to import
 
+from mrasfm_engine.aggregation.significance import in_sigmas
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import BundleAdjustmentConfig
 from mrasfm_engine.geometry import se3
@@ -43,7 +43,6 @@ OUTLIER_DOF = 8.0  # of Student's t: single knocked cameras hardly widen the dev
 NOTHING_OBSERVED = 0.9  # share of the prior's sigma: as in a scene, what leaves more of it says nothing
 LEARNING_SHARE = 0.5  # of a drive's own sigma: where others know that much better, all of its units vary
 COMMON_STEPS = 10
-FAR = 600.0  # a sum of squares beyond this has no probability in floating point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -369,13 +368,8 @@ def _contradictions(
         if both.any():
             total = variance + _variance(one.information[row]) + deviation**2
             squared = float(((one.by_images[row] - common)[both] ** 2 / total[both]).sum())
-            result[one.scene] = _as_normal(squared, int(both.sum()))
+            result[one.scene] = in_sigmas(squared, int(both.sum()))
     return result
-
-
-def _as_normal(squared: float, dof: int) -> float:
-    """A normal variable as unlikely as a sum of squares."""
-    return float(-ndtri(chdtrc(dof, squared) / 2.0)) if squared < FAR else float(np.sqrt(squared))
 
 
 def _expected(
