@@ -22,7 +22,10 @@ from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registra
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.types import Ints
-from schemas.findings import Finding
+from schemas.findings import Finding, warning
+
+# At two sigmas of more a lane of 3.5 m is a third of a metre wider or narrower, and is taken for another kind of lane.
+MAX_SIGMA_SCALE = 0.05
 
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
@@ -266,6 +269,21 @@ def motion_findings(mapper: Mapper) -> list[Finding]:
     """Findings on the motion within units."""
     units = _not_compensated(mapper)
     return [rig_motion.finding(len(units), int(mapper.registered.sum()))] if len(units) else []
+
+
+def scale_findings(refinement: Refinement) -> list[Finding]:
+    """Warn where lengths in the scene are hardly known."""
+    certainty = refinement.certainty
+    if certainty is None or not np.isfinite(certainty.sigma_scale) or certainty.sigma_scale <= MAX_SIGMA_SCALE:
+        return []
+    return [
+        warning(
+            "scale-uncertain",
+            f"lengths are known to {certainty.sigma_scale:.0%} (one sigma): the drive observes the scale badly",
+            "Give GNSS positions, or declare sigma_translation_m of cameras whose distances are known better; a longer "
+            "drive with turns, and cameras with a common view, tell the scale as well.",
+        )
+    ]
 
 
 def _poorly_seen(mapper: Mapper) -> list[str]:

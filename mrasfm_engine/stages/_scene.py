@@ -132,6 +132,7 @@ def _refined(
         names = [camera.name for camera in run.drive.cameras]
         findings.append(miscalibration.pair_finding(names, refinement.wrong_pair))
     findings += mapping_report.motion_findings(mapper)
+    findings += mapping_report.scale_findings(refinement)
     report = {
         "stage": Stage.REFINEMENT,
         "seconds": round(time.perf_counter() - started, 3),

@@ -10,6 +10,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping import refinement
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
+from mrasfm_engine.mapping.mapping_report import scale_findings
 from mrasfm_engine.mapping.refinement import Refinement, refine
 from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
 
@@ -99,3 +100,17 @@ def test_rotations_that_images_contradict_say_nothing_of_the_scale() -> None:
         assert abs(error) < 0.02
         weights.append(1.0 / result.given_scale.sigma)
     assert 0 < weights[1] < 0.2 * weights[0]
+
+
+def test_a_scale_that_the_drive_hardly_observes_is_a_finding() -> None:
+    """A straight street, with cameras mounted to a millimetre and to half a metre of their distance of a metre."""
+    said = {}
+    for sigma_m in (0.001, 0.5):
+        simulated = make_simulated_drive(units=8, cameras=2, points=400, straight=True, noise_px=0.2)
+        cameras = [c.model_copy(update={"sigma_translation_m": sigma_m}) for c in simulated.drive.cameras]
+        rig = simulated.drive.manifest.rig.model_copy(update={"cameras": cameras})
+        manifest = simulated.drive.manifest.model_copy(update={"rig": rig})
+        simulated = replace(simulated, drive=replace(simulated.drive, manifest=manifest))
+        mapper = with_true_poses(make_model(simulated), simulated, range(8))
+        said[sigma_m] = [finding.code for finding in scale_findings(refine(mapper))]
+    assert said == {0.001: [], 0.5: ["scale-uncertain"]}
