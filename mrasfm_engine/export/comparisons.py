@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -71,13 +71,19 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
     poses, points = np.linalg.inv(_registered_poses(scene)), _points_by_keypoint(scene)
     registered = np.flatnonzero(scene.image_registered).tolist()
     missing = dict(zip(registered, poses, strict=True))
+    read, expected = list[tuple[str, Sequence[float]]](), list[Floats]()
     for image in found:
         i = image.image_id - 1
         yield Row(f"image {image.image_id}", i in missing, True)
         yield Row(f"the name of image {image.image_id}", image.name, scene.drive.images[i].file)
-        yield Row(f"the pose of {image.name}", image.cam_from_world, missing.pop(i), POSE_TOLERANCE)
+        read.append((image.name, image.cam_from_world))
+        expected.append(missing.pop(i))
         yield Row(f"a keypoint of {image.name}", image.xy_px, scene.features[i].xy_px, POSE_TOLERANCE)
         yield Row(f"a point seen in {image.name}", image.point_ids, points[i])
+    numbers = np.array([pose for _, pose in read], dtype=np.float64).reshape(-1, 7)
+    composed = transforms(np.roll(numbers[:, :4], -1, axis=1), numbers[:, 4:])
+    for (name, _), pose, known in zip(read, composed, expected, strict=True):
+        yield Row(f"the pose of {name}", pose, known, POSE_TOLERANCE)
     yield Row("what it lacks of the registered images", [scene.drive.images[i].file for i in missing], [])
 
 

@@ -94,7 +94,7 @@ def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[s
     others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs, map_document=content.document)
     figures["notes"] += others.write(work, read_back)
     digests = {"poses.tum": write_content(work / "poses.tum", _poses_text(scene))}
-    digests["poses.json"] = write_json(work / "poses.json", _poses_document(content))
+    digests["poses.json"] = write_json(work / "poses.json", _poses_document(content), in_lines=pose_files.LISTS)
     digests["frame.json"] = write_json(work / "frame.json", _frame_document(scene))
     (work / CALIBRATION_FOLDER).mkdir()
     for name, document in content.calibrations.items():

@@ -9,7 +9,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.io.trajectory_file import format_tum
-from mrasfm_engine.scene.drive import pose_from_matrix
+from mrasfm_engine.scene.drive import pose_documents
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats
 
@@ -17,6 +17,7 @@ POSE_TIME = {
     False: "an image's pose is at its unit's timestamp_us",
     True: "a unit's pose is at its timestamp_us, an image's at its own: with a rolling shutter, of its middle row",
 }
+LISTS = ("units", "images")  # of `poses_document`, as long as the drive
 
 
 def poses_text(scene: Scene) -> str:
@@ -37,6 +38,8 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
     cameras = scene.world_from_cam
     unit_places = geodetic_positions(scene, scene.world_from_rig)
     camera_places = geodetic_positions(scene, cameras)
+    rig_poses = pose_documents(scene.world_from_rig)  # NaN of what is not registered, which is not written
+    camera_poses = pose_documents(cameras)
     units = []
     for u, frame in enumerate(scene.drive.manifest.frames):
         registered = bool(scene.unit_registered[u])
@@ -46,7 +49,7 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
             "registered": registered,
         }
         if registered:
-            unit["world_from_rig"] = pose_from_matrix(scene.world_from_rig[u]).model_dump()
+            unit["world_from_rig"] = rig_poses[u]
             if np.isfinite(scene.sigma_position_m[u]).all():
                 unit["sigma_position_m"] = scene.sigma_position_m[u].tolist()
             unit |= _place(unit_places, u)
@@ -66,7 +69,7 @@ def poses_document(scene: Scene, components: Sequence[Bools] = ()) -> dict[str, 
             "registered": bool(scene.image_registered[i]),
         }
         if image["registered"]:
-            image["world_from_cam"] = pose_from_matrix(cameras[i]).model_dump()
+            image["world_from_cam"] = camera_poses[i]
             image |= _place(camera_places, i)
         images.append(image)
     return {

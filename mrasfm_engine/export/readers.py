@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,7 @@ class ModelImage(NamedTuple):
 
     image_id: int
     name: str
-    cam_from_world: Floats  # (4, 4)
+    cam_from_world: Sequence[float]  # (7,) quaternion w x y z, translation
     xy_px: Floats  # (n, 2)
     point_ids: Ints | Floats  # (n,) whole numbers, -1 where a keypoint observes none
 
@@ -133,7 +133,7 @@ def images_binary(path: Path) -> Iterator[ModelImage]:
             name = b"".join(iter(partial(_exactly, file, 1), b"\0")).decode("utf-8")
             (count,) = struct.unpack("<Q", _exactly(file, 8))
             rows = np.frombuffer(_exactly(file, 24 * count), dtype=[("xy", "<f8", 2), ("point", "<i8")])
-            yield ModelImage(image_id, name, _pose(numbers), rows["xy"], rows["point"])
+            yield ModelImage(image_id, name, numbers, rows["xy"], rows["point"])
         left = len(file.read(1))
     if left:
         raise ValueError("bytes are left over")
@@ -156,7 +156,7 @@ def images_text(path: Path) -> Iterator[ModelImage]:
                 raise ValueError("it ends early")
             image_id, *numbers, _, name = head.removesuffix("\n").split(" ", maxsplit=9)
             rows = _numbers(keypoints).reshape(-1, 3)
-            yield ModelImage(int(image_id), name, _pose([float(v) for v in numbers]), rows[:, :2], rows[:, 2])
+            yield ModelImage(int(image_id), name, [float(v) for v in numbers], rows[:, :2], rows[:, 2])
 
 
 def points_text(path: Path) -> ModelPoints:
@@ -194,12 +194,6 @@ def points_binary(path: Path) -> ModelPoints:
     rows = np.array(heads, dtype=np.float64).reshape(-1, 8)
     observations = np.concatenate([np.zeros((0, 3), np.int64), *tracks])
     return ModelPoints(rows[:, 0].astype(np.int64), rows[:, 1:4], rows[:, 4:7], rows[:, 7], observations)
-
-
-def _pose(numbers: list[float]) -> Floats:
-    w, x, y, z, *translation = numbers
-    pose: Floats = transforms([x, y, z, w], translation)[0]
-    return pose
 
 
 def _numbers(text: str) -> Floats:

@@ -173,7 +173,9 @@ def _write(
     if scene.road is not None:
         digests[ROAD_FILE] = write_json(work / ROAD_FILE, road.road_document(scene))
     digests["poses.tum"] = write_content(work / "poses.tum", pose_files.poses_text(scene))
-    digests["poses.json"] = write_json(work / "poses.json", pose_files.poses_document(scene, components))
+    digests["poses.json"] = write_json(
+        work / "poses.json", pose_files.poses_document(scene, components), in_lines=pose_files.LISTS
+    )
     calibrated = calibration.calibration_document(scene, report.get("component", 0))
     digests["calibration.json"] = write_json(work / "calibration.json", calibrated)
     digests["frame.json"] = write_json(work / "frame.json", coordinate_frame.frame_document(scene))
@@ -231,8 +233,10 @@ def _own_car_files(scene: Scene) -> dict[str, bytes]:
     }
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> str:
+def write_json(path: Path, document: Mapping[str, Any], *, in_lines: Sequence[str] = ()) -> str:
     """Write a JSON document; the SHA-256 of its text.
+
+    Of lists named `in_lines` every entry has one line: Python's encoder writes them ten times as fast.
 
     Raises
     ------
@@ -240,7 +244,14 @@ def write_json(path: Path, document: Mapping[str, Any]) -> str:
         Where a value has no JSON form.
     """
     try:
-        text = json.dumps(document, allow_nan=False, indent=1, ensure_ascii=False, default=_plain)
+        encode = partial(json.dumps, allow_nan=False, ensure_ascii=False, default=_plain)
+        if in_lines:
+            lists = {key: ",\n  ".join(encode(entry) for entry in document[key]) for key in in_lines}
+            parts = {key: encode(value) for key, value in document.items() if key not in in_lines}
+            parts |= {key: f"[\n  {text}\n ]" for key, text in lists.items()}
+            text = "{\n" + ",\n".join(f" {encode(key)}: {parts[key]}" for key in document) + "\n}"
+        else:
+            text = encode(document, indent=1)
     except (TypeError, ValueError) as error:
         raise MrasfmError(
             f"{path.name} cannot be written: {error}",

@@ -19,6 +19,15 @@ def matrix_from_pose(pose: Pose) -> Floats:
     return se3.transform(se3.rotation_from_quaternion(pose.rotation_xyzw), pose.translation_m)
 
 
+def pose_documents(a_from_b: Floats) -> list[dict[str, list[float]]]:
+    """Poses as the manifest's JSON has them, of transforms (n, 4, 4)."""
+    quaternions = se3.quaternion_from_rotation(a_from_b[:, :3, :3]).tolist()
+    return [
+        {"rotation_xyzw": rotation, "translation_m": translation}
+        for rotation, translation in zip(quaternions, a_from_b[:, :3, 3].tolist(), strict=True)
+    ]
+
+
 def pose_from_matrix(a_from_b: Floats) -> Pose:
     """A manifest's pose of a 4x4 transform."""
     return Pose(
