@@ -30,7 +30,7 @@ WINDOW_PX = 0.7  # sigma of the neighbourhood whose gradients count together
 CHANGE_WINDOW_PX = 1.5  # sigma
 CHANGE_RATIO = 2.0
 MIN_CHANGE_STEP = 0.3  # of that ratio, on a logarithmic scale; less is how much the change of one surface varies
-STEP_SIGMAS = 3.0  # of a step that few images alone make: a tenth of a thousand pixels without any has more
+STEP_SIGMAS = 3.0  # of a step that few images alone make, in which one pixel in ninety has more
 RIM_PX = 5  # from the outline, where the surfaces on its two sides are compared
 
 ALONG_MOTION = 0.6  # worth of an edge along the motion, which the world has too, against one across it
