@@ -180,7 +180,7 @@ def test_cameras_that_cannot_change_the_answer_are_not_read(tmp_path: Path, monk
 
     def counted(path: Path, *args: object) -> object:
         asked.append((path.parent.name, path.stem))
-        return read_image_small(path, *args)  # type: ignore[arg-type]
+        return read_image_small(path, *args)
 
     monkeypatch.setattr(standing, "read_image_small", counted)
     found = standing_of(drive)
