@@ -10,5 +10,5 @@ from scipy.special import chdtrc, ndtri  # scipy.stats takes half a second to im
 def in_sigmas(squared: float, freedoms: int) -> float:
     """Size of a normal variable that is as unlikely as a chi-squared one of so many degrees of freedom."""
     beyond = float(chdtrc(freedoms, squared))
-    # Where the probability is below the least number there is, the root is right to a hundredth.
+    # The root is what it tends to: it jumps by a hundredth for six, and by a tenth for sixty.
     return float(-ndtri(beyond / 2.0)) if beyond > 0.0 else math.sqrt(squared)

@@ -21,6 +21,7 @@ from mrasfm_engine.types import Floats, Ints
 from schemas import DriveManifest
 
 POSE_TOLERANCE = 1e-6  # metres, and elements of rotation matrices
+QUATERNION_TOLERANCE = 1e-6  # of a length: readers normalise
 GEODETIC_TOLERANCE_M = 1e-4
 PLY_TOLERANCE_M = 1e-3  # coordinates are float32 up to some kilometres from the origin
 ROUNDING = 1e-9  # of numbers that are written with all their digits
@@ -81,6 +82,8 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
         yield Row(f"a keypoint of {image.name}", image.xy_px, scene.features[i].xy_px, POSE_TOLERANCE)
         yield Row(f"a point seen in {image.name}", image.point_ids, points[i])
     numbers = np.array([pose for _, pose in read], dtype=np.float64).reshape(-1, 7)
+    for k in np.flatnonzero(~(np.abs(np.linalg.norm(numbers[:, :4], axis=1) - 1.0) < QUATERNION_TOLERANCE)):
+        yield Row(f"the length of the quaternion of {read[k][0]}", np.linalg.norm(numbers[k, :4]), 1.0)
     composed = transforms(np.roll(numbers[:, :4], -1, axis=1), numbers[:, 4:])
     for (name, _), pose, known in zip(read, composed, expected, strict=True):
         yield Row(f"the pose of {name}", pose, known, POSE_TOLERANCE)

@@ -246,7 +246,7 @@ def write_json(path: Path, document: Mapping[str, Any], *, in_lines: Sequence[st
     try:
         encode = partial(json.dumps, allow_nan=False, ensure_ascii=False, default=_plain)
         if in_lines:
-            lists = {key: ",\n  ".join(encode(entry) for entry in document[key]) for key in in_lines}
+            lists = {key: ",\n  ".join(encode(entry) for entry in document[key]) for key in in_lines if key in document}
             parts = {key: encode(value) for key, value in document.items() if key not in in_lines}
             parts |= {key: f"[\n  {text}\n ]" for key, text in lists.items()}
             text = "{\n" + ",\n".join(f" {encode(key)}: {parts[key]}" for key in document) + "\n}"

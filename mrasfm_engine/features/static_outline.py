@@ -29,6 +29,7 @@ WINDOW_PX = 0.7  # sigma of the neighbourhood whose gradients count together
 # Half of the change or less is another surface for sure.
 CHANGE_WINDOW_PX = 1.5  # sigma
 CHANGE_RATIO = 2.0
+NO_CHANGE = 1e-3  # relative to the brightness; less is a constant pixel
 MIN_CHANGE_STEP = 0.3  # of that ratio, on a logarithmic scale; less is how much the change of one surface varies
 STEP_SIGMAS = 3.0  # of a step that few images alone make, in which one pixel in ninety has more
 RIM_PX = 5  # from the outline, where the surfaces on its two sides are compared
@@ -88,8 +89,9 @@ class StaticEdges:
         change = np.asarray(np.sqrt((changes**2).mean(0)), dtype=np.float32)
         slope = _change_slope(change)
         # Halves differ by twice the error of the whole; the median length of two normal errors is 1.18 sigmas.
-        error = np.median(np.hypot(*(_change_slope(changes[0]) - _change_slope(changes[1])))) / (2 * 1.18)
-        least_step = math.hypot(MIN_CHANGE_STEP, STEP_SIGMAS * float(error))
+        differences = np.hypot(*(_change_slope(changes[0]) - _change_slope(changes[1])))[near & (change > NO_CHANGE)]
+        error = float(np.median(differences)) / (2 * 1.18) if len(differences) else 0.0
+        least_step = math.hypot(MIN_CHANGE_STEP, STEP_SIGMAS * error)
         step = _without_rim(np.clip(np.hypot(*slope) - least_step, 0, 1) * near)
         return cls(
             edge=edge,
@@ -165,7 +167,7 @@ def _windowed(values: Floats32) -> Floats32:
 
 def _change_slope(change: Floats32) -> Floats32:
     """Slope (2, h, w) of a logarithm of the change, in steps of `CHANGE_RATIO` across the window."""
-    smooth = np.log(cv2.GaussianBlur(change, (0, 0), CHANGE_WINDOW_PX) + 1e-3)
+    smooth = np.log(cv2.GaussianBlur(change, (0, 0), CHANGE_WINDOW_PX) + NO_CHANGE)
     slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1))])
     return np.asarray(slope * (2 * CHANGE_WINDOW_PX / math.log(CHANGE_RATIO)), dtype=np.float32)
 

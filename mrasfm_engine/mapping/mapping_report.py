@@ -279,7 +279,7 @@ def scale_findings(refinement: Refinement) -> list[Finding]:
     return [
         warning(
             "scale-uncertain",
-            f"lengths are known to {certainty.sigma_scale:.0%} (one sigma): the drive observes the scale badly",
+            f"lengths are known to {certainty.sigma_scale:.1%} (one sigma): the drive observes the scale badly",
             "Give GNSS positions, or declare sigma_translation_m of cameras whose distances are known better; a longer "
             "drive with turns, and cameras with a common view, tell the scale as well.",
         )

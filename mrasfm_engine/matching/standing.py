@@ -6,9 +6,8 @@ those between take no part in the reconstruction and get their poses from these 
 Each unit is compared with the last one that moved, so that the steps of a creeping car add up. An image is divided into
 blocks, and each block's displacement follows from its gradients and its change (Lucas and Kanade, IJCAI 1981), where a
 change of exposure is allowed. A camera moved as the median of its blocks did: traffic covers less than half of most
-images. The car moved where more than half of the cameras did: a lorry beside it fills the cameras of one side. So the
-cameras are looked at one after the other until it is decided, and images of the others are not read. Where the prior
-trajectory shows motion no image is read.
+images. The car moved where more than half of the cameras did: a lorry beside it fills the cameras of one side. Where
+the prior trajectory shows motion no image is read.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ class Standing:
         (units,) those that are reconstructed; the others stand between two of them.
     moved_px
         (units,) how far a unit that is left out moved against the first of its stop, at full size: in the camera that
-        moved most of those looked at, but for cameras that show something else; NaN for the other units.
+        moved most, but for cameras that show something else; NaN for the other units.
     compared
         Units whose images were read.
     """
@@ -80,7 +79,8 @@ def find_standing(
 ) -> Standing:
     """Find the units that moved less than `min_motion_px`, in pixels of full images.
 
-    A drive without any motion keeps all units, as mapping does. A camera whose image cannot be read tells nothing.
+    A drive without any motion keeps all units, as mapping does. Units with an image that cannot be read are not left
+    out: the extraction says what is wrong with it.
 
     Raises
     ------
@@ -94,16 +94,13 @@ def find_standing(
     stands, moved_px = np.zeros(units, dtype=np.bool_), np.full(units, np.nan)
     of_unit = _by_unit(drive)
 
-    def small(unit: int) -> SmallImages:
+    def small(unit: int) -> dict[int, Floats32]:
         if cancel is not None and cancel():
             raise CancelledError
-        images = SmallImages(drive, of_unit[unit])
-        for camera in images.cameras[: _least_to_stand(len(images.cameras))]:
-            images.read(camera)
-        return images
+        return _small_images(drive, of_unit[unit])
 
     way = _PriorWay.from_prior(drive, prior)
-    last, kept_images = 0, SmallImages(drive, [])
+    last, kept_images = 0, dict[int, Floats32]()
     with one_opencv_thread(), closing(in_order(threads, small, read)) as images:
         for unit, now in zip(read, images, strict=True):
             motion_px = (np.inf, np.inf)
@@ -177,63 +174,28 @@ class _PriorWay:
         return bool(self.known[units].all() and self.moved(self.times_s[units[:1]], self.times_s[units[1:]])[0])
 
 
-class SmallImages:
-    """Small grey images of a unit, each read where it is first asked for."""
-
-    def __init__(self, drive: Drive, images: Sequence[DriveImage]) -> None:
-        self._drive = drive
-        self._images = {image.camera: image for image in images}
-        self._read: dict[int, Floats32 | None] = {}
-
-    @property
-    def cameras(self) -> list[int]:
-        """Cameras in the order in which they are looked at: every other one first, as neighbours see one lorry."""
-        of_rig = sorted(self._images)
-        return of_rig[::2] + of_rig[1::2]
-
-    def read(self, camera: int) -> Floats32 | None:
-        """The image (h, w) of a camera; None where there is none, or it cannot be read."""
-        if camera in self._images and camera not in self._read:
-            self._read[camera] = _small_image(self._drive, self._images[camera])
-        return self._read.get(camera)
-
-
-def unit_motion_px(before: SmallImages, now: SmallImages, *, min_motion_px: float) -> tuple[float, float]:
+def unit_motion_px(
+    before: dict[int, Floats32], now: dict[int, Floats32], *, min_motion_px: float
+) -> tuple[float, float]:
     """Motion (px, at full size) of more than half of the cameras, and of the one that moved most.
 
-    Cameras that show something else count in the first only. Both are infinite where no camera tells. Cameras are
-    looked at until no other changes on which side of `min_motion_px` the first is.
+    Cameras that show something else count in the first only. Both are infinite where no camera tells.
     """
-    moved = list[float]()
-    cameras = [camera for camera in now.cameras if camera in before.cameras]
-    for row, camera in enumerate(cameras):
-        motion_px = _camera_motion_px(before.read(camera), now.read(camera), min_motion_px)
-        if motion_px is not None:
-            moved.append(motion_px)
-        left = len(cameras) - row - 1
-        standing, needed = sum(px < min_motion_px for px in moved), _least_to_stand(len(moved) + left)
-        if moved and (standing >= needed or standing + left < needed):
-            break
+    max_sigma_px = MAX_NOISE * min_motion_px / REDUCED
+    moved = []
+    for camera in before.keys() & now.keys():
+        if before[camera].shape != now[camera].shape:
+            continue
+        blocks = block_motion_px(before[camera], now[camera], max_sigma_px)
+        tell = blocks[~np.isnan(blocks)]
+        if len(tell) >= MIN_BLOCKS:
+            moved.append(float(np.median(tell)) * REDUCED)
     if not moved:
         return np.inf, np.inf
     moved.sort()
     explained = [way_px for way_px in moved if np.isfinite(way_px)]
     # The smaller one of the two in the middle: half of the cameras may see one lorry.
-    return moved[_least_to_stand(len(moved)) - 1], max(explained, default=np.inf)
-
-
-def _least_to_stand(cameras: int) -> int:
-    """Least number of cameras of which a unit stands, of those that tell: half of them."""
-    return (cameras + 1) // 2
-
-
-def _camera_motion_px(before: Floats32 | None, now: Floats32 | None, min_motion_px: float) -> float | None:
-    """Motion of a camera between two small images; None where it does not tell."""
-    if before is None or now is None or before.shape != now.shape:
-        return None
-    blocks = block_motion_px(before, now, MAX_NOISE * min_motion_px / REDUCED)
-    tell = blocks[~np.isnan(blocks)]
-    return float(np.median(tell)) * REDUCED if len(tell) >= MIN_BLOCKS else None
+    return moved[(len(moved) - 1) // 2], max(explained, default=np.inf)
 
 
 def _by_unit(drive: Drive) -> list[list[DriveImage]]:
@@ -243,17 +205,22 @@ def _by_unit(drive: Drive) -> list[list[DriveImage]]:
     return result
 
 
-def _small_image(drive: Drive, image: DriveImage) -> Floats32 | None:
-    """The small grey image (h, w) of an image; None where it cannot be read."""
-    camera = drive.cameras[image.camera]
-    try:
-        rgb = read_image_small(drive.root / image.file, (camera.width, camera.height), max(camera.width // REDUCED, 1))
-    except InputError:
-        return None
-    if rgb is None:
-        return None
-    grey = rgb.mean(axis=2, dtype=np.float32)
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), SMOOTHING_PX), dtype=np.float32)
+def _small_images(drive: Drive, images: Sequence[DriveImage]) -> dict[int, Floats32]:
+    """Small grey images by camera; none at all where one of them cannot be read."""
+    result: dict[int, Floats32] = {}
+    for image in images:
+        camera = drive.cameras[image.camera]
+        try:
+            rgb = read_image_small(
+                drive.root / image.file, (camera.width, camera.height), max(camera.width // REDUCED, 1)
+            )
+        except InputError:
+            return {}
+        if rgb is None:
+            return {}
+        grey = rgb.mean(axis=2, dtype=np.float32)
+        result[image.camera] = np.asarray(cv2.GaussianBlur(grey, (0, 0), SMOOTHING_PX), dtype=np.float32)
+    return result
 
 
 @njit(cache=True, nogil=True)

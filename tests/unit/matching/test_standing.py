@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mrasfm_engine.io.images import read_image_small
-from mrasfm_engine.matching import standing
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.standing import Standing, find_standing, moving_by_prior
@@ -172,18 +170,3 @@ def test_the_drive_without_them(tmp_path: Path) -> None:
     left = drive.restricted_to(found.included)
     assert [frame.source_frame for frame in left.manifest.frames] == [0, 1, 2, 7, 8, 9, 10]
     assert [image.unit for image in left.images] == list(range(7))
-
-
-def test_cameras_that_cannot_change_the_answer_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = write(tmp_path, 11, lambda unit, camera: view(camera, stop_px(unit)), cameras=3)
-    asked = list[tuple[str, str]]()
-
-    def counted(path: Path, *args: object) -> object:
-        asked.append((path.parent.name, path.stem))
-        return read_image_small(path, *args)
-
-    monkeypatch.setattr(standing, "read_image_small", counted)
-    found = standing_of(drive)
-    assert found.included.tolist() == [True] * 3 + [False] * 4 + [True] * 4
-    assert {camera for camera, unit in asked if 3 <= int(unit) <= 6} == {"camera0", "camera2"}
-    assert len(asked) == len(set(asked))
