@@ -244,14 +244,7 @@ def write_json(path: Path, document: Mapping[str, Any], *, in_lines: Sequence[st
         Where a value has no JSON form.
     """
     try:
-        encode = partial(json.dumps, allow_nan=False, ensure_ascii=False, default=_plain)
-        if in_lines:
-            lists = {key: ",\n  ".join(encode(entry) for entry in document[key]) for key in in_lines if key in document}
-            parts = {key: encode(value) for key, value in document.items() if key not in in_lines}
-            parts |= {key: f"[\n  {text}\n ]" for key, text in lists.items()}
-            text = "{\n" + ",\n".join(f" {encode(key)}: {parts[key]}" for key in document) + "\n}"
-        else:
-            text = encode(document, indent=1)
+        text = _in_lines(document, in_lines) if in_lines else _encode(document, indent=1)
     except (TypeError, ValueError) as error:
         raise MrasfmError(
             f"{path.name} cannot be written: {error}",
@@ -259,6 +252,19 @@ def write_json(path: Path, document: Mapping[str, Any], *, in_lines: Sequence[st
             code="export-check-failed",
         ) from error
     return write_content(path, text + "\n")
+
+
+def _encode(value: Any, *, indent: int | None = None) -> str:
+    return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False, default=_plain)
+
+
+def _in_lines(document: Mapping[str, Any], lists: Sequence[str]) -> str:
+    """JSON with a line for each value, and for each entry of some `lists`."""
+    lines = []
+    for key, value in document.items():
+        text = "[\n  " + ",\n  ".join(map(_encode, value)) + "\n ]" if key in lists else _encode(value)
+        lines.append(f" {_encode(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}"
 
 
 def _plain(value: Any) -> Any:

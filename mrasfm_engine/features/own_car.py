@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import CancelledError
-from mrasfm_engine.features.static_outline import RESOLUTION, RIM_PX, StaticEdges, trace_outline
+from mrasfm_engine.features.static_outline import RESOLUTION, RIM_PX, StaticEdges, gradients_of, trace_outline
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_small
@@ -203,7 +203,7 @@ class _Statistics:
     def add(self, image: Bytes, outlines: Floats32) -> None:
         """Count an image (h, w, 3) with its outlines (h, w)."""
         smooth = _smoothed(image, SMOOTHING_PX)
-        gradient = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1))])
+        gradient = gradients_of(smooth)
         detail = (smooth - _smoothed(image, FINE_PX)) / (smooth + DARK)
         energy = _channel_sum(gradient[0] ** 2 + gradient[1] ** 2)
         if self.count == 0:

@@ -88,10 +88,7 @@ class StaticEdges:
         near = fall > 0
         change = np.asarray(np.sqrt((changes**2).mean(0)), dtype=np.float32)
         slope = _change_slope(change)
-        # Halves differ by twice the error of the whole; the median length of two normal errors is 1.18 sigmas.
-        differences = np.hypot(*(_change_slope(changes[0]) - _change_slope(changes[1])))[near & (change > NO_CHANGE)]
-        error = float(np.median(differences)) / (2 * 1.18) if len(differences) else 0.0
-        least_step = math.hypot(MIN_CHANGE_STEP, STEP_SIGMAS * error)
+        least_step = _least_step(changes, near & (change > NO_CHANGE))
         step = _without_rim(np.clip(np.hypot(*slope) - least_step, 0, 1) * near)
         return cls(
             edge=edge,
@@ -165,11 +162,23 @@ def _windowed(values: Floats32) -> Floats32:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), WINDOW_PX), dtype=np.float32)
 
 
+def gradients_of(image: Floats32) -> Floats32:
+    """Gradients (2, h, w, ...) of an image (h, w, ...) along x and y, per pixel."""
+    return np.stack([cv2.Sobel(image, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1))])
+
+
+def _least_step(changes: Floats32, asked: Bools) -> float:
+    """Least step that counts, by how much halves (2, h, w) of the images differ in the pixels (h, w) that are asked."""
+    # Halves differ by twice the error of the whole; the median length of two normal errors is 1.18 sigmas.
+    differences = np.hypot(*(_change_slope(changes[0]) - _change_slope(changes[1])))[asked]
+    error = float(np.median(differences)) / (2 * 1.18) if len(differences) else 0.0
+    return math.hypot(MIN_CHANGE_STEP, STEP_SIGMAS * error)
+
+
 def _change_slope(change: Floats32) -> Floats32:
     """Slope (2, h, w) of a logarithm of the change, in steps of `CHANGE_RATIO` across the window."""
     smooth = np.log(cv2.GaussianBlur(change, (0, 0), CHANGE_WINDOW_PX) + NO_CHANGE)
-    slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1))])
-    return np.asarray(slope * (2 * CHANGE_WINDOW_PX / math.log(CHANGE_RATIO)), dtype=np.float32)
+    return np.asarray(gradients_of(smooth) * (2 * CHANGE_WINDOW_PX / math.log(CHANGE_RATIO)), dtype=np.float32)
 
 
 def _without_rim(values: Floats32) -> Floats32:

@@ -30,10 +30,8 @@ def pose_documents(a_from_b: Floats) -> list[dict[str, list[float]]]:
 
 def pose_from_matrix(a_from_b: Floats) -> Pose:
     """A manifest's pose of a 4x4 transform."""
-    return Pose(
-        rotation_xyzw=[float(v) for v in se3.quaternion_from_rotation(a_from_b[:3, :3])],
-        translation_m=[float(v) for v in a_from_b[:3, 3]],
-    )
+    (document,) = pose_documents(a_from_b[None])
+    return Pose(**document)
 
 
 class Incomplete(StrEnum):

@@ -274,26 +274,29 @@ def inverted(rig_from_cam: np.ndarray) -> np.ndarray:
     return se3.inverse(rig_from_cam)
 
 
+def with_cameras(simulated: SimulatedDrive, cameras: Sequence[Camera]) -> SimulatedDrive:
+    """The same drive, whose manifest has other cameras."""
+    manifest = simulated.drive.manifest
+    rig = manifest.rig.model_copy(update={"cameras": list(cameras)})
+    return replace(simulated, drive=replace(simulated.drive, manifest=manifest.model_copy(update={"rig": rig})))
+
+
 def enlarged(simulated: SimulatedDrive, factor: int) -> SimulatedDrive:
     """The same drive by sensors of `factor` times as many pixels a side: so is everything that pixels measure."""
-    truth, manifest = simulated.truth, simulated.drive.manifest
+    truth = simulated.truth
     cameras = [
         c.model_copy(
             update={"width": factor * c.width, "height": factor * c.height, "params": [factor * v for v in c.params]}
         )
-        for c in manifest.rig.cameras
+        for c in simulated.drive.cameras
     ]
     return replace(
-        simulated,
+        with_cameras(simulated, cameras),
         truth=replace(
             truth,
             camera_params=factor * truth.camera_params,
             xy_px=factor * truth.xy_px,
             image_size_px=(factor * truth.image_size_px[0], factor * truth.image_size_px[1]),
-        ),
-        drive=Drive(
-            simulated.drive.root,
-            manifest.model_copy(update={"rig": manifest.rig.model_copy(update={"cameras": cameras})}),
         ),
         features=[replace(f, xy_px=(factor * f.xy_px).astype(np.float32)) for f in simulated.features],
     )

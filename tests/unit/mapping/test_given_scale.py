@@ -12,7 +12,13 @@ from mrasfm_engine.mapping import refinement
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
 from mrasfm_engine.mapping.mapping_report import scale_findings
 from mrasfm_engine.mapping.refinement import Refinement, refine
-from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    with_cameras,
+    with_true_poses,
+)
 
 UNITS = 20
 
@@ -52,9 +58,7 @@ def drive(
         rotation = se3.quaternion_from_rotation(given).tolist()
         pose = camera.rig_from_cam.model_copy(update={"rotation_xyzw": rotation})
         cameras.append(camera.model_copy(update={"rig_from_cam": pose}))
-    rig = simulated.drive.manifest.rig.model_copy(update={"cameras": cameras})
-    manifest = simulated.drive.manifest.model_copy(update={"rig": rig})
-    return replace(simulated, features=features, drive=replace(simulated.drive, manifest=manifest))
+    return replace(with_cameras(simulated, cameras), features=features)
 
 
 def refined(simulated: SimulatedDrive, *, free: bool = True) -> tuple[float, Refinement]:
@@ -108,9 +112,7 @@ def test_a_scale_that_the_drive_hardly_observes_is_a_finding() -> None:
     for sigma_m in (0.001, 0.5):
         simulated = make_simulated_drive(units=8, cameras=2, points=400, straight=True, noise_px=0.2)
         cameras = [c.model_copy(update={"sigma_translation_m": sigma_m}) for c in simulated.drive.cameras]
-        rig = simulated.drive.manifest.rig.model_copy(update={"cameras": cameras})
-        manifest = simulated.drive.manifest.model_copy(update={"rig": rig})
-        simulated = replace(simulated, drive=replace(simulated.drive, manifest=manifest))
+        simulated = with_cameras(simulated, cameras)
         mapper = with_true_poses(make_model(simulated), simulated, range(8))
         said[sigma_m] = [finding.code for finding in scale_findings(refine(mapper))]
     assert said == {0.001: [], 0.5: ["scale-uncertain"]}

@@ -13,7 +13,13 @@ from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
-from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    with_cameras,
+    with_true_poses,
+)
 from tests.unit.mapping.test_placement import ARM_M, received
 
 SIGMA_FOCAL = 0.02
@@ -27,8 +33,7 @@ def model(*, straight: bool, focal: float = 1.0, cameras: int = 4) -> tuple[Mapp
     given = [
         c.model_copy(update={"params": [focal * c.params[0], focal * c.params[1], *c.params[2:]]}) for c in rig.cameras
     ]
-    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": given})})
-    simulated = replace(simulated, drive=replace(simulated.drive, manifest=manifest))
+    simulated = with_cameras(simulated, given)
     return with_true_poses(make_model(simulated, config=CONFIG), simulated, range(30)), simulated
 
 
@@ -93,8 +98,7 @@ def test_terms_of_distortion_that_never_vary_are_said() -> None:
     wide = {"model": "FULL_OPENCV", "params": [*rig.cameras[0].params, 0.1, -0.02, 0.0, 0.0, 0.003, 0.0, 0.04, 0.0]}
     plain = {"model": "FULL_OPENCV", "params": [*rig.cameras[1].params, 0.1, -0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]}
     cameras = [camera.model_copy(update=to) for camera, to in zip(rig.cameras, (wide, plain), strict=True)]
-    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
-    mapper.drive = replace(simulated.drive, manifest=manifest)
+    mapper.drive = with_cameras(simulated, cameras).drive
     decision = IntrinsicsDecision(
         free=np.ones((2, 8), dtype=np.bool_), sigma_focal=np.full(2, 1e-3), prior_sigma_focal=np.full(2, SIGMA_FOCAL)
     )
@@ -110,8 +114,7 @@ def test_the_prior_is_the_manifests_where_it_says_one() -> None:
     rig = simulated.drive.manifest.rig
     given = {"sigma_focal_px": 3.0, "sigma_principal_point_px": 1.5, "sigma_distortion": 0.01}
     cameras = [rig.cameras[0].model_copy(update=given), rig.cameras[1]]
-    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
-    mapper.drive = replace(simulated.drive, manifest=manifest)
+    mapper.drive = with_cameras(simulated, cameras).drive
     prior = intrinsics_prior(mapper)
     assert prior.sigma[0, 0] == pytest.approx(3.0 / prior.params[0, 0])
     assert prior.sigma[1, 0] == SIGMA_FOCAL

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from tests.helpers.simulated_drive import (
     make_simulated_drive,
     metric_errors_m,
     rmse,
+    with_cameras,
     with_true_poses,
 )
 from tests.unit.mapping.test_placement import ARM_M, received
@@ -42,8 +42,7 @@ def model(
     )
     rig = simulated.drive.manifest.rig
     cameras = [c.model_copy(update={"readout_us": 0, "sigma_time_offset_us": 5000.0, **camera}) for c in rig.cameras]
-    manifest = simulated.drive.manifest.model_copy(update={"rig": rig.model_copy(update={"cameras": cameras})})
-    simulated = replace(simulated, drive=replace(simulated.drive, manifest=manifest))
+    simulated = with_cameras(simulated, cameras)
     return with_true_poses(make_model(simulated, config=config), simulated, range(UNITS)), simulated
 
 
