@@ -16,16 +16,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
+from numba import njit
 
 from mrasfm_engine.bundle_adjustment.priors import (
     add_to_units,
     antenna_jacobian,
     antenna_residuals,
     cauchy_cost,
-    cauchy_weights,
 )
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
@@ -159,17 +160,10 @@ class ReceiverPositions:
 
     def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats]:
         """The states (k, 3) that cost least, residuals (n, 3) and robust weights (n,) with them."""
-        weights, states, residuals = np.ones(len(whitened)), np.zeros((len(self.knots_s), AXES)), whitened
-        for _ in range(MAX_REWEIGHTINGS):
-            for axis in range(AXES):
-                right = self._at_knots((weights * whitened[:, axis])[:, None], axis)
-                states[:, axis] = _solved(self._by_knots(weights, axis), right)[:, 0]
-            residuals = whitened - self._at_samples(states)
-            renewed = cauchy_weights(residuals, self.loss_scale)
-            same = bool((np.abs(renewed - weights) < SAME_WEIGHTS).all())
-            weights = renewed
-            if same:
-                break
+        states, residuals, weights = np.zeros((len(self.knots_s), AXES)), whitened.copy(), np.ones(len(whitened))
+        _find_best_states(
+            whitened, self._gain, *self._places, self._precision, self.loss_scale, states, residuals, weights
+        )
         return states, residuals, weights
 
     def errors_m(self, state: State) -> Floats:
@@ -236,6 +230,48 @@ class ReceiverPositions:
         known = self.information(np.concatenate([way[:, :, None], others], axis=2))
         lost = known[0, 1:] @ np.linalg.pinv(known[1:, 1:], rcond=1e-12, hermitian=True) @ known[1:, 0]
         return max(0.0, float(known[0, 0] - lost))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_best_states(
+    whitened: Any, gain: Any, before: Any, after: Any, share: Any, precision: Any, loss_scale: float,
+    states: Any, residuals: Any, weights: Any,
+) -> None:  # fmt: skip
+    """Iteratively reweighted least squares for the states; the caller asks for them at every step and scale."""
+    count = len(states)
+    diagonal, off = np.empty(count), np.empty(count)  # of M, and its superdiagonal, whose first entry is unused
+    for _ in range(MAX_REWEIGHTINGS):
+        for axis in range(AXES):
+            diagonal[:], off[:], states[:, axis] = precision[1], precision[0], 0.0
+            for i in range(len(whitened)):
+                a, b, later = before[i], after[i], share[i]
+                own = gain[i, axis]
+                weight, right = weights[i] * own * own, weights[i] * own * whitened[i, axis]
+                diagonal[a] += weight * (1.0 - later) ** 2
+                states[a, axis] += right * (1.0 - later)
+                if b > a:
+                    diagonal[b] += weight * later**2
+                    off[b] += weight * later * (1.0 - later)
+                    states[b, axis] += right * later
+            for k in range(1, count):
+                factor = off[k] / diagonal[k - 1]
+                diagonal[k] -= factor * off[k]
+                states[k, axis] -= factor * states[k - 1, axis]
+            states[count - 1, axis] /= diagonal[count - 1]
+            for k in range(count - 2, -1, -1):
+                states[k, axis] = (states[k, axis] - off[k + 1] * states[k + 1, axis]) / diagonal[k]
+        change = 0.0
+        for i in range(len(whitened)):
+            squared = 0.0
+            for axis in range(AXES):
+                own = states[before[i], axis] + share[i] * (states[after[i], axis] - states[before[i], axis])
+                residuals[i, axis] = whitened[i, axis] - gain[i, axis] * own
+                squared += residuals[i, axis] ** 2
+            renewed = 1.0 / (1.0 + squared / loss_scale**2)
+            change = max(change, abs(renewed - weights[i]))
+            weights[i] = renewed
+        if change < SAME_WEIGHTS:
+            break
 
 
 def _log_determinant(tridiagonal: Floats) -> float:

@@ -19,6 +19,7 @@ from mrasfm_engine.types import Bools, Floats
 SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
 SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
 HYPOTHESES = 300
+MAX_AT_ONCE = 200_000  # residuals of hypotheses that are in memory at one time
 LEAST_SCALE_RANGE = 1.25  # of the receiver's trajectory against the rig's, where the baselines are known better
 SCALE_SIGMAS = 2.5
 MIN_CONSENSUS = 0.3  # of the positions
@@ -275,23 +276,31 @@ def _best_yaw(
     scale_range: tuple[float, float],
 ) -> tuple[Floats, Bools]:
     """RANSAC over pairs of positions for the turn about the vertical, the scale and the shift: a similarity (4, 4)."""
+    first = rng.integers(len(a), size=HYPOTHESES)
+    second = (first + rng.integers(1, len(a), size=HYPOTHESES)) % len(a)
+    along, moved = a[second] - a[first], measured[second] - measured[first]
+    length_m, moved_m = np.hypot(*along[:, :2].T), np.hypot(*moved[:, :2].T)
+    slack_m = 4.0 * (sigma[first, 0] + sigma[second, 0])
+    least, most = scale_range
+    possible = (length_m >= 1e-3) & (moved_m >= least * length_m - slack_m) & (moved_m <= most * length_m + slack_m)
     best_score, best, best_inlier = -1.0, np.eye(4), np.zeros(len(a), dtype=np.bool_)
-    for _ in range(HYPOTHESES):
-        i, j = rng.choice(len(a), 2, replace=False)
-        da, dm = a[j] - a[i], measured[j] - measured[i]
-        length, slack = float(np.hypot(da[0], da[1])), 4.0 * float(sigma[i, 0] + sigma[j, 0])
-        moved_m = float(np.hypot(dm[0], dm[1]))
-        if length < 1e-3 or not scale_range[0] * length - slack <= moved_m <= scale_range[1] * length + slack:
-            continue
-        scale = float(np.clip(moved_m / length, *scale_range))
-        yaw = np.arctan2(dm[1], dm[0]) - np.arctan2(da[1], da[0])
-        rotation = scale * se3.exp_so3([0.0, 0.0, yaw])
-        shift = np.median(measured - a @ rotation.T, axis=0)
-        for t in (shift, 0.5 * (measured[i] + measured[j] - (a[i] + a[j]) @ rotation.T)):
-            off = np.linalg.norm((a @ rotation.T + t - measured) / sigma, axis=1)
-            score = float(np.maximum(0.0, outlier_sigmas**2 - off**2).sum())
-            if score > best_score:
-                best_score, best, best_inlier = score, se3.transform(rotation, t), off < outlier_sigmas
+    at_once = max(1, MAX_AT_ONCE // len(a))
+    hypotheses = np.flatnonzero(possible)
+    for begin in range(0, len(hypotheses), at_once):
+        h = hypotheses[begin : begin + at_once]
+        turn = np.zeros((len(h), 3))
+        turn[:, 2] = np.arctan2(*moved[h, 1::-1].T) - np.arctan2(*along[h, 1::-1].T)
+        scale = np.clip(moved_m[h] / length_m[h], *scale_range)
+        rotation = scale[:, None, None] * se3.exp_so3(turn)
+        shift = measured - a @ np.swapaxes(rotation, -1, -2)  # (hypotheses, n, 3)
+        of_pair = 0.5 * (shift[np.arange(len(h)), first[h]] + shift[np.arange(len(h)), second[h]])
+        for t in (np.median(shift, axis=1), of_pair):
+            off = np.linalg.norm((t[:, None] - shift) / sigma, axis=2)
+            score = np.maximum(0.0, outlier_sigmas**2 - off**2).sum(1)
+            winner = int(score.argmax())
+            if score[winner] > best_score:
+                best_score, best = float(score[winner]), se3.transform(rotation[winner], t[winner])
+                best_inlier = off[winner] < outlier_sigmas
     return best, best_inlier
 
 

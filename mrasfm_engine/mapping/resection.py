@@ -118,5 +118,8 @@ def _pose_system(
             j[3], j[4], j[5] = -n[0], -n[1], -n[2]
             for a in range(6):
                 gradient[a] += j[a] * residual
-                for b in range(6):
+                for b in range(a + 1):
                     square[a, b] += j[a] * j[b]
+    for a in range(6):
+        for b in range(a):
+            square[b, a] = square[a, b]

@@ -161,7 +161,7 @@ def height_sigmas_m(mapper: Mapper, tracks: Ints, world_from_rig: Floats) -> Flo
 
 def _all_images_are_masked(mapper: Mapper) -> bool:
     """Every image with keypoints has some of a known class: an image without a mask has none."""
-    images = np.unique(mapper.keypoints.image)
+    images = np.flatnonzero(np.diff(mapper.keypoints.first))
     return bool(len(images)) and bool(mapper.keypoints.is_masked[images].all())
 
 

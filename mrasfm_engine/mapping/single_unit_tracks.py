@@ -21,6 +21,7 @@ from scipy.special import betaln
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.parallel import mapped
 from mrasfm_engine.triangulation.track_motion import GroundPath
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -102,19 +103,22 @@ def _neighbourhoods(mapper: Mapper, moves: Bools) -> tuple[_Shares, Bools]:
     unit, track = np.divmod(seen, tracks)
     single = np.bincount(track, minlength=tracks) == 1
     begins = np.searchsorted(unit, np.arange(units + 1))
-    found: list[tuple[Ints, Ints, Ints, Ints]] = []
-    for u in range(units):
+
+    def of_unit(u: int) -> tuple[Ints, Ints, Ints, Ints]:
         here = slice(begins[u], begins[u + 1])
         asked = np.flatnonzero(images[here] > 1)
-        if len(asked):
-            around = _around(mapper.state.points_m[track[here]], ~single[track[here]], asked)
-            found.append((track[here][asked], unit[here][asked], *around))
-    columns = [np.concatenate(each) for each in zip(*found, strict=True)] if found else [np.zeros(0, np.int64)] * 4
+        around = _around(mapper.state.points_m[track[here]], ~single[track[here]], asked)
+        return track[here][asked], unit[here][asked], *around
+
+    found = mapped(mapper.config.threads, of_unit, range(units))
+    columns = [np.concatenate(each) for each in zip(*found, strict=True)]
     return _Shares(track=columns[0], unit=columns[1], neighbours=columns[2], going_on=columns[3]), single
 
 
 def _around(points_m: Floats, goes_on: Bools, asked: Ints) -> tuple[Ints, Ints]:
     """Neighbours and those of them that go on, around the points `asked` (n,) of all points (m, 3) of a unit."""
+    if not len(asked):
+        return asked, asked
     count = min(NEIGHBOURS + 1, len(points_m))
     _, index = cKDTree(points_m).query(points_m[asked], k=count, distance_upper_bound=REACH_M)
     index = np.asarray(index, dtype=np.int64).reshape(len(asked), count)

@@ -60,12 +60,14 @@ class Keypoints:
         for pair in kept:
             matched[pair.image_a].append(pair.matches[:, 0])
             matched[pair.image_b].append(pair.matches[:, 1])
-        numbers = [np.unique(np.concatenate(of_image)).astype(np.int64) for of_image in matched]
+        is_matched = [np.bincount(np.concatenate(of_image)) > 0 for of_image in matched]
+        row_of = [np.cumsum(of_image, dtype=np.int32) - 1 for of_image in is_matched]
 
         def numbered_anew(pair: PairMatches) -> PairMatches:
-            ends = (pair.image_a, pair.image_b)
-            rows = [np.searchsorted(numbers[image], pair.matches[:, side]) for side, image in enumerate(ends)]
-            return replace(pair, matches=np.stack(rows, axis=1).astype(np.int32))
+            rows = (row_of[pair.image_a][pair.matches[:, 0]], row_of[pair.image_b][pair.matches[:, 1]])
+            return replace(pair, matches=np.stack(rows, axis=1).astype(np.int32, copy=False))
+
+        numbers = [np.flatnonzero(of_image) for of_image in is_matched]
 
         return Keypoints._of_numbers(drive, features, numbers, bands), [numbered_anew(pair) for pair in kept]
 
