@@ -82,16 +82,24 @@ class AbsolutePriors:
         """True where they say how the scene lies, so that no unit has to be held."""
         return self.positions is not None or self.rough is not None
 
-    def place(self, mapper: Mapper) -> None:
+    @property
+    def positions_are_refused(self) -> bool:
+        """True where positions were compared with the scene and do not fit it."""
+        return self.placement is not None and self.placement.prior is None
+
+    def place(self, mapper: Mapper, *, sigma_scale: float = 0.0) -> None:
         """Move the scene to where positions, or else rough poses, say that it is; both become terms.
 
         What they say of its scale is compared with the rig as given: positions may have changed it while it grew.
+        `sigma_scale`, relative, is what the images leave open of it.
         """
         settings = mapper.config.bundle_adjustment
         if settings.priors and settings.reassessment and not mapper.drive.has_single_camera:
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
         if self.gnss is not None and self.antenna_in_rig_m is not None:
-            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m, thorough=True)
+            self.placement = place_by_gnss(
+                mapper, self.gnss, self.antenna_in_rig_m, sigma_scale=sigma_scale, thorough=True
+            )
         sigma = mapper.drive.manifest.rough_poses
         if self.positions is None and self.rough_world_from_rig is not None and sigma is not None:
             self.placed_by_rough_poses = place_by_rough_poses(

@@ -92,11 +92,14 @@ class Placement:
         return self.prior is not None and bool(self.noise_factor > BENT or self.inlier.mean() < MOST)
 
 
-def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, thorough: bool = False) -> Placement:
+def place_by_gnss(
+    mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, sigma_scale: float = 0.0, thorough: bool = False
+) -> Placement:
     """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
-    The reconstruction keeps its scale, which comes from the rig; only that of a single camera is the receiver's. See
-    `reassess_positions` for `thorough`.
+    The reconstruction keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
+    `sigma_scale`, relative, is by how much it may be off beside what the baselines are. See `reassess_positions` for
+    `thorough`.
     """
     settings, times = mapper.config.gnss, mapper.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
@@ -104,7 +107,7 @@ def place_by_gnss(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, 
     single = mapper.drive.has_single_camera
     if single and len(units) > 1:
         scale_with_baselines(mapper, _extent(measured[units]) / _extent(mapper.state.unit_position_m[units]))
-    sigma_rig_scale = scale_of_baselines(mapper)[1]
+    sigma_rig_scale = float(np.hypot(scale_of_baselines(mapper)[1], sigma_scale))
     alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
     for _ in range(SCALE_ROUNDS if single else 0):
         if isinstance(alignment, GnssAlignment):

@@ -131,6 +131,8 @@ def refine(
     absolute = AbsolutePriors() if absolute is None else absolute
     result = Refinement(absolute=absolute)
     absolute.place(mapper)
+    if absolute.positions_are_refused and not mapper.drive.has_single_camera and _reassesses(mapper):
+        absolute.place(mapper, sigma_scale=_settled(mapper, absolute))
     placed = result.georeferenced or result.placed_by_rough_poses
     if not placed and mapper.drive.has_single_camera:
         raise ReconstructionError(
@@ -228,6 +230,25 @@ def refine(
         result.miscalibrations = find_miscalibrations(*known)
         result.wrong_pair = find_wrong_pair(*known)
     return result
+
+
+def _settled(mapper: Mapper, absolute: AbsolutePriors) -> float:
+    """Adjust by the images and the rig as given; the standard deviation of the scale, relative, that this leaves.
+
+    While the scene grows, damping holds up a scale that images hardly tell: positions that are right contradict it.
+    """
+    free_units, options = _free_units(mapper, absolute), _options(mapper, _observation_sigma(mapper))
+    adjust_poses(mapper, free_units, terms=absolute.terms(mapper), options=options)
+    mapper.complete()
+    problem, _ = mapper.problem(
+        free_units,
+        free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
+        terms=[calibration_prior(mapper), *absolute.terms(mapper)],
+        options=options,
+    )
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
+        return 0.0
+    return covariances(problem, problem.state).sigma_scale
 
 
 def _adjust(

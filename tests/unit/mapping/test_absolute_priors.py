@@ -154,3 +154,17 @@ def test_rough_poses_that_contradict_a_growing_scene_take_no_part_in_it() -> Non
     known.renew(mapper)
     assert known.rough is None
     assert not known.hold_the_frame
+
+
+def test_a_receiver_that_a_scale_on_its_way_contradicts_is_asked_again() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    middle = mapper.state.unit_position_m.mean(0)
+    for places_m in (mapper.state.unit_position_m, mapper.state.points_m):
+        places_m[:] = middle + 0.7 * (places_m - middle)
+    known = AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M)
+    known.place(mapper)
+    assert known.positions_are_refused
+    assert refine(mapper, known).georeferenced
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 0.0 < abs(scale - 1.0) < 0.01
