@@ -29,6 +29,7 @@ class Covariances:
     sigma_scale: float  # relative, of the trajectory's size
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
     calibration_of_independent_errors: Floats  # (6 c, 6 c) the same as the adjustment weighs it: without shared errors
+    scale_with_calibration: Floats  # (6 c,) covariance of the scale with these, as the adjustment weighs it
     times_s2: Floats  # (c, c) of the free cameras' time offsets, (0, 0) where none has a place
     times_of_independent_errors_s2: Floats  # (c, c) the same as the adjustment weighs them
 
@@ -63,6 +64,7 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
         sigma_scale=found.sigma_scale,
         calibration=found.cameras[poses],
         calibration_of_independent_errors=found.cameras_of_independent_errors[poses],
+        scale_with_calibration=found.scale_with_cameras[poses[0].ravel()],
         times_s2=found.cameras[times],
         times_of_independent_errors_s2=found.cameras_of_independent_errors[times],
     )
@@ -73,6 +75,7 @@ class _Marginals:
     units: Floats  # (free units, 6) variances
     cameras: Floats  # (d c, d c) covariance of the free cameras; zero where held
     cameras_of_independent_errors: Floats  # (d c, d c)
+    scale_with_cameras: Floats  # (d c,) as the adjustment weighs errors
     sigma_scale: float
 
 
@@ -90,7 +93,8 @@ def _regular_marginals(
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
     joint, of_readouts = _of_functionals(problem, state, eliminated, border)[1:]
-    cameras = joint[:-1, :-1]
+    cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
+    scale_with_cameras[eliminated.free] = joint[-1, :-1]
     if shared_errors:
         joint = _with_shared_errors(problem, state, unseen, joint)
     joint = joint + of_readouts
@@ -108,6 +112,7 @@ def _regular_marginals(
         units=np.maximum(variance, 0.0),
         cameras=covariances_of_cameras[0],
         cameras_of_independent_errors=covariances_of_cameras[1],
+        scale_with_cameras=scale_with_cameras,
         sigma_scale=scale,
     )
 
@@ -181,7 +186,13 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     if size > LARGEST_DENSE:
         cameras = np.diag(np.full(size - split, np.inf))
         units = np.full((layout.num_units, UNIT_DOF), np.inf)
-        return _Marginals(units=units, cameras=cameras, cameras_of_independent_errors=cameras, sigma_scale=np.inf)
+        return _Marginals(
+            units=units,
+            cameras=cameras,
+            cameras_of_independent_errors=cameras,
+            scale_with_cameras=np.zeros(size - split),
+            sigma_scale=np.inf,
+        )
     matrix = system.matrix
     free = np.setdiff1d(np.arange(size), layout.held())
     free = free[np.diagonal(matrix)[free] > 0.0]
@@ -193,14 +204,21 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     covariance[np.ix_(free, free)] = inverse
     covariance[np.diag_indices(size)] = variance
     units = variance[:split].reshape(-1, UNIT_DOF)
-    scale = float("nan")
+    scale, scale_with_cameras = float("nan"), np.zeros(size - split)
     if np.isinf(units[:, 3:]).any():
         scale = np.inf
     elif len(position) >= 2:
         functional = scale_functional(position)
         scale = _sigma_scale(float(functional @ covariance[:split, :split] @ functional))
+        scale_with_cameras = functional @ covariance[:split, split:]
     cameras = covariance[split:, split:]
-    return _Marginals(units=units, cameras=cameras, cameras_of_independent_errors=cameras, sigma_scale=scale)
+    return _Marginals(
+        units=units,
+        cameras=cameras,
+        cameras_of_independent_errors=cameras,
+        scale_with_cameras=scale_with_cameras,
+        sigma_scale=scale,
+    )
 
 
 def _inverse(matrix: Floats) -> tuple[Floats, Bools]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
@@ -130,6 +130,30 @@ def scale_with_baselines(mapper: Mapper, factor: float) -> None:
     mapper.motion.scale(state, factor, mean)
     state.unit_position_m[:] = unit_position_m
     state.camera_position_m[:] = camera_position_m
+
+
+def hold_baselines(mapper: Mapper, certainty: Covariances) -> None:
+    """Give the baselines the length that they have by their prior.
+
+    The scene follows as far as it is known by them alone: all of it where images compare both well, as those of a
+    stereo pair do, and none of it where positions know the scene's scale better than images compare it with the rig
+    [conditional mean of a normal distribution].
+    """
+    centred = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
+    if float((centred**2).sum()) < MIN_BASELINES_M2:
+        return
+    length = np.zeros((len(centred), 6))
+    length[:, 3:] = centred / (centred**2).sum()
+    length = length.ravel()
+    variance = float(length @ certainty.calibration_of_independent_errors @ length)
+    follows = float(np.clip(length @ certainty.scale_with_calibration / variance, 0.0, 1.0)) if variance > 0.0 else 1.0
+    factor = scale_of_baselines(mapper)[0]
+    scale_with_baselines(mapper, factor)
+    back, state = factor ** (follows - 1.0), mapper.state
+    centre = state.unit_position_m[mapper.registered].mean(0)
+    for places_m in (state.points_m, state.unit_position_m):
+        places_m[:] = centre + back * (places_m - centre)
+    mapper.renew_motion()
 
 
 def take_calibration(mapper: Mapper, other: Mapper) -> None:

@@ -20,9 +20,8 @@ from mrasfm_engine.mapping.calibration import (
     CalibrationDecision,
     assess_calibration,
     calibration_prior,
+    hold_baselines,
     resolve_scale,
-    scale_of_baselines,
-    scale_with_baselines,
     take_calibration,
 )
 from mrasfm_engine.mapping.georeferencing import BENT
@@ -369,11 +368,14 @@ def _hold_unobserved(
     if result.times is not None:
         result.held_times = result.times.to_hold
     hold_times = result.held_times is not None and (result.held_times.any() or holds_mean_time)
+    hold_scale = result.georeferenced and weighed.scale_only_prior
+    if hold_scale:
+        hold_baselines(mapper, result.certainty)
     if weighed.to_hold[result.recalibrated].any() or hold_times:
         result.held = weighed.to_hold
         _adjust(mapper, result, free_units, rough=False, cancel=cancel)
-    if result.georeferenced and weighed.scale_only_prior:
-        scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
+        if hold_scale:
+            hold_baselines(mapper, result.certainty)
 
 
 def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:

@@ -65,6 +65,9 @@ def test_covariances_are_the_inverse_of_the_full_hessian(free_focal: bool) -> No
     functional = np.zeros(12)
     functional.reshape(2, 6)[:, 3:] = centred / (centred**2).sum()
     assert found.sigma_scale == pytest.approx(np.sqrt(functional @ covariance[:12, :12] @ functional), rel=1e-3)
+    dof = problem.layout.camera_dof
+    with_poses = (functional @ covariance[:12, 12 : 12 + 2 * dof]).reshape(2, dof)[:, :6].ravel()
+    np.testing.assert_allclose(found.scale_with_calibration, with_poses, rtol=1e-3, atol=1e-12)
 
 
 def test_the_sigma_of_scale_is_that_of_the_baseline() -> None:

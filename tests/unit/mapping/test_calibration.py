@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.priors import PositionPrior
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import (
     assess_calibration,
     calibration_prior,
+    hold_baselines,
     is_straight,
     resolve_scale,
     scale_of_baselines,
@@ -171,3 +173,30 @@ def test_the_scale_comes_to_where_the_terms_cost_least() -> None:
     resolve_scale(mapper, terms)
     assert scale_of_baselines(mapper)[0] == pytest.approx(1.0, abs=1e-4)
     assert np.abs(mapper.state.points_m - before).max() > 0.1
+
+
+@pytest.mark.parametrize("sigma_m", [1e-4, 10.0])
+def test_held_baselines_take_the_scene_along_as_far_as_positions_leave_its_scale_open(sigma_m: float) -> None:
+    mapper = true_model(cameras=2)
+    way_m = np.linalg.norm(np.ptp(mapper.state.unit_position_m, axis=0))
+    free = np.arange(UNITS) > 0
+    positions = PositionPrior(
+        unit=np.arange(UNITS),
+        position_m=mapper.state.unit_position_m.copy(),
+        sigma_m=np.full((UNITS, 3), sigma_m),
+        lever_arm_m=np.zeros(3),
+    )
+    terms = [calibration_prior(mapper), positions]
+    problem, _ = mapper.problem(
+        free, free_cameras=np.ones(2, dtype=np.bool_), terms=terms, options=SolverOptions(sigma_px=30.0)
+    )
+    certainty = covariances(problem, problem.state, shared_errors=False)
+    camera_m = mapper.state.camera_position_m
+    camera_m[:] = camera_m.mean(0) + 1.1 * (camera_m - camera_m.mean(0))
+    hold_baselines(mapper, certainty)
+    assert scale_of_baselines(mapper)[0] == pytest.approx(1.0)
+    longer = np.linalg.norm(np.ptp(mapper.state.unit_position_m, axis=0)) / way_m
+    if sigma_m < 1.0:
+        assert 0.995 < longer < 1.005
+    else:
+        assert 1.0 / 1.1 - 0.01 < longer < 1.0 / 1.1 + 0.03
