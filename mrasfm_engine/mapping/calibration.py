@@ -142,9 +142,9 @@ def hold_baselines(mapper: Mapper, certainty: Covariances) -> None:
     centred = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
     if float((centred**2).sum()) < MIN_BASELINES_M2:
         return
-    length = np.zeros((len(centred), 6))
-    length[:, 3:] = centred / (centred**2).sum()
-    length = length.ravel()
+    of_camera = np.zeros((len(centred), 6))
+    of_camera[:, 3:] = centred / (centred**2).sum()
+    length = of_camera.ravel()  # derivative of the baselines' common length, relative
     variance = float(length @ certainty.calibration_of_independent_errors @ length)
     follows = float(np.clip(length @ certainty.scale_with_calibration / variance, 0.0, 1.0)) if variance > 0.0 else 1.0
     factor = scale_of_baselines(mapper)[0]
