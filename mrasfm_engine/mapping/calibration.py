@@ -112,9 +112,13 @@ def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
     given = prior.position_m - prior.position_m.mean(0)
     current = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
     information = float(((given**2).sum(1) / prior.sigma_translation_m**2).sum())
-    if min(float((current**2).sum()), float((given**2).sum())) < MIN_BASELINES_M2:
+    length2, given2 = float((current**2).sum()), float((given**2).sum())
+    if min(length2, given2) < MIN_BASELINES_M2:
         return 1.0, np.inf  # cameras in one place have no scale
-    return float((given * current).sum() / (current**2).sum()), 1.0 / float(np.sqrt(information))
+    along = float((given * current).sum())
+    # Of baselines that images have turned round, the length alone is compared: no factor mirrors a scene.
+    factor = along / length2 if along > 0.0 else np.sqrt(given2 / length2)
+    return float(factor), 1.0 / float(np.sqrt(information))
 
 
 def scale_with_baselines(mapper: Mapper, factor: float) -> None:
@@ -130,6 +134,15 @@ def scale_with_baselines(mapper: Mapper, factor: float) -> None:
     mapper.motion.scale(state, factor, mean)
     state.unit_position_m[:] = unit_position_m
     state.camera_position_m[:] = camera_position_m
+
+
+def scale_scene(mapper: Mapper, factor: float) -> None:
+    """Scale units and points about their middle, and leave the cameras where they are in the rig."""
+    state = mapper.state
+    centre = state.unit_position_m[mapper.registered].mean(0)
+    for places_m in (state.points_m, state.unit_position_m):
+        places_m[:] = centre + factor * (places_m - centre)
+    mapper.renew_motion()
 
 
 def hold_baselines(mapper: Mapper, certainty: Covariances) -> None:
@@ -149,11 +162,7 @@ def hold_baselines(mapper: Mapper, certainty: Covariances) -> None:
     follows = float(np.clip(length @ certainty.scale_with_calibration / variance, 0.0, 1.0)) if variance > 0.0 else 1.0
     factor = scale_of_baselines(mapper)[0]
     scale_with_baselines(mapper, factor)
-    back, state = factor ** (follows - 1.0), mapper.state
-    centre = state.unit_position_m[mapper.registered].mean(0)
-    for places_m in (state.points_m, state.unit_position_m):
-        places_m[:] = centre + back * (places_m - centre)
-    mapper.renew_motion()
+    scale_scene(mapper, factor ** (follows - 1.0))
 
 
 def take_calibration(mapper: Mapper, other: Mapper) -> None:

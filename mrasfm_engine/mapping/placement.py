@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
-from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
+from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_scene, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import (
     BENT,
     MOST,
@@ -41,7 +42,10 @@ KNOTS = 20  # in the correlation time of what wanders: less often than its filte
 USUAL_LOG_SIGMA = np.log(2.0)  # standard deviation of the logarithm of a receiver's errors over what it declares
 MOST_RESIDUALS, MIN_FOR_LIKELIHOOD = 150, 8
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
-SCALE_ROUNDS = 3  # of fitting one camera's arbitrary scale to the receiver
+SCALE_ROUNDS = 3  # of fitting an arbitrary scale to the receiver
+# Of the scale's logarithm: beyond, the cost of images is no longer alike in the scale and in its inverse, and its sigma
+# does not say how far off it may be.
+UNKNOWN_SIGMA_SCALE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,22 +101,23 @@ def place_by_gnss(
 ) -> Placement:
     """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
-    The reconstruction keeps its scale, which comes from the rig; only that of a single camera is the receiver's.
-    `sigma_scale`, relative, is by how much it may be off beside what the baselines are. See `reassess_positions` for
-    `thorough`.
+    The reconstruction keeps its scale, which comes from the rig; that of a single camera is the receiver's, and that of
+    a scene whose images hardly compare it with the rig. `sigma_scale`, relative, is by how much it may be off beside
+    what the baselines are. See `reassess_positions` for `thorough`.
     """
     settings, times = mapper.config.gnss, mapper.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
     units = np.flatnonzero(mapper.registered & np.isfinite(measured[:, 0]))
     single = mapper.drive.has_single_camera
-    if single and len(units) > 1:
-        scale_with_baselines(mapper, _extent(measured[units]) / _extent(mapper.state.unit_position_m[units]))
     sigma_rig_scale = float(np.hypot(scale_of_baselines(mapper)[1], sigma_scale))
-    alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
-    for _ in range(SCALE_ROUNDS if single else 0):
-        if isinstance(alignment, GnssAlignment):
-            scale_with_baselines(mapper, alignment.scale)
-            alignment = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
+
+    def align() -> GnssAlignment | str:
+        return _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
+
+    if (single or sigma_scale > UNKNOWN_SIGMA_SCALE) and len(units) > 1:
+        alignment = _with_scale(mapper, align, _extent(measured[units]) / _extent(mapper.state.unit_position_m[units]))
+    else:
+        alignment = align()
     if isinstance(alignment, str):
         return Placement(reason=alignment)
     move(mapper, alignment.world_from_model)
@@ -132,6 +137,20 @@ def place_by_gnss(
         assert placement.prior is not None
         placement.findings = _findings(mapper, alignment, placement.prior)
     return placement
+
+
+def _with_scale(mapper: Mapper, align: Callable[[], GnssAlignment | str], factor: float) -> GnssAlignment | str:
+    """The alignment with the receiver's scale, near a factor, to which the scene is scaled where there is one."""
+    scale = scale_with_baselines if mapper.drive.has_single_camera else scale_scene
+    scale(mapper, factor)
+    alignment = align()
+    for _ in range(SCALE_ROUNDS):
+        if isinstance(alignment, str):
+            scale(mapper, 1.0 / factor)
+            break
+        scale(mapper, alignment.scale)
+        factor, alignment = factor * alignment.scale, align()
+    return alignment
 
 
 def reassess_positions(

@@ -57,6 +57,12 @@ def test_the_baselines_tell_by_how_much_they_were_scaled() -> None:
     assert 0.01 < sigma < 0.1  # 5 cm on some metres of baselines
 
 
+def test_baselines_that_are_turned_round_mirror_no_scene() -> None:
+    mapper = true_model(cameras=2)
+    mapper.state.camera_position_m[:] = 0.8 * mapper.state.camera_position_m[::-1]
+    assert scale_of_baselines(mapper)[0] == pytest.approx(1.25)
+
+
 def test_cameras_in_one_place_have_no_scale() -> None:
     mapper = true_model(cameras=1)
     assert scale_of_baselines(mapper) == (1.0, np.inf)

@@ -10,11 +10,24 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import Placement, ReceiverErrors, most_likely_errors, receiver_errors
+from mrasfm_engine.mapping.placement import (
+    Placement,
+    ReceiverErrors,
+    most_likely_errors,
+    place_by_gnss,
+    receiver_errors,
+)
 from mrasfm_engine.mapping.refinement import Refinement, refine
-from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, true_matches
+from tests.helpers.simulated_drive import (
+    SimulatedDrive,
+    make_model,
+    make_simulated_drive,
+    true_matches,
+    with_true_poses,
+)
 
 ARM_M = np.array([-0.5, 0.2, 1.6])
 UNITS = 30
@@ -176,3 +189,27 @@ def test_positions_take_part_while_the_scene_grows(sigma_m: float) -> None:
     assert len(log.absolute.positions.unit) > UNITS / 2
     errors_m = np.linalg.norm(mapper.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
     assert 1e-4 < np.sqrt((errors_m**2).mean()) < sigma_m  # in the receiver's frame, before any refinement
+
+
+@pytest.mark.parametrize("factor", [0.02, 50.0])
+def test_a_scale_that_images_do_not_tell_is_the_receivers(factor: float) -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    scale_scene(mapper, factor)
+    gnss, before = received(simulated, 0.02), mapper.state.unit_position_m.copy()
+    assert place_by_gnss(mapper, gnss, ARM_M, sigma_scale=0.05).prior is None  # images tell it, so one of both is wrong
+    np.testing.assert_array_equal(mapper.state.unit_position_m, before)
+    assert place_by_gnss(mapper, gnss, ARM_M, sigma_scale=0.2).prior is not None
+    off_m = np.linalg.norm(mapper.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
+    assert 0.0 < np.median(off_m) < 0.05
+
+
+def test_a_receiver_of_another_route_changes_nothing() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    before = mapper.state.unit_position_m.copy()
+    elsewhere_m = np.random.default_rng(2).normal(size=(UNITS, 3)) * 20.0
+    placement = place_by_gnss(mapper, received(simulated, 0.02, elsewhere_m), ARM_M, sigma_scale=0.2)
+    assert placement.prior is None
+    assert placement.reason
+    np.testing.assert_allclose(mapper.state.unit_position_m, before, atol=1e-9)
