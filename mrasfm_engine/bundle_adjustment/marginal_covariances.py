@@ -29,7 +29,8 @@ class Covariances:
     sigma_scale: float  # relative, of the trajectory's size
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
     calibration_of_independent_errors: Floats  # (6 c, 6 c) the same as the adjustment weighs it: without shared errors
-    scale_with_calibration: Floats  # (6 c,) covariance of the scale with these, as the adjustment weighs it
+    # (6 c,) covariance of the scale with these, as the adjustment weighs errors; NaN where it is not known
+    scale_with_calibration: Floats
     times_s2: Floats  # (c, c) of the free cameras' time offsets, (0, 0) where none has a place
     times_of_independent_errors_s2: Floats  # (c, c) the same as the adjustment weighs them
 
@@ -190,7 +191,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
             units=units,
             cameras=cameras,
             cameras_of_independent_errors=cameras,
-            scale_with_cameras=np.zeros(size - split),
+            scale_with_cameras=np.full(size - split, np.nan),
             sigma_scale=np.inf,
         )
     matrix = system.matrix
@@ -204,7 +205,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     covariance[np.ix_(free, free)] = inverse
     covariance[np.diag_indices(size)] = variance
     units = variance[:split].reshape(-1, UNIT_DOF)
-    scale, scale_with_cameras = float("nan"), np.zeros(size - split)
+    scale, scale_with_cameras = float("nan"), np.full(size - split, np.nan)
     if np.isinf(units[:, 3:]).any():
         scale = np.inf
     elif len(position) >= 2:

@@ -74,13 +74,15 @@ class CalibrationPrior:
         return np.repeat((w / w.sum() * np.sqrt(len(w)))[:, None], 6, axis=1)
 
     def without_gauge(self, covariance: Floats) -> Floats:
-        """A covariance of all cameras' poses (6 c, 6 c) without what the gauge leaves of a common motion."""
+        """A covariance of all cameras' poses (6 c, 6 c), or theirs with something else (6 c,), without what the gauge
+        leaves of a common motion.
+        """
         cameras = len(self.rotation)
         weights = np.full(cameras, 1.0 / cameras) if self.gauge_weights is None else self.gauge_weights
         sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1).ravel()
         mean = np.kron(np.tile(weights / weights.sum(), (cameras, 1)), np.eye(6))
         own = np.eye(6 * cameras) - mean * sigma[:, None] / sigma
-        result: Floats = own @ covariance @ own.T
+        result: Floats = own @ covariance if covariance.ndim == 1 else own @ covariance @ own.T
         return result
 
     def cost(self, state: State) -> float:

@@ -160,7 +160,11 @@ class ReceiverPositions:
 
     def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats]:
         """The states (k, 3) that cost least, residuals (n, 3) and robust weights (n,) with them."""
-        states, residuals, weights = np.zeros((len(self.knots_s), AXES)), whitened.copy(), np.ones(len(whitened))
+        states, residuals, weights = (
+            np.zeros((len(self.knots_s), AXES)),
+            np.empty_like(whitened),
+            np.ones(len(whitened)),
+        )
         _find_best_states(
             whitened, self._gain, *self._places, self._precision, self.loss_scale, states, residuals, weights
         )
@@ -237,7 +241,10 @@ def _find_best_states(
     whitened: Any, gain: Any, before: Any, after: Any, share: Any, precision: Any, loss_scale: float,
     states: Any, residuals: Any, weights: Any,
 ) -> None:  # fmt: skip
-    """Iteratively reweighted least squares for the states; the caller asks for them at every step and scale."""
+    """Find the states (k, 3), k > 0, by iteratively reweighted least squares, with their residuals and weights.
+
+    M and D'Wv, as `_by_knots` and `_at_knots` have them, are formed and solved without an array in between.
+    """
     count = len(states)
     diagonal, off = np.empty(count), np.empty(count)  # of M, and its superdiagonal, whose first entry is unused
     for _ in range(MAX_REWEIGHTINGS):

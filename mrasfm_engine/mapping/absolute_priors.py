@@ -84,7 +84,7 @@ class AbsolutePriors:
 
     @property
     def positions_are_refused(self) -> bool:
-        """True where positions were compared with the scene and do not fit it."""
+        """True where the receiver's positions take no part, for the reason that the placement has."""
         return self.placement is not None and self.placement.prior is None
 
     def place(self, mapper: Mapper, *, sigma_scale: float = 0.0) -> None:
@@ -94,6 +94,7 @@ class AbsolutePriors:
         `sigma_scale`, relative, is what the images leave open of it.
         """
         settings = mapper.config.bundle_adjustment
+        self.placed_by_rough_poses = False
         if settings.priors and settings.reassessment and not mapper.drive.has_single_camera:
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
         if self.gnss is not None and self.antenna_in_rig_m is not None:

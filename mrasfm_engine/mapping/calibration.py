@@ -112,13 +112,11 @@ def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
     given = prior.position_m - prior.position_m.mean(0)
     current = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
     information = float(((given**2).sum(1) / prior.sigma_translation_m**2).sum())
-    length2, given2 = float((current**2).sum()), float((given**2).sum())
-    if min(length2, given2) < MIN_BASELINES_M2:
+    lengths2 = float((current**2).sum()), float((given**2).sum())
+    if min(lengths2) < MIN_BASELINES_M2:
         return 1.0, np.inf  # cameras in one place have no scale
-    along = float((given * current).sum())
-    # Of baselines that images have turned round, the length alone is compared: no factor mirrors a scene.
-    factor = along / length2 if along > 0.0 else np.sqrt(given2 / length2)
-    return float(factor), 1.0 / float(np.sqrt(information))
+    # Lengths alone: the images may have turned the baselines, and no turn shrinks or mirrors a scene.
+    return float(np.sqrt(lengths2[1] / lengths2[0])), 1.0 / float(np.sqrt(information))
 
 
 def scale_with_baselines(mapper: Mapper, factor: float) -> None:
@@ -126,43 +124,60 @@ def scale_with_baselines(mapper: Mapper, factor: float) -> None:
 
     The cameras' mean place in the rig is kept, as the gauge holds it; the units move instead.
     """
-    state = mapper.state
-    centre = state.unit_position_m[mapper.registered].mean(0)
-    mean = state.camera_position_m.mean(0)
-    unit_position_m, camera_position_m = _scaled_places(mapper, factor)
-    state.points_m[:] = centre + factor * (state.points_m - centre)
-    mapper.motion.scale(state, factor, mean)
-    state.unit_position_m[:] = unit_position_m
-    state.camera_position_m[:] = camera_position_m
+    camera_position_m = _scaled_places(mapper, factor)[1]
+    scale_scene(mapper, factor)
+    mapper.state.camera_position_m[:] = camera_position_m
 
 
 def scale_scene(mapper: Mapper, factor: float) -> None:
-    """Scale units and points about their middle, and leave the cameras where they are in the rig."""
+    """Scale units and points as `scale_with_baselines` does, and leave the cameras where they are in the rig."""
     state = mapper.state
-    centre = state.unit_position_m[mapper.registered].mean(0)
-    for places_m in (state.points_m, state.unit_position_m):
-        places_m[:] = centre + factor * (places_m - centre)
-    mapper.renew_motion()
+    centre, mean = state.unit_position_m[mapper.registered].mean(0), state.camera_position_m.mean(0)
+    unit_position_m = _scaled_places(mapper, factor)[0]
+    state.points_m[:] = centre + factor * (state.points_m - centre)
+    mapper.motion.scale(state, factor, mean)
+    state.unit_position_m[:] = unit_position_m
 
 
-def hold_baselines(mapper: Mapper, certainty: Covariances) -> None:
-    """Give the baselines the length that they have by their prior.
+def hold_baselines(mapper: Mapper, certainty: Covariances) -> float:
+    """Give the baselines the length that they have by their prior; by how much the scene stays behind, in pixels.
 
     The scene follows as far as it is known by them alone: all of it where images compare both well, as those of a
     stereo pair do, and none of it where positions know the scene's scale better than images compare it with the rig
     [conditional mean of a normal distribution].
     """
-    centred = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
-    if float((centred**2).sum()) < MIN_BASELINES_M2:
-        return
-    of_camera = np.zeros((len(centred), 6))
-    of_camera[:, 3:] = centred / (centred**2).sum()
-    length = of_camera.ravel()  # derivative of the baselines' common length, relative
-    variance = float(length @ certainty.calibration_of_independent_errors @ length)
-    follows = float(np.clip(length @ certainty.scale_with_calibration / variance, 0.0, 1.0)) if variance > 0.0 else 1.0
-    factor = scale_of_baselines(mapper)[0]
+    factor, follows = scale_of_baselines(mapper)[0], _share_of_baselines(mapper, certainty)[0]
+    back = factor ** (follows - 1.0)
     scale_with_baselines(mapper, factor)
-    scale_scene(mapper, factor ** (follows - 1.0))
+    scale_scene(mapper, back)
+    centred_m = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
+    away_m = abs(back - 1.0) * float(np.linalg.norm(centred_m, axis=1).max())
+    focal_px = float(mapper.state.camera_params[:, :2].mean())
+    return float(away_m * focal_px / max(median_depth_m(mapper), 1e-9))
+
+
+def sigma_scale_of_images(mapper: Mapper, certainty: Covariances) -> float:
+    """Standard deviation of the scene's scale, relative, if the baselines' length is known."""
+    explained = _share_of_baselines(mapper, certainty)[1]
+    return float(np.sqrt(max(certainty.sigma_scale**2 - explained, 0.0)))
+
+
+def _share_of_baselines(mapper: Mapper, certainty: Covariances) -> tuple[float, float]:
+    """By how much the scene's scale follows that of the baselines, 0 to 1, and the variance of it that this explains.
+
+    One and nothing where the covariance does not say it.
+    """
+    centred = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
+    of_camera = np.zeros((len(centred), 6))
+    of_camera[:, 3:] = centred / max(float((centred**2).sum()), MIN_BASELINES_M2)
+    length = of_camera.ravel()  # derivative of the baselines' common length, relative
+    if certainty.scale_with_calibration.shape != length.shape:
+        return 1.0, 0.0
+    variance = float(length @ certainty.calibration_of_independent_errors @ length)
+    covariance = float(length @ certainty.scale_with_calibration)
+    if not (np.isfinite(covariance) and np.isfinite(variance) and variance > 0.0):
+        return 1.0, 0.0
+    return float(np.clip(covariance / variance, 0.0, 1.0)), covariance**2 / variance
 
 
 def take_calibration(mapper: Mapper, other: Mapper) -> None:

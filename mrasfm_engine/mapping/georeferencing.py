@@ -19,7 +19,7 @@ from mrasfm_engine.types import Bools, Floats
 SIGMA_ROLL_RAD = np.radians(2.0)  # a road's cross fall, as far as it does not average out over a drive
 SIGMA_PITCH_RAD = np.radians(5.0)  # a road's grade
 HYPOTHESES = 300
-MAX_AT_ONCE = 200_000  # residuals of hypotheses that are in memory at one time
+MAX_AT_ONCE = 200_000  # positions under hypotheses that are in memory at one time
 LEAST_SCALE_RANGE = 1.25  # of the receiver's trajectory against the rig's, where the baselines are known better
 SCALE_SIGMAS = 2.5
 MIN_CONSENSUS = 0.3  # of the positions
@@ -49,7 +49,7 @@ class GnssAlignment:
     world_from_model: Floats  # (4, 4), rigid
     inlier: Bools  # (n,)
     residual_m: Floats  # (n,) distance after the similarity fit
-    scale: float  # factor on the reconstruction that fits the receiver best: reported, not applied
+    scale: float  # factor on the reconstruction that fits the receiver best; the transform does not apply it
     sigma_scale: float  # its standard deviation, from independent positions with the noise that was seen
     noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
 
@@ -296,7 +296,7 @@ def _best_yaw(
         of_pair = 0.5 * (shift[np.arange(len(h)), first[h]] + shift[np.arange(len(h)), second[h]])
         for t in (np.median(shift, axis=1), of_pair):
             off = np.linalg.norm((t[:, None] - shift) / sigma, axis=2)
-            score = np.maximum(0.0, outlier_sigmas**2 - off**2).sum(1)
+            score = np.nan_to_num(np.maximum(0.0, outlier_sigmas**2 - off**2).sum(1), nan=-1.0)
             winner = int(score.argmax())
             if score[winner] > best_score:
                 best_score, best = float(score[winner]), se3.transform(rotation[winner], t[winner])

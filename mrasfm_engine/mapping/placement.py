@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -43,9 +44,9 @@ USUAL_LOG_SIGMA = np.log(2.0)  # standard deviation of the logarithm of a receiv
 MOST_RESIDUALS, MIN_FOR_LIKELIHOOD = 150, 8
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting an arbitrary scale to the receiver
-# Of the scale's logarithm: beyond, the cost of images is no longer alike in the scale and in its inverse, and its sigma
-# does not say how far off it may be.
-UNKNOWN_SIGMA_SCALE = 0.1
+# Sigma of the scale by images, relative, beyond which it does not bound their error, as the cost is no longer alike in
+# the scale and in its inverse. Of a stereo pair it is a percent or less.
+UNKNOWN_SIGMA_SCALE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +116,8 @@ def place_by_gnss(
         return _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
 
     if (single or sigma_scale > UNKNOWN_SIGMA_SCALE) and len(units) > 1:
-        alignment = _with_scale(mapper, align, _extent(measured[units]) / _extent(mapper.state.unit_position_m[units]))
+        factor = _extent(measured[units]) / _extent(mapper.state.unit_position_m[units])
+        alignment = _with_receivers_scale(mapper, align, factor)
     else:
         alignment = align()
     if isinstance(alignment, str):
@@ -139,17 +141,21 @@ def place_by_gnss(
     return placement
 
 
-def _with_scale(mapper: Mapper, align: Callable[[], GnssAlignment | str], factor: float) -> GnssAlignment | str:
-    """The alignment with the receiver's scale, near a factor, to which the scene is scaled where there is one."""
+def _with_receivers_scale(
+    mapper: Mapper, align: Callable[[], GnssAlignment | str], factor: float
+) -> GnssAlignment | str:
+    """Scale the scene to the receiver, beginning with a factor, and align it; it stays as it is if that fails."""
+    begun = copy.deepcopy(mapper.state)
     scale = scale_with_baselines if mapper.drive.has_single_camera else scale_scene
     scale(mapper, factor)
     alignment = align()
     for _ in range(SCALE_ROUNDS):
-        if isinstance(alignment, str):
-            scale(mapper, 1.0 / factor)
-            break
-        scale(mapper, alignment.scale)
-        factor, alignment = factor * alignment.scale, align()
+        if isinstance(alignment, GnssAlignment):
+            scale(mapper, alignment.scale)
+            factor, alignment = factor * alignment.scale, align()
+    if isinstance(alignment, str):
+        scale(mapper, 1.0 / factor)  # also poses of single images, which are no part of the state,
+        mapper.state = begun  # and without what that rounds
     return alignment
 
 

@@ -22,6 +22,7 @@ from mrasfm_engine.mapping.calibration import (
     calibration_prior,
     hold_baselines,
     resolve_scale,
+    sigma_scale_of_images,
     take_calibration,
 )
 from mrasfm_engine.mapping.georeferencing import BENT
@@ -63,6 +64,7 @@ TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
 ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
 MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
+BEHIND = 0.1  # of an observation's sigma, beyond which a scene that stayed behind its baselines is adjusted
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
 SIGMA_PX_RANGE = (0.1, 2.0)  # below, keypoints are hardly localised; above, most are wrong
 
@@ -130,8 +132,8 @@ def refine(
     absolute = AbsolutePriors() if absolute is None else absolute
     result = Refinement(absolute=absolute)
     absolute.place(mapper)
-    if absolute.positions_are_refused and not mapper.drive.has_single_camera and _reassesses(mapper):
-        absolute.place(mapper, sigma_scale=_settled(mapper, absolute))
+    if absolute.positions_are_refused:
+        _compare_positions_again(mapper, result, cancel)
     placed = result.georeferenced or result.placed_by_rough_poses
     if not placed and mapper.drive.has_single_camera:
         raise ReconstructionError(
@@ -231,23 +233,28 @@ def refine(
     return result
 
 
-def _settled(mapper: Mapper, absolute: AbsolutePriors) -> float:
-    """Adjust by the images and the rig as given; the standard deviation of the scale, relative, that this leaves.
+def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel | None) -> None:
+    """Adjust by the images and the rig as given, and compare positions that were refused with that scene.
 
-    While the scene grows, damping holds up a scale that images hardly tell: positions that are right contradict it.
+    While the scene grows, damping holds up a scale that images hardly observe, and right positions contradict it.
     """
+    settings, absolute = mapper.config.bundle_adjustment, result.absolute
+    if mapper.drive.has_single_camera or not (_reassesses(mapper) and settings.camera_set_adjustment):
+        return
     free_units, options = _free_units(mapper, absolute), _options(mapper, _observation_sigma(mapper))
-    adjust_poses(mapper, free_units, terms=absolute.terms(mapper), options=options)
+    terms = absolute.terms(mapper)
+    result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
     mapper.complete()
+    terms = [calibration_prior(mapper), *terms]
     problem, _ = mapper.problem(
-        free_units,
-        free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-        terms=[calibration_prior(mapper), *absolute.terms(mapper)],
-        options=options,
+        free_units, free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_), terms=terms, options=options
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
-        return 0.0
-    return covariances(problem, problem.state).sigma_scale
+        return
+    sigma_scale = sigma_scale_of_images(mapper, covariances(problem, problem.state))
+    lens = scale_of_given_rotations(mapper, free_units=free_units, free_times=None, terms=terms, options=options)
+    if np.isfinite(sigma_scale):
+        absolute.place(mapper, sigma_scale=float(np.hypot(sigma_scale, 0.0 if lens is None else lens.sigma_scale)))
 
 
 def _adjust(
@@ -369,13 +376,14 @@ def _hold_unobserved(
         result.held_times = result.times.to_hold
     hold_times = result.held_times is not None and (result.held_times.any() or holds_mean_time)
     hold_scale = result.georeferenced and weighed.scale_only_prior
-    if hold_scale:
-        hold_baselines(mapper, result.certainty)
+    behind_px = hold_baselines(mapper, result.certainty) if hold_scale else 0.0
     if weighed.to_hold[result.recalibrated].any() or hold_times:
         result.held = weighed.to_hold
         _adjust(mapper, result, free_units, rough=False, cancel=cancel)
-        if hold_scale:
-            hold_baselines(mapper, result.certainty)
+        behind_px = hold_baselines(mapper, result.certainty) if hold_scale else 0.0
+    if behind_px > BEHIND * result.sigma_px:  # units and points are no longer where the images want them
+        terms, options = result.absolute.terms(mapper), _options(mapper, result.sigma_px)
+        result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
 
 
 def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:
@@ -498,5 +506,6 @@ def _of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
         certainty,
         calibration=calibration,
         calibration_of_independent_errors=prior.without_gauge(certainty.calibration_of_independent_errors),
+        scale_with_calibration=prior.without_gauge(certainty.scale_with_calibration),
         sigma_camera=sigma_camera,
     )

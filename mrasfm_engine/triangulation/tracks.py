@@ -60,14 +60,16 @@ class Keypoints:
         for pair in kept:
             matched[pair.image_a].append(pair.matches[:, 0])
             matched[pair.image_b].append(pair.matches[:, 1])
-        is_matched = [np.bincount(np.concatenate(of_image)) > 0 for of_image in matched]
-        row_of = [np.cumsum(of_image, dtype=np.int32) - 1 for of_image in is_matched]
+        numbers: list[Ints] = []
+        row_of: list[Ints32] = []
+        for of_image in matched:
+            is_matched = np.bincount(np.concatenate(of_image)) > 0
+            numbers.append(np.flatnonzero(is_matched))
+            row_of.append(np.cumsum(is_matched, dtype=np.int32) - np.int32(1))
 
         def numbered_anew(pair: PairMatches) -> PairMatches:
             rows = (row_of[pair.image_a][pair.matches[:, 0]], row_of[pair.image_b][pair.matches[:, 1]])
             return replace(pair, matches=np.stack(rows, axis=1).astype(np.int32, copy=False))
-
-        numbers = [np.flatnonzero(of_image) for of_image in is_matched]
 
         return Keypoints._of_numbers(drive, features, numbers, bands), [numbered_anew(pair) for pair in kept]
 

@@ -11,6 +11,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping.absolute_priors import LOCAL_POSITIONS, AbsolutePriors
+from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
@@ -156,15 +157,47 @@ def test_rough_poses_that_contradict_a_growing_scene_take_no_part_in_it() -> Non
     assert not known.hold_the_frame
 
 
-def test_a_receiver_that_a_scale_on_its_way_contradicts_is_asked_again() -> None:
+def scaled(factor: float) -> tuple[SimulatedDrive, Mapper]:
+    """A drive of a stereo pair whose scene has another size than by its baseline."""
     simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500)
     mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
-    middle = mapper.state.unit_position_m.mean(0)
-    for places_m in (mapper.state.unit_position_m, mapper.state.points_m):
-        places_m[:] = middle + 0.7 * (places_m - middle)
+    scale_scene(mapper, factor)
+    return simulated, mapper
+
+
+def test_positions_that_contradict_the_scale_of_a_growing_scene_are_compared_with_the_adjusted_one() -> None:
+    simulated, mapper = scaled(0.7)
     known = AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M)
     known.place(mapper)
     assert known.positions_are_refused
     assert refine(mapper, known).georeferenced
     scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
-    assert 0.0 < abs(scale - 1.0) < 0.01
+    assert 0.99 < scale < 1.01
+
+
+def test_positions_of_another_scale_than_a_stereo_pairs_stay_refused() -> None:
+    """The pair's baseline is known to 14 %, but images compare it with the scene to a tenth of a percent."""
+    simulated, mapper = scaled(1.0)
+    gnss = received(simulated, 0.05)
+    result = refine(
+        mapper, AbsolutePriors(gnss=replace(gnss, position_m=1.6 * gnss.position_m), antenna_in_rig_m=ARM_M)
+    )
+    assert not result.georeferenced
+    assert result.placement is not None
+    assert "1.6 times as long" in result.placement.reason
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 0.9 < scale < 1.1
+
+
+def test_rough_poses_do_not_say_where_a_scene_is_that_positions_place_afterwards() -> None:
+    simulated, mapper = scaled(0.7)
+    poses = rough_poses(simulated)
+    simulated = with_rough_poses(simulated, poses)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    scale_scene(mapper, 0.7)
+    known = AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M, rough_world_from_rig=poses)
+    result = refine(mapper, known)
+    assert result.georeferenced
+    assert not result.placed_by_rough_poses
+    off_m = np.linalg.norm(mapper.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
+    assert 0.0 < off_m.max() < 0.2

@@ -15,7 +15,9 @@ from mrasfm_engine.mapping.calibration import (
     is_straight,
     resolve_scale,
     scale_of_baselines,
+    scale_scene,
     scale_with_baselines,
+    sigma_scale_of_images,
 )
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import place_by_rough_poses
@@ -57,10 +59,22 @@ def test_the_baselines_tell_by_how_much_they_were_scaled() -> None:
     assert 0.01 < sigma < 0.1  # 5 cm on some metres of baselines
 
 
-def test_baselines_that_are_turned_round_mirror_no_scene() -> None:
+@pytest.mark.parametrize("turn_deg", [30.0, 89.0, 91.0, 180.0])
+def test_baselines_that_images_have_turned_neither_shrink_nor_mirror_a_scene(turn_deg: float) -> None:
     mapper = true_model(cameras=2)
-    mapper.state.camera_position_m[:] = 0.8 * mapper.state.camera_position_m[::-1]
+    camera_m = mapper.state.camera_position_m
+    camera_m[:] = 0.8 * camera_m @ se3.exp_so3([0.0, 0.0, np.radians(turn_deg)]).T
     assert scale_of_baselines(mapper)[0] == pytest.approx(1.25)
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_a_scene_that_is_scaled_without_its_cameras_moves_points_by_their_parallax_alone(factor: float) -> None:
+    mapper = true_model(cameras=2)
+    before = errors_px(mapper)
+    scale_scene(mapper, factor)
+    moved_px = np.abs(errors_px(mapper) - before)
+    # 3 % of half of the baseline of 0.5 m, seen from 15 m; the cameras are 2 m from the rig's origin.
+    assert 0.05 < np.median(moved_px) < 0.35
 
 
 def test_cameras_in_one_place_have_no_scale() -> None:
@@ -206,3 +220,18 @@ def test_held_baselines_take_the_scene_along_as_far_as_positions_leave_its_scale
         assert 0.995 < longer < 1.005
     else:
         assert 1.0 / 1.1 - 0.01 < longer < 1.0 / 1.1 + 0.03
+
+
+def test_images_of_a_stereo_pair_know_the_scale_but_for_its_baseline() -> None:
+    mapper = true_model(cameras=2)
+    problem, _ = mapper.problem(
+        np.arange(UNITS) > 0,
+        free_cameras=np.ones(2, dtype=np.bool_),
+        terms=[calibration_prior(mapper)],
+        options=SolverOptions(sigma_px=0.5),
+    )
+    certainty = covariances(problem, problem.state, shared_errors=False)
+    held, _ = mapper.problem(np.arange(UNITS) > 0, options=SolverOptions(sigma_px=0.5))
+    of_held = covariances(held, held.state).sigma_scale
+    assert certainty.sigma_scale > 0.1
+    assert of_held < sigma_scale_of_images(mapper, certainty) < 0.03
