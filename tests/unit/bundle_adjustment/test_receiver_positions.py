@@ -178,3 +178,20 @@ def test_clusters_of_samples_share_what_knots_leave_out() -> None:
     columns[:, 0, 0] = between
     exact = 1.0 / (between @ np.linalg.solve(covariance, between))
     assert 0.97 < (1.0 / float(term.information(columns)[0, 0])) / exact < 30.0
+
+
+@pytest.mark.parametrize("knots", [1, 5, UNITS])
+def test_the_best_states_solve_the_system_of_their_weights(knots: int) -> None:
+    rng = np.random.default_rng(7)
+    state = moving(rng)
+    term = received(state, rng, knots_s=np.linspace(0.0, 2.0 * (UNITS - 1), knots), loss_scale=2.0)
+    whitened = term._whitened(state)[1]
+    states, residuals, weights = term._best(whitened)
+    assert 0.0 < weights.min() < 0.9
+    np.testing.assert_allclose(residuals, whitened - term._at_samples(states), atol=1e-12)
+    np.testing.assert_allclose(weights, 1.0 / (1.0 + (residuals**2).sum(1) / 4.0), atol=1e-6)
+    for axis in range(3):
+        off, diagonal = term._by_knots(weights, axis)
+        matrix = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
+        right = term._at_knots((weights * whitened[:, axis])[:, None], axis)[:, 0]
+        np.testing.assert_allclose(matrix @ states[:, axis], right, rtol=1e-5, atol=1e-5)
