@@ -252,9 +252,10 @@ def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel 
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return
     sigma_scale = sigma_scale_of_images(mapper, covariances(problem, problem.state))
+    if not np.isfinite(sigma_scale):
+        return
     lens = scale_of_given_rotations(mapper, free_units=free_units, free_times=None, terms=terms, options=options)
-    if np.isfinite(sigma_scale):
-        absolute.place(mapper, sigma_scale=float(np.hypot(sigma_scale, 0.0 if lens is None else lens.sigma_scale)))
+    absolute.place(mapper, sigma_scale=float(np.hypot(sigma_scale, 0.0 if lens is None else lens.sigma_scale)))
 
 
 def _adjust(
