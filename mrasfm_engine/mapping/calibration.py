@@ -163,9 +163,9 @@ def sigma_scale_of_images(mapper: Mapper, certainty: Covariances) -> float:
 
 
 def _share_of_baselines(mapper: Mapper, certainty: Covariances) -> tuple[float, float]:
-    """By how much the scene's scale follows that of the baselines, 0 to 1, and the variance of it that this explains.
+    """Share of a change of the baselines that the scene's scale follows, and the variance of it that this explains.
 
-    One and nothing where the covariance does not say it.
+    One and zero where the covariance does not say it.
     """
     centred = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
     of_camera = np.zeros((len(centred), 6))
