@@ -160,11 +160,8 @@ class ReceiverPositions:
 
     def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats]:
         """The states (k, 3) that cost least, residuals (n, 3) and robust weights (n,) with them."""
-        states, residuals, weights = (
-            np.zeros((len(self.knots_s), AXES)),
-            np.empty_like(whitened),
-            np.ones(len(whitened)),
-        )
+        states = np.empty((len(self.knots_s), AXES))
+        residuals, weights = np.empty_like(whitened), np.ones(len(whitened))
         _find_best_states(
             whitened, self._gain, *self._places, self._precision, self.loss_scale, states, residuals, weights
         )

@@ -109,14 +109,13 @@ def median_depth_m(mapper: Mapper) -> float:
 def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
     """Factor by which the baselines would have to grow to be as given, and its standard deviation by their prior."""
     prior = calibration_prior(mapper)
-    given = prior.position_m - prior.position_m.mean(0)
-    current = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
-    information = float(((given**2).sum(1) / prior.sigma_translation_m**2).sum())
-    lengths2 = float((current**2).sum()), float((given**2).sum())
-    if min(lengths2) < MIN_BASELINES_M2:
+    given, current = _about_their_mean(prior.position_m), _about_their_mean(mapper.state.camera_position_m)
+    lengths_m = np.linalg.norm(current), np.linalg.norm(given)
+    if min(lengths_m) ** 2 < MIN_BASELINES_M2:
         return 1.0, np.inf  # cameras in one place have no scale
+    information = ((given**2).sum(1) / prior.sigma_translation_m**2).sum()
     # Lengths alone: the images may have turned the baselines, and no turn shrinks or mirrors a scene.
-    return float(np.sqrt(lengths2[1] / lengths2[0])), 1.0 / float(np.sqrt(information))
+    return float(lengths_m[1] / lengths_m[0]), float(1.0 / np.sqrt(information))
 
 
 def scale_with_baselines(mapper: Mapper, factor: float) -> None:
@@ -124,16 +123,15 @@ def scale_with_baselines(mapper: Mapper, factor: float) -> None:
 
     The cameras' mean place in the rig is kept, as the gauge holds it; the units move instead.
     """
-    camera_position_m = _scaled_places(mapper, factor)[1]
     scale_scene(mapper, factor)
-    mapper.state.camera_position_m[:] = camera_position_m
+    mapper.state.camera_position_m[:] = _scaled_cameras(mapper, factor)
 
 
 def scale_scene(mapper: Mapper, factor: float) -> None:
     """Scale units and points as `scale_with_baselines` does, and leave the cameras where they are in the rig."""
     state = mapper.state
     centre, mean = state.unit_position_m[mapper.registered].mean(0), state.camera_position_m.mean(0)
-    unit_position_m = _scaled_places(mapper, factor)[0]
+    unit_position_m = _scaled_units(mapper, factor)
     state.points_m[:] = centre + factor * (state.points_m - centre)
     mapper.motion.scale(state, factor, mean)
     state.unit_position_m[:] = unit_position_m
@@ -150,8 +148,8 @@ def hold_baselines(mapper: Mapper, certainty: Covariances) -> float:
     back = factor ** (follows - 1.0)
     scale_with_baselines(mapper, factor)
     scale_scene(mapper, back)
-    centred_m = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
-    away_m = abs(back - 1.0) * float(np.linalg.norm(centred_m, axis=1).max())
+    from_mean_m = np.linalg.norm(_about_their_mean(mapper.state.camera_position_m), axis=1)
+    away_m = abs(back - 1.0) * float(from_mean_m.max())
     focal_px = float(mapper.state.camera_params[:, :2].mean())
     return float(away_m * focal_px / max(median_depth_m(mapper), 1e-9))
 
@@ -167,7 +165,7 @@ def _share_of_baselines(mapper: Mapper, certainty: Covariances) -> tuple[float, 
 
     One and zero where the covariance does not say it.
     """
-    centred = mapper.state.camera_position_m - mapper.state.camera_position_m.mean(0)
+    centred = _about_their_mean(mapper.state.camera_position_m)
     of_camera = np.zeros((len(centred), 6))
     of_camera[:, 3:] = centred / max(float((centred**2).sum()), MIN_BASELINES_M2)
     length = of_camera.ravel()  # derivative of the baselines' common length, relative
@@ -182,7 +180,7 @@ def _share_of_baselines(mapper: Mapper, certainty: Covariances) -> tuple[float, 
 
 def take_calibration(mapper: Mapper, other: Mapper) -> None:
     """Give the mapper's cameras the calibration of another scene of the drive; units and points follow its scale."""
-    lengths_m = [np.linalg.norm(m.state.camera_position_m - m.state.camera_position_m.mean(0)) for m in (mapper, other)]
+    lengths_m = [np.linalg.norm(_about_their_mean(m.state.camera_position_m)) for m in (mapper, other)]
     if min(lengths_m) ** 2 >= MIN_BASELINES_M2:
         scale_with_baselines(mapper, float(lengths_m[1] / lengths_m[0]))
     mapper.state = mapper.state.with_cameras_of(other.state)
@@ -197,8 +195,9 @@ def resolve_scale(mapper: Mapper, terms: Sequence[Term]) -> None:
     """
 
     def cost(log_factor: float) -> float:
-        unit_position_m, camera_position_m = _scaled_places(mapper, float(np.exp(log_factor)))
-        state = replace(mapper.state, unit_position_m=unit_position_m, camera_position_m=camera_position_m)
+        factor = float(np.exp(log_factor))
+        units_m, cameras_m = _scaled_units(mapper, factor), _scaled_cameras(mapper, factor)
+        state = replace(mapper.state, unit_position_m=units_m, camera_position_m=cameras_m)
         return sum(term.cost(state) for term in terms)
 
     found = minimize_scalar(cost, bounds=(-SCALE_RANGE, SCALE_RANGE), method="bounded", options={"xatol": 1e-6})
@@ -206,12 +205,23 @@ def resolve_scale(mapper: Mapper, terms: Sequence[Term]) -> None:
         scale_with_baselines(mapper, float(np.exp(found.x)))
 
 
-def _scaled_places(mapper: Mapper, factor: float) -> tuple[Floats, Floats]:
-    """Positions of units (u, 3) in the world and of cameras (c, 3) in the rig, scaled about their middle."""
+def _scaled_units(mapper: Mapper, factor: float) -> Floats:
+    """Positions (u, 3) of units, scaled so that the cameras' mean place in each is scaled about the units' middle."""
     state = mapper.state
     centre = state.unit_position_m[mapper.registered].mean(0)
-    mean = state.camera_position_m.mean(0)
     # Scaled about the rig's origin the cameras' mean would move by this.
-    moved = (factor - 1.0) * mean
-    units = centre + factor * (state.unit_position_m - centre) + state.unit_rotation @ moved
-    return units, mean + factor * (state.camera_position_m - mean)
+    moved = (factor - 1.0) * state.camera_position_m.mean(0)
+    result: Floats = centre + factor * (state.unit_position_m - centre) + state.unit_rotation @ moved
+    return result
+
+
+def _scaled_cameras(mapper: Mapper, factor: float) -> Floats:
+    """Positions (c, 3) of cameras in the rig, scaled about their mean."""
+    position_m = mapper.state.camera_position_m
+    result: Floats = position_m.mean(0) + factor * _about_their_mean(position_m)
+    return result
+
+
+def _about_their_mean(position_m: Floats) -> Floats:
+    result: Floats = position_m - position_m.mean(0)
+    return result

@@ -14,6 +14,7 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
+from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.simultaneous import calibration_sigmas
 from mrasfm_engine.types import Floats, Ints
@@ -22,6 +23,8 @@ MISSED = 0.01  # share of right image points that a gate takes for wrong
 TURN_RAD = 0.15  # of viewing rays, between units that see a point: a step of some metres past points 10 to 20 m away
 CHANCE_SHARE = 0.01  # of the inliers that a pose must have, those that any pose has by chance at most
 LIMIT_SIGMAS = math.sqrt(chdtri(2, MISSED))
+SIGMA_PX_RANGE = (0.1, 2.0)  # below, keypoints are hardly localised; above, most are wrong
+MIN_REDUNDANCY = 0.1  # of an observation's two numbers, the share that its point leaves
 
 
 def widest_gates_px(mapper: Mapper) -> Floats:
@@ -53,6 +56,22 @@ def gates_px(mapper: Mapper, errors_px: Floats, camera: Ints) -> Floats:
     narrowed = LIMIT_SIGMAS * robust_sigma(relative[near]) * widest
     result: Floats = np.clip(narrowed, observation_gate_px(mapper), widest)
     return result
+
+
+def observation_sigma_px(mapper: Mapper) -> float:
+    """Standard deviation of an image coordinate, from the median error and the redundancy of the points."""
+    rows = np.flatnonzero(mapper.is_inlier)
+    if not len(rows):
+        raise ReconstructionError(
+            "no point of the scene is left after filtering",
+            remedy="Check the cameras' intrinsics, and that the images belong to them.",
+            code="nothing-left",
+        )
+    tracks = mapper.tracks.of_keypoint[rows]
+    errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, tracks)
+    points = np.count_nonzero(np.bincount(tracks))
+    redundancy = max(MIN_REDUNDANCY, 1.0 - 3.0 * points / (2.0 * len(rows)))
+    return float(np.clip(robust_sigma(errors) / math.sqrt(redundancy), *SIGMA_PX_RANGE))
 
 
 def robust_sigma(errors: Floats) -> float:

@@ -27,6 +27,7 @@ from mrasfm_engine.mapping.calibration import (
 )
 from mrasfm_engine.mapping.georeferencing import BENT
 from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
+from mrasfm_engine.mapping.inlier_gates import observation_sigma_px
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
@@ -66,7 +67,6 @@ ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations cha
 MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 BEHIND = 0.1  # of an observation's sigma, beyond which a scene that stayed behind its baselines is adjusted
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
-SIGMA_PX_RANGE = (0.1, 2.0)  # below, keypoints are hardly localised; above, most are wrong
 
 
 @dataclass(kw_only=True)
@@ -147,7 +147,7 @@ def refine(
         mapper.complete()
     free_units = _free_units(mapper, absolute)
     result.moving = drop_moving(mapper)
-    result.sigma_px = _observation_sigma(mapper)
+    result.sigma_px = observation_sigma_px(mapper)
     if calibrated is not None:
         result.calibration = CalibrationDecision(False, OF_THE_LARGEST)
     else:
@@ -186,7 +186,7 @@ def refine(
     steady = _unbend(mapper, result, free_units, cancel)
     done, is_last = 0, False
     while not is_last:
-        result.sigma_px = _observation_sigma(mapper)
+        result.sigma_px = observation_sigma_px(mapper)
         is_last = done == MAX_ROUNDS - 1 or (done >= ROUNDS - 1 and steady)
         _adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
         steady = _reassess(mapper, result)
@@ -241,7 +241,7 @@ def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel 
     settings, absolute = mapper.config.bundle_adjustment, result.absolute
     if mapper.drive.has_single_camera or not (_reassesses(mapper) and settings.camera_set_adjustment):
         return
-    free_units, options = _free_units(mapper, absolute), _options(mapper, _observation_sigma(mapper))
+    free_units, options = _free_units(mapper, absolute), _options(mapper, observation_sigma_px(mapper))
     terms = absolute.terms(mapper)
     result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
     mapper.complete()
@@ -412,24 +412,6 @@ def _free_units(mapper: Mapper, absolute: AbsolutePriors) -> Bools:
     if not (absolute.hold_the_frame and mapper.config.bundle_adjustment.priors):
         free[np.flatnonzero(free)[0]] = False
     return free
-
-
-def _observation_sigma(mapper: Mapper) -> float:
-    """Standard deviation of an image coordinate, from the median error and the redundancy of the points."""
-    rows = np.flatnonzero(mapper.is_inlier)
-    if not len(rows):
-        raise ReconstructionError(
-            "no point of the scene is left after filtering",
-            remedy="Check the cameras' intrinsics, and that the images belong to them.",
-            code="nothing-left",
-        )
-    tracks = mapper.tracks.of_keypoint[rows]
-    errors = mapper.triangulator.errors_px(mapper.state, rows, mapper.state.points_m, tracks)
-    points = np.count_nonzero(np.bincount(tracks))
-    redundancy = max(0.1, 1.0 - 3.0 * points / (2.0 * len(rows)))
-    # The squared length of a 2D normal error has the median 2 ln 2 sigma^2.
-    sigma = float(np.sqrt(np.median(errors**2) / (2 * np.log(2)) / redundancy))
-    return float(np.clip(sigma, *SIGMA_PX_RANGE))
 
 
 def _terms(mapper: Mapper, result: Refinement) -> list[Term]:

@@ -157,16 +157,20 @@ def test_rough_poses_that_contradict_a_growing_scene_take_no_part_in_it() -> Non
     assert not known.hold_the_frame
 
 
-def scaled(factor: float) -> tuple[SimulatedDrive, Mapper]:
-    """A drive of a stereo pair whose scene has another size than by its baseline."""
-    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500)
+def stereo_drive() -> SimulatedDrive:
+    return make_simulated_drive(units=UNITS, cameras=2, points=1500)
+
+
+def scaled(simulated: SimulatedDrive, factor: float) -> Mapper:
+    """The drive's true scene in another size than by its baseline."""
     mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
     scale_scene(mapper, factor)
-    return simulated, mapper
+    return mapper
 
 
 def test_positions_that_contradict_the_scale_of_a_growing_scene_are_compared_with_the_adjusted_one() -> None:
-    simulated, mapper = scaled(0.7)
+    simulated = stereo_drive()
+    mapper = scaled(simulated, 0.7)
     known = AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M)
     known.place(mapper)
     assert known.positions_are_refused
@@ -177,7 +181,8 @@ def test_positions_that_contradict_the_scale_of_a_growing_scene_are_compared_wit
 
 def test_positions_of_another_scale_than_a_stereo_pairs_stay_refused() -> None:
     """The pair's baseline is known to 14 %, but images compare it with the scene to a tenth of a percent."""
-    simulated, mapper = scaled(1.0)
+    simulated = stereo_drive()
+    mapper = scaled(simulated, 1.0)
     gnss = received(simulated, 0.05)
     result = refine(
         mapper, AbsolutePriors(gnss=replace(gnss, position_m=1.6 * gnss.position_m), antenna_in_rig_m=ARM_M)
@@ -190,11 +195,10 @@ def test_positions_of_another_scale_than_a_stereo_pairs_stay_refused() -> None:
 
 
 def test_rough_poses_do_not_say_where_a_scene_is_that_positions_place_afterwards() -> None:
-    simulated, mapper = scaled(0.7)
+    simulated = stereo_drive()
     poses = rough_poses(simulated)
     simulated = with_rough_poses(simulated, poses)
-    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
-    scale_scene(mapper, 0.7)
+    mapper = scaled(simulated, 0.7)
     known = AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M, rough_world_from_rig=poses)
     result = refine(mapper, known)
     assert result.georeferenced
