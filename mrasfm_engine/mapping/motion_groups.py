@@ -3,8 +3,10 @@
 A rigid object that moves has many keypoints side by side, and one velocity explains them all. Whether a track moves is
 decided for all tracks together [mean field of an Ising model]: by its own evidence, or by that for the velocity that
 its moving neighbours share, and by what its neighbours are. Given that velocity, a track pays no Occam factor for one
-of its own [Savage-Dickey]. So velocities along the own motion count as well, of which a track alone reveals nothing. A
-track among moving ones may also be a mixture of wrong matches, as objects that move and look alike make them.
+of its own [Savage-Dickey], unless it is one that what stands seems to have as well. So velocities along the own motion
+count, too, of which a track alone reveals nothing. A track whose own velocity is known, and another, is no part of what
+its neighbours are; one among moving ones may also be a mixture of wrong matches, as objects that move and look alike
+make them.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from mrasfm_engine.triangulation.track_motion import SPEED_M_S, TrackMotion
+from mrasfm_engine.triangulation.track_motion import DRIFT_M_S, SPEED_M_S, TrackMotion
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.types import Floats, Ints
 
@@ -29,6 +31,7 @@ BOND = 1.0  # log odds that a neighbour adds that moves,
 BOND_TO_STANDING = 0.5  # and takes that stands: a thing's outline has both on its sides
 SLACK_M_S = 0.5  # by which velocities of one thing differ
 MIXED = 8.0  # cost of an observation, if matches are mixed: as a residual of five standard deviations has it
+OTHER_VELOCITY = 11.8  # squared distance of two velocities, as improbable as three standard deviations of one number
 ROUNDS = 10
 ALONE, SHARED, MIXTURE, BESIDE = 1, 2, 3, 4  # why a track is taken to move
 
@@ -45,6 +48,8 @@ class MotionGroups:
 
 def group(
     motion: TrackMotion,
+    suspects: Ints,
+    known: Floats,
     keypoints: Keypoints,
     tracks: Tracks,
     focal_px: Floats,
@@ -56,12 +61,14 @@ def group(
     ----------
     motion
         Of all tracks; those without evidence stand, but for those that `weigh` gives some.
+    suspects, known
+        Tracks (m,) that may move, and log odds (n,) for that by something else than their own observations; zero where
+        nothing is known. Of the others, the suspects' neighbours are decided.
     focal_px
         Of every camera (c,).
     weigh
         Completes `motion` for tracks.
     """
-    suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
     beside = _neighbours(suspects, motion, keypoints, tracks, focal_px)
     others = np.setdiff1d(beside[beside >= 0], suspects)
     weigh(others[np.isnan(motion.log_evidence[others])])
@@ -71,15 +78,19 @@ def group(
     place[nodes] = np.arange(len(nodes))
     # A neighbour that is no node stands: it is beside no suspect.
     linked = np.where(edges >= 0, place[edges], -2)
-    evidence = np.nan_to_num(motion.log_evidence[nodes], nan=-MOST_EVIDENCE)
+    is_known, is_weighed = known[nodes] > 0.0, np.isfinite(motion.log_evidence[nodes])
+    evidence = np.where(is_known, 0.0, -MOST_EVIDENCE)
+    evidence[is_weighed] = motion.log_evidence[nodes[is_weighed]]
+    covariance = np.tile([SPEED_M_S**2, 0.0, SPEED_M_S**2], (len(nodes), 1))
+    covariance[is_weighed] = motion.covariance[nodes[is_weighed]]
     score, reason = np.empty(len(nodes)), np.empty(len(nodes), dtype=np.int64)
     _mean_field(
-        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], motion.covariance[nodes],
+        linked, evidence + known[nodes], motion.log_prior[nodes], motion.velocity_m_s[nodes], covariance,
         motion.observations[nodes] * (motion.misfit[nodes] - MIXED), score, reason,
     )  # fmt: skip
     order = np.argsort(nodes)
     # What was not weighed, with too few observations, is not known to move.
-    order = order[(score[order] > 0.0) & np.isfinite(motion.log_evidence[nodes[order]])]
+    order = order[(score[order] > 0.0) & (is_known | is_weighed)[order]]
     return MotionGroups(tracks=nodes[order], reason=reason[order])
 
 
@@ -116,6 +127,19 @@ def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_key
                 count = min(count + 1, len(distance))
             if count == len(distance):
                 limit = distance[count - 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _moving_against_standing(v0: float, v1: float, i0: float, i1: float, i2: float) -> float:
+    """Logarithm of how much likelier a velocity of information i0, i1, i2 is on what moves than on what stands."""
+    det = i0 * i2 - i1 * i1
+    xx, xy, yy = i2 / det, -i1 / det, i0 / det
+    result = 0.0
+    for sign, spread2 in ((1.0, SPEED_M_S**2), (-1.0, DRIFT_M_S**2)):
+        x, y = xx + spread2, yy + spread2
+        det = x * y - xy * xy
+        result -= 0.5 * sign * ((y * v0 * v0 - 2.0 * xy * v0 * v1 + x * v1 * v1) / det + math.log(det))
+    return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -167,10 +191,13 @@ def _mean_field(
                 away = (yy * d0 * d0 - 2.0 * xy * d0 * d1 + xx * d1 * d1) / det
                 speed = (common0 * common0 + common1 * common1) / speed2
                 shared = evidence[n] + 0.5 * (speed - away - math.log(det / (speed2 * speed2)))
+                shared += min(_moving_against_standing(common0, common1, i0, i1, i2), 0.0)
                 if shared > best:
                     best, why = shared, SHARED
                 if 0.5 * mixed[n] > best:
                     best, why = 0.5 * mixed[n], MIXTURE
+                if why == ALONE and away > OTHER_VELOCITY:
+                    bonds = min(bonds, 0.0)  # it is no part of what its neighbours are
             # Evidence against is not bounded: no neighbours outweigh what is sure to stand.
             score[n] = min(best, MOST_EVIDENCE) + prior[n] - PRIOR + bonds
             reason[n] = why if best + prior[n] > PRIOR else BESIDE

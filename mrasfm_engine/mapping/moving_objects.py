@@ -60,13 +60,23 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
         )  # fmt: skip
 
     weigh(np.flatnonzero(may_move), only_unsure=True)
-    found = group(motion, mapper.keypoints, mapper.tracks, mapper.state.camera_params[:, :2].mean(1), weigh)
+    focal_px = mapper.state.camera_params[:, :2].mean(1)
+    suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
+    known = np.zeros(len(mapper.tracks))
+    found = group(motion, suspects, known, mapper.keypoints, mapper.tracks, focal_px, weigh)
     moves = np.zeros(len(mapper.tracks), dtype=np.bool_)
     moves[found.tracks] = may_move[found.tracks]
+    in_one_unit, log_odds = moving_in_single_units(mapper, moves, path)
+    known[in_one_unit] = np.where(may_move[in_one_unit], log_odds, 0.0)
+    if known.any():
+        # They say something of their neighbours: those on the same thing that hardly tell by themselves.
+        suspects = np.union1d(suspects, np.flatnonzero(known))
+        found = group(motion, suspects, known, mapper.keypoints, mapper.tracks, focal_px, weigh)
+        moves = known > 0.0
+        moves[found.tracks] = may_move[found.tracks]
     reasons = np.full(len(mapper.tracks), IN_ONE_UNIT)
     reasons[found.tracks] = found.reason
-    in_one_unit = moving_in_single_units(mapper, moves, path)
-    moves[in_one_unit] = may_move[in_one_unit]
+    reasons[known > 0.0] = IN_ONE_UNIT
     tracks = np.flatnonzero(moves)
     points = int(mapper.triangulated[tracks].sum())
     mapper.drop(tracks)

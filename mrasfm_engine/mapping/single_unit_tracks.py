@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import betaln
+from scipy.special import betaln, expit, logit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project_points
@@ -28,7 +28,10 @@ from mrasfm_engine.types import Bools, Floats, Ints
 NEIGHBOURS = 12
 REACH_M = 1.2  # to neighbours: half of a car
 MOVING = (1.0, 4.0)  # Beta distribution of the share on things that move: some wrong points look as if they went on
-PRIOR = np.log(0.05 / 0.95)  # log odds: of the tracks that one unit alone observes, one in twenty
+# Of the tracks that one unit alone observes, one in twenty moves, as far as the drive does not tell: Beta distribution.
+SHARE_THAT_MOVES = (1.0, 19.0)
+SHARE_STEPS = 30  # of expectation and maximisation
+SHARE_SETTLED = 1e-4
 LEAST_ROWS = 30  # whose shares tell what stands looks like
 CORRELATION = (0.01, 0.9)  # of points in one neighbourhood
 
@@ -43,23 +46,38 @@ class _Shares:
     going_on: Ints  # (n,) of the neighbours, those that other units observe as well
 
 
-def moving_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> Ints:
-    """Tracks with points that one unit alone observes, and that move by what their neighbourhood shows.
+def moving_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[Ints, Floats]:
+    """Tracks (n,) with points that one unit alone observes, and that move by what their neighbourhood shows.
 
-    `moves` (tracks,) are known to move, and are no neighbours.
+    The second result are the log odds (n,) for that. `moves` (tracks,) are known to move, and are no neighbours.
     """
     shares, single = _neighbourhoods(mapper, moves)
     if len(shares.track) < LEAST_ROWS or not (shares.neighbours > 1).any():
-        return np.zeros(0, dtype=np.int64)
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
     stands = _distribution(shares)
     asked = np.flatnonzero(single[shares.track] & (shares.neighbours > 0))
+    points_m = mapper.state.points_m[shares.track[asked]]
+    asked = asked[_off_the_ground(points_m, path) & _seen_by_next(mapper, points_m, shares.unit[asked])]
     # The track itself is one more of the neighbourhood that does not go on.
     count, going_on = shares.neighbours[asked] + 1, shares.going_on[asked]
     gain = _log_likelihood(going_on, count, *MOVING) - _log_likelihood(going_on, count, *stands)
-    asked = asked[gain + PRIOR > 0.0]
-    track = shares.track[asked]
-    points_m = mapper.state.points_m[track]
-    return np.unique(track[_off_the_ground(points_m, path) & _seen_by_next(mapper, points_m, shares.unit[asked])])
+    log_odds = gain + log_odds_of_moving(gain)
+    return shares.track[asked[log_odds > 0.0]], log_odds[log_odds > 0.0]
+
+
+def log_odds_of_moving(gain: Floats) -> float:
+    """Log odds for one of the tracks to move, by what all of their log likelihood ratios (n,) say together.
+
+    A street with traffic beside the vehicle has many, most drives have none [expectation maximisation].
+    """
+    moving, standing = SHARE_THAT_MOVES
+    share = moving / (moving + standing)
+    for _ in range(SHARE_STEPS):
+        before, beliefs = share, expit(gain + logit(share))
+        share = float((moving + beliefs.sum()) / (moving + standing + len(gain)))
+        if abs(share - before) < SHARE_SETTLED:
+            break
+    return float(logit(share))
 
 
 def _off_the_ground(points_m: Floats, path: GroundPath) -> Bools:

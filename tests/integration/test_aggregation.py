@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three drives, the second 3 m ahead of the first in the same lane, with their scenes in `scenes/`."""
     folder = tmp_path_factory.mktemp("aggregation") / "street"
-    synth(folder, "--drives", 3, "--cameras", 4, "--units", UNITS, "--seed", 4, "--no-masks")
+    synth(folder, "--drives", 3, "--cameras", 4, "--units", UNITS, "--seed", 4, "--no-masks", "--tight")
     for k in range(3):
         assert main(["reconstruct", str(folder / f"drive_{k}"), "--out", str(folder / "scenes" / f"drive_{k}")]) == 0
     return folder
@@ -52,7 +52,7 @@ def test_accuracy_and_files(street: Path, two: Path, mrasfm: Run) -> None:
     assert 0 < seam["rotation_deg"] < 0.1
     assert seam["coarse"]["translation_m"] > 2 * seam["translation_m"]
     expected = {"model", "points.ply", "poses.tum", "poses.json", "calibration", "frame.json", "map.json", "pictures"}
-    expected |= {"points.copc.laz", "trajectory.gpkg", "rigs", "autoware"}
+    expected |= {"points.copc.laz", "trajectory.gpkg", "rigs", "autoware", "view.json", "report.html"}
     assert {p.name for p in two.iterdir()} == {*expected, "scenes", "seams", "report.json", ".stages"}
     assert {p.name for p in (two / "pictures").iterdir()} == {
         f"seam-drive_0~drive_1-{when}.png" for when in ("before", "after")
@@ -108,7 +108,7 @@ def test_what_cannot_be_in_a_map(street: Path, two: Path, tmp_path: Path, mrasfm
 
     out = ("--out", tmp_path / "out")
     other = street / "scenes" / "drive_2"
-    assert "needs 2 scenes" in refused(scene, *out)
+    assert "needs 2 drives" in refused(scene, *out)
     assert "called 'drive_0'" in refused(scene, scene, *out)
     assert "of the same drive" in refused(scene, f"again={scene}", *out)
     assert "does not exist" in refused(scene, tmp_path / "nowhere", *out)
@@ -117,18 +117,25 @@ def test_what_cannot_be_in_a_map(street: Path, two: Path, tmp_path: Path, mrasfm
     assert "has a scene called drive_0 already" in refused("--into", two, scene)
     assert "not in the map" in refused("--into", two, "--remove", "nobody")
     assert "twice" in refused("--into", two, "--remove", "drive_1", "--remove", "drive_1")
-    assert "needs 2 scenes" in refused("--into", two, "--remove", "drive_1")
+    assert "needs 2 drives" in refused("--into", two, "--remove", "drive_1")
     for file, change, said in (
         ("frame.json", {"version": 7}, "is of version 7"),
-        ("frame.json", {"georeferenced": False}, "is not georeferenced"),
         ("poses.json", {"units": []}, "is damaged"),
     ):
-        copy = tmp_path / "copy"
-        shutil.copytree(other, copy, ignore=shutil.ignore_patterns(".stages", "pictures"))
-        document = json.loads((copy / file).read_text()) | change
-        (copy / file).write_text(json.dumps(document))
+        copy = changed_copy(other, tmp_path / "copy", file, change)
         assert said in refused(scene, copy, *out)
         shutil.rmtree(copy)
+    # One scene that is georeferenced would place the other.
+    unplaced = [changed_copy(of, tmp_path / of.name, "frame.json", {"georeferenced": False}) for of in (scene, other)]
+    assert "is not georeferenced" in refused(*unplaced, *out)
     shutil.copytree(other, copy, ignore=shutil.ignore_patterns(".stages", "pictures", "manifest.json"))
     assert "earlier version" in refused(scene, copy, *out)
     assert not (tmp_path / "out").exists() or not (tmp_path / "out" / "report.json").exists()
+
+
+def changed_copy(scene: Path, copy: Path, file: str, change: dict[str, object]) -> Path:
+    """A copy of a scene of which one file says something else."""
+    shutil.copytree(scene, copy, ignore=shutil.ignore_patterns(".stages", "pictures"))
+    document = json.loads((copy / file).read_text()) | change
+    (copy / file).write_text(json.dumps(document))
+    return copy

@@ -8,7 +8,7 @@ import numpy as np
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.moving_objects import IN_ONE_UNIT, drop_moving
-from mrasfm_engine.mapping.single_unit_tracks import moving_in_single_units
+from mrasfm_engine.mapping.single_unit_tracks import SHARE_THAT_MOVES, log_odds_of_moving, moving_in_single_units
 from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
@@ -43,7 +43,7 @@ def mapped(simulated: SimulatedDrive, only_within_units: Callable[[np.ndarray], 
 
 
 def found_in(mapper: Mapper) -> np.ndarray:
-    return moving_in_single_units(mapper, np.zeros(len(mapper.tracks), np.bool_), ground_path(mapper))
+    return moving_in_single_units(mapper, np.zeros(len(mapper.tracks), np.bool_), ground_path(mapper))[0]
 
 
 def on_car(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
@@ -63,6 +63,22 @@ def test_points_of_a_car_that_two_cameras_see_at_one_instant_go() -> None:
     assert (mapper.triangulated & car).sum() <= 0.1 * (before & car).sum()
     assert (before & ~mapper.triangulated & ~shows_car).sum() <= 0.02 * (before & ~shows_car).sum()
     assert IN_ONE_UNIT in found.reason
+
+
+def test_the_share_that_moves_is_told_by_all_of_them() -> None:
+    """Log likelihood ratios of which none, one in three or nearly all speak for a motion, and of no track at all."""
+    rng = np.random.default_rng(5)
+    standing, moving = rng.normal(-2.0, 1.0, 300), rng.normal(3.0, 1.0, 300)
+
+    def share_found(log_ratios: np.ndarray) -> float:
+        return float(1.0 / (1.0 + np.exp(-log_odds_of_moving(log_ratios))))
+
+    for share in (0.3, 0.9):
+        mixed = np.concatenate([moving[: round(300 * share)], standing[: round(300 * (1.0 - share))]])
+        assert abs(share_found(mixed) - share) < 0.05
+    assert share_found(standing) < 0.01
+    moving_of_prior, standing_of_prior = SHARE_THAT_MOVES
+    assert np.isclose(share_found(np.zeros(0)), moving_of_prior / (moving_of_prior + standing_of_prior))
 
 
 def test_points_of_a_parked_car_stay_as_other_units_see_it_too() -> None:
