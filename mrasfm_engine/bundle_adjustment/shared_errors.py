@@ -21,6 +21,7 @@ its images share.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
@@ -28,7 +29,8 @@ from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats
 
-MIN_UNITS = 10  # beyond those that units and cameras absorb: fewer tell no covariance
+MIN_UNITS = 3  # fewer tell no covariance
+SIGMAS = 3.0  # of few units they are as improbable as of many
 LEVELS = 10  # rounds, in which directions that stood out no longer do
 SINGULAR = 1e-9  # eigenvalues of a correlation below this are rounding
 POINT_GROUPS = 4096  # points that share nothing add up to as much as one by one; so many tell a variance to 2 %
@@ -67,6 +69,7 @@ def _widened(covariance: Floats, scores: Floats) -> Floats:
     Few units scatter far in some directions although they share nothing: the eigenvalues of their covariance over the
     true one reach (1 + sqrt(k / n))^2 [Marchenko and Pastur, Mathematics of the USSR-Sbornik 1967]. One that stands out
     is l (1 + k / n / (l - 1)), where l is the true one [Baik and Silverstein, Journal of Multivariate Analysis 2006].
+    What n units tell of a direction alone, errors exceed as Student's distribution exceeds the normal one.
     """
     count, ratio = len(scores), scores.shape[1] / len(scores)
     sigma = np.sqrt(np.diagonal(covariance))
@@ -82,6 +85,7 @@ def _widened(covariance: Floats, scores: Floats) -> Floats:
     found = found / level
     half = np.maximum(found + 1.0 - ratio, 0.0) / 2.0
     own = np.where(found > edge, half + np.sqrt(np.maximum(half**2 - found, 0.0)), 1.0)
+    own[found > edge] *= (stdtrit(count - 1, ndtr(SIGMAS)) / SIGMAS) ** 2
     spread = root @ directions * np.sqrt(level * own)
     result: Floats = spread @ spread.T
     return result

@@ -10,7 +10,6 @@ from scipy.optimize import minimize_scalar
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
-from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.simultaneous import calibration_sigmas
@@ -18,6 +17,7 @@ from mrasfm_engine.types import Bools, Floats
 
 STRAIGHT = "held as given: without GNSS a drive this straight does not observe it"
 FEW_UNITS = "held as given: too few units to tell what they err by together"
+MANY_UNITS = 10  # leave nothing open but what the prior knows
 MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
 
@@ -78,8 +78,7 @@ def assess_calibration(
     # Without priors nothing bounds what the drive does not observe, without reassessment nothing takes it back.
     if not (settings.priors and settings.reassessment) and not georeferenced and is_straight(mapper):
         return CalibrationDecision(False, STRAIGHT)
-    # Many units leave nothing open but what the prior knows.
-    if mapper.registered.sum() < MIN_UNITS:
+    if mapper.registered.sum() < MANY_UNITS:
         problem, _ = mapper.problem(
             free_units,
             free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
