@@ -3,10 +3,9 @@
 A rigid object that moves has many keypoints side by side, and one velocity explains them all. Whether a track moves is
 decided for all tracks together [mean field of an Ising model]: by its own evidence, or by that for the velocity that
 its moving neighbours share, and by what its neighbours are. Given that velocity, a track pays no Occam factor for one
-of its own [Savage-Dickey], unless it is one that what stands seems to have as well. So velocities along the own motion
-count, too, of which a track alone reveals nothing. A track whose own velocity is known, and another, is no part of what
-its neighbours are; one among moving ones may also be a mixture of wrong matches, as objects that move and look alike
-make them.
+of its own [Savage-Dickey], unless errors of poses explain that velocity as well. So velocities along the own motion
+count, too, of which a track alone reveals nothing. Moving neighbours say nothing of a track with another velocity. A
+track among them may also be a mixture of wrong matches, as objects that move and look alike make them.
 """
 
 from __future__ import annotations
@@ -52,6 +51,7 @@ def group(
     known: Floats,
     keypoints: Keypoints,
     tracks: Tracks,
+    *,
     focal_px: Floats,
     weigh: Callable[[Ints], None],
 ) -> MotionGroups:
@@ -60,15 +60,17 @@ def group(
     Parameters
     ----------
     motion
-        Of all tracks; those without evidence stand, but for those that `weigh` gives some.
-    suspects, known
-        Tracks (m,) that may move, and log odds (n,) for that by something else than their own observations; zero where
-        nothing is known. Of the others, the suspects' neighbours are decided.
+        Of all tracks; those without evidence, also where `weigh` gives none, stand unless something else is known.
+    suspects
+        Tracks (m,) that may move. They and their neighbours are judged, all others stand.
+    known
+        Log odds (tracks,) to move by something else than a track's own observations; NaN where there are none.
     focal_px
         Of every camera (c,).
     weigh
         Completes `motion` for tracks.
     """
+    weigh(suspects[np.isnan(motion.log_evidence[suspects])])
     beside = _neighbours(suspects, motion, keypoints, tracks, focal_px)
     others = np.setdiff1d(beside[beside >= 0], suspects)
     weigh(others[np.isnan(motion.log_evidence[others])])
@@ -78,15 +80,16 @@ def group(
     place[nodes] = np.arange(len(nodes))
     # A neighbour that is no node stands: it is beside no suspect.
     linked = np.where(edges >= 0, place[edges], -2)
-    is_known, is_weighed = known[nodes] > 0.0, np.isfinite(motion.log_evidence[nodes])
+    is_known, is_weighed = np.isfinite(known[nodes]), np.isfinite(motion.log_evidence[nodes])
     evidence = np.where(is_known, 0.0, -MOST_EVIDENCE)
     evidence[is_weighed] = motion.log_evidence[nodes[is_weighed]]
+    evidence[is_known] += known[nodes[is_known]]
     covariance = np.tile([SPEED_M_S**2, 0.0, SPEED_M_S**2], (len(nodes), 1))
     covariance[is_weighed] = motion.covariance[nodes[is_weighed]]
+    mixed = np.where(is_weighed, 0.5 * motion.observations[nodes] * (motion.misfit[nodes] - MIXED), -np.inf)
     score, reason = np.empty(len(nodes)), np.empty(len(nodes), dtype=np.int64)
     _mean_field(
-        linked, evidence + known[nodes], motion.log_prior[nodes], motion.velocity_m_s[nodes], covariance,
-        motion.observations[nodes] * (motion.misfit[nodes] - MIXED), score, reason,
+        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], covariance, mixed, score, reason
     )  # fmt: skip
     order = np.argsort(nodes)
     # What was not weighed, with too few observations, is not known to move.
@@ -130,16 +133,41 @@ def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_key
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _moving_against_standing(v0: float, v1: float, i0: float, i1: float, i2: float) -> float:
-    """Logarithm of how much likelier a velocity of information i0, i1, i2 is on what moves than on what stands."""
-    det = i0 * i2 - i1 * i1
-    xx, xy, yy = i2 / det, -i1 / det, i0 / det
+def _moving_against_standing(v0: float, v1: float, xx: float, xy: float, yy: float) -> float:
+    """Logarithm of how much likelier a velocity of covariance xx, xy, yy is on what moves than on what stands."""
     result = 0.0
     for sign, spread2 in ((1.0, SPEED_M_S**2), (-1.0, DRIFT_M_S**2)):
         x, y = xx + spread2, yy + spread2
         det = x * y - xy * xy
         result -= 0.5 * sign * ((y * v0 * v0 - 2.0 * xy * v0 * v1 + x * v1 * v1) / det + math.log(det))
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _without_prior(velocity: Any, covariance: Any, information: Any, pulled: Any) -> None:
+    """Information (3,) xx, xy, yy that observations have of the velocity of a thing, and that times the velocity (2,).
+
+    Velocities and covariances have the prior of a track's own velocity: neighbours must not count it again each.
+    Velocities of one thing differ by SLACK_M_S.
+    """
+    slack2, prior = SLACK_M_S**2, 1.0 / SPEED_M_S**2
+    xx, xy, yy = covariance
+    det = xx * yy - xy * xy
+    information[:], pulled[:] = 0.0, 0.0
+    if not det > 0.0:
+        return
+    xx, xy, yy = yy / det, -xy / det, xx / det
+    p0, p1 = xx * velocity[0] + xy * velocity[1], xy * velocity[0] + yy * velocity[1]
+    xx, yy = max(xx - prior, 0.0), max(yy - prior, 0.0)
+    if xx * yy < xy * xy:  # by rounding
+        xy = math.copysign(math.sqrt(xx * yy), xy)
+    # i (1 + s i)^-1 and (1 + s i)^-1 p
+    a, b, d = 1.0 + slack2 * xx, slack2 * xy, 1.0 + slack2 * yy
+    det = a * d - b * b
+    information[0] = (xx * d - xy * b) / det
+    information[1] = (xy * a - xx * b) / det
+    information[2] = (yy * a - xy * b) / det
+    pulled[0], pulled[1] = (d * p0 - b * p1) / det, (a * p1 - b * p0) / det
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -154,25 +182,20 @@ def _mean_field(
     for n in range(count):
         own = min(evidence[n], MOST_EVIDENCE)
         belief[n] = math.tanh(0.5 * (own + prior[n] - PRIOR))
-        xx, xy, yy = covariance[n, 0] + slack2, covariance[n, 1], covariance[n, 2] + slack2
-        det = xx * yy - xy * xy
-        if not det > 0.0:
-            xx, xy, yy, det = speed2, 0.0, speed2, speed2 * speed2
-        information[n, 0], information[n, 1], information[n, 2] = yy / det, -xy / det, xx / det
-        pulled[n, 0] = information[n, 0] * velocity[n, 0] + information[n, 1] * velocity[n, 1]
-        pulled[n, 1] = information[n, 1] * velocity[n, 0] + information[n, 2] * velocity[n, 1]
+        _without_prior(velocity[n], covariance[n], information[n], pulled[n])
     for _ in range(ROUNDS):
         for n in range(count):
-            i0 = i1 = i2 = v0 = v1 = moving = bonds = 0.0
+            i0, i1, i2 = 1.0 / speed2, 0.0, 1.0 / speed2
+            v0 = v1 = moving = for_moving = for_standing = 0.0
             for j in range(size):
                 m = linked[n, j]
                 if m == -2:
                     continue
                 b = belief[m] if m >= 0 else -1.0
                 if b <= 0.0:
-                    bonds += BOND_TO_STANDING * b
+                    for_standing -= BOND_TO_STANDING * b
                     continue
-                bonds += BOND * b
+                for_moving += BOND * b
                 moving += b
                 i0 += b * information[m, 0]
                 i1 += b * information[m, 1]
@@ -180,26 +203,25 @@ def _mean_field(
                 v0 += b * pulled[m, 0]
                 v1 += b * pulled[m, 1]
             best, why = evidence[n], ALONE
-            det = i0 * i2 - i1 * i1
-            if moving > 0.5 and det > 0.0:
+            if moving > 0.5:
+                det = i0 * i2 - i1 * i1
                 common0, common1 = (i2 * v0 - i1 * v1) / det, (i0 * v1 - i1 * v0) / det
-                xx = covariance[n, 0] + slack2 + i2 / det
-                xy = covariance[n, 1] - i1 / det
-                yy = covariance[n, 2] + slack2 + i0 / det
+                cxx, cxy, cyy = i2 / det, -i1 / det, i0 / det
+                xx, xy, yy = covariance[n, 0] + slack2 + cxx, covariance[n, 1] + cxy, covariance[n, 2] + slack2 + cyy
                 d0, d1 = common0 - velocity[n, 0], common1 - velocity[n, 1]
                 det = xx * yy - xy * xy
                 away = (yy * d0 * d0 - 2.0 * xy * d0 * d1 + xx * d1 * d1) / det
                 speed = (common0 * common0 + common1 * common1) / speed2
                 shared = evidence[n] + 0.5 * (speed - away - math.log(det / (speed2 * speed2)))
-                shared += min(_moving_against_standing(common0, common1, i0, i1, i2), 0.0)
-                if shared > best:
+                shared += min(_moving_against_standing(common0, common1, cxx, cxy, cyy), 0.0)
+                if away <= OTHER_VELOCITY and shared > best:
                     best, why = shared, SHARED
-                if 0.5 * mixed[n] > best:
-                    best, why = 0.5 * mixed[n], MIXTURE
-                if why == ALONE and away > OTHER_VELOCITY:
-                    bonds = min(bonds, 0.0)  # it is no part of what its neighbours are
+                if mixed[n] > best:  # and its velocity means nothing
+                    best, why = mixed[n], MIXTURE
+                elif away > OTHER_VELOCITY:
+                    for_moving = 0.0
             # Evidence against is not bounded: no neighbours outweigh what is sure to stand.
-            score[n] = min(best, MOST_EVIDENCE) + prior[n] - PRIOR + bonds
+            score[n] = min(best, MOST_EVIDENCE) + prior[n] - PRIOR + for_moving - for_standing
             reason[n] = why if best + prior[n] > PRIOR else BESIDE
             following[n] = 0.5 * belief[n] + 0.5 * math.tanh(0.5 * score[n])
         belief[:] = following

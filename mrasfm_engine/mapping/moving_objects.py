@@ -8,13 +8,13 @@ import numpy as np
 
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MIXTURE, SHARED, group
-from mrasfm_engine.mapping.single_unit_tracks import moving_in_single_units
+from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MIXTURE, SHARED, MotionGroups, group
+from mrasfm_engine.mapping.single_unit_tracks import log_odds_in_single_units
 from mrasfm_engine.scene.semantics import UNKNOWN
 from mrasfm_engine.triangulation.point_hypotheses import Views
 from mrasfm_engine.triangulation.track_motion import TrackMotion, weigh_tracks
 from mrasfm_engine.triangulation.triangulate import cam_from_world
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Bools, Floats, Ints
 from schemas import SemanticClass
 
 SIGMA_PX_RANGE = (0.1, 3.0)
@@ -62,21 +62,21 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
     weigh(np.flatnonzero(may_move), only_unsure=True)
     focal_px = mapper.state.camera_params[:, :2].mean(1)
     suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
-    known = np.zeros(len(mapper.tracks))
-    found = group(motion, suspects, known, mapper.keypoints, mapper.tracks, focal_px, weigh)
-    moves = np.zeros(len(mapper.tracks), dtype=np.bool_)
-    moves[found.tracks] = may_move[found.tracks]
-    in_one_unit, log_odds = moving_in_single_units(mapper, moves, path)
-    known[in_one_unit] = np.where(may_move[in_one_unit], log_odds, 0.0)
-    if known.any():
-        # They say something of their neighbours: those on the same thing that hardly tell by themselves.
-        suspects = np.union1d(suspects, np.flatnonzero(known))
-        found = group(motion, suspects, known, mapper.keypoints, mapper.tracks, focal_px, weigh)
-        moves = known > 0.0
-        moves[found.tracks] = may_move[found.tracks]
-    reasons = np.full(len(mapper.tracks), IN_ONE_UNIT)
+
+    def moving(suspects: Ints, known: Floats) -> MotionGroups:
+        return group(motion, suspects, known, mapper.keypoints, mapper.tracks, focal_px=focal_px, weigh=weigh)
+
+    found = moving(suspects, np.full(len(mapper.tracks), np.nan))
+    known = log_odds_in_single_units(mapper, _among(found.tracks, may_move), path)
+    known[~may_move] = np.nan
+    in_one_unit = known > 0.0
+    if in_one_unit.any():
+        # What one unit alone observes speaks for its neighbours, too: those on the same thing that hardly tell.
+        found = moving(np.union1d(suspects, np.flatnonzero(in_one_unit)), known)
+    moves = _among(found.tracks, may_move)
+    reasons = np.zeros(len(mapper.tracks), dtype=np.int64)
     reasons[found.tracks] = found.reason
-    reasons[known > 0.0] = IN_ONE_UNIT
+    reasons[in_one_unit] = IN_ONE_UNIT
     tracks = np.flatnonzero(moves)
     points = int(mapper.triangulated[tracks].sum())
     mapper.drop(tracks)
@@ -85,6 +85,13 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
     seen = np.bincount(of_keypoint[of_keypoint >= 0], minlength=len(mapper.tracks))
     judged = int((may_move & (seen > 1)).sum())
     return MovingTracks(tracks=tracks, reason=reasons[tracks], points=points, judged=judged)
+
+
+def _among(tracks: Ints, may_move: Bools) -> Bools:
+    """Which of the tracks (tracks,) are in a list, and may move."""
+    result = np.zeros(len(may_move), dtype=np.bool_)
+    result[tracks] = may_move[tracks]
+    return result
 
 
 def views_of(mapper: Mapper) -> Views:

@@ -11,12 +11,12 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, co
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
     FEW_UNITS,
+    MANY_UNITS,
     CalibrationDecision,
     assess_calibration,
     calibration_prior,
@@ -159,7 +159,7 @@ def refine(
             options=_options(mapper, result.sigma_px),
         )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    few = not result.georeferenced and _reassesses(mapper) and mapper.registered.sum() < MIN_UNITS
+    few = not result.georeferenced and _reassesses(mapper) and mapper.registered.sum() < MANY_UNITS
     if result.calibration.free and few:
         _hold_unless_wrong(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)

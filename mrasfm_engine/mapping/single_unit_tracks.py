@@ -28,12 +28,11 @@ from mrasfm_engine.types import Bools, Floats, Ints
 NEIGHBOURS = 12
 REACH_M = 1.2  # to neighbours: half of a car
 MOVING = (1.0, 4.0)  # Beta distribution of the share on things that move: some wrong points look as if they went on
-# Of the tracks that one unit alone observes, one in twenty moves, as far as the drive does not tell: Beta distribution.
-SHARE_THAT_MOVES = (1.0, 19.0)
-SHARE_STEPS = 30  # of expectation and maximisation
-SHARE_SETTLED = 1e-4
+SHARE_THAT_MOVES = (2.0, 20.0)  # Beta distribution, as far as the drive does not tell: most likely one in twenty
+ROUNDS = 30  # of expectation and maximisation
+CONVERGED = 1e-3  # of the share of points that move, relative
 LEAST_ROWS = 30  # whose shares tell what stands looks like
-CORRELATION = (0.01, 0.9)  # of points in one neighbourhood
+LEAST_CORRELATION = 0.01  # of points in one neighbourhood
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,38 +45,42 @@ class _Shares:
     going_on: Ints  # (n,) of the neighbours, those that other units observe as well
 
 
-def moving_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[Ints, Floats]:
-    """Tracks (n,) with points that one unit alone observes, and that move by what their neighbourhood shows.
+def log_odds_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> Floats:
+    """Log odds (tracks,) to move by what is around them, of tracks that one unit alone observes; NaN of all others.
 
-    The second result are the log odds (n,) for that. `moves` (tracks,) are known to move, and are no neighbours.
+    `moves` (tracks,) are known to move, and are no neighbours.
     """
+    result = np.full(len(mapper.tracks), np.nan)
     shares, single = _neighbourhoods(mapper, moves)
-    if len(shares.track) < LEAST_ROWS or not (shares.neighbours > 1).any():
-        return np.zeros(0, dtype=np.int64), np.zeros(0)
-    stands = _distribution(shares)
-    asked = np.flatnonzero(single[shares.track] & (shares.neighbours > 0))
-    points_m = mapper.state.points_m[shares.track[asked]]
-    asked = asked[_off_the_ground(points_m, path) & _seen_by_next(mapper, points_m, shares.unit[asked])]
-    # The track itself is one more of the neighbourhood that does not go on.
-    count, going_on = shares.neighbours[asked] + 1, shares.going_on[asked]
-    gain = _log_likelihood(going_on, count, *MOVING) - _log_likelihood(going_on, count, *stands)
-    log_odds = gain + log_odds_of_moving(gain)
-    return shares.track[asked[log_odds > 0.0]], log_odds[log_odds > 0.0]
+    rows = np.flatnonzero(shares.neighbours > 0)
+    points_m = mapper.state.points_m[shares.track[rows]]
+    rows = rows[_off_the_ground(points_m, path) & _seen_by_next(mapper, points_m, shares.unit[rows])]
+    # The track itself is one more of its neighbourhood.
+    alone = single[shares.track[rows]]
+    count, going_on = shares.neighbours[rows] + 1, shares.going_on[rows] + ~alone
+    if len(rows) >= LEAST_ROWS:
+        result[shares.track[rows[alone]]] = log_odds_of_moving(count, going_on)[alone]
+    return result
 
 
-def log_odds_of_moving(gain: Floats) -> float:
-    """Log odds for one of the tracks to move, by what all of their log likelihood ratios (n,) say together.
+def log_odds_of_moving(count: Ints, going_on: Ints) -> Floats:
+    """Log odds (n,) of neighbourhoods to move, of whose points (n,) so many go on.
 
-    A street with traffic beside the vehicle has many, most drives have none [expectation maximisation].
+    How many move, and how many points go on of those that stand, is told by all of them together [expectation
+    maximisation]: a street with traffic beside the vehicle has many that move, most drives have none.
     """
-    moving, standing = SHARE_THAT_MOVES
-    share = moving / (moving + standing)
-    for _ in range(SHARE_STEPS):
-        before, beliefs = share, expit(gain + logit(share))
-        share = float((moving + beliefs.sum()) / (moving + standing + len(gain)))
-        if abs(share - before) < SHARE_SETTLED:
+    mode, others = (number - 1.0 for number in SHARE_THAT_MOVES)
+    share = mode / (mode + others)
+    gain = belief = np.zeros(len(count))
+    for _ in range(ROUNDS):
+        stands = _distribution(count, going_on, 1.0 - belief)
+        gain = _log_likelihood(going_on, count, *MOVING) - _log_likelihood(going_on, count, *stands)
+        belief = expit(gain + logit(share))
+        before, share = share, float((mode + belief.sum()) / (mode + others + len(count)))
+        if abs(share - before) < CONVERGED * before:
             break
-    return float(logit(share))
+    result: Floats = gain + logit(share)
+    return result
 
 
 def _off_the_ground(points_m: Floats, path: GroundPath) -> Bools:
@@ -145,15 +148,19 @@ def _around(points_m: Floats, goes_on: Bools, asked: Ints) -> tuple[Ints, Ints]:
     return is_other.sum(axis=1), going_on.sum(axis=1)
 
 
-def _distribution(shares: _Shares) -> tuple[float, float]:
-    """The Beta distribution of the share, by its moments; some point has two neighbours."""
-    told = shares.neighbours > 1
-    n, share = shares.neighbours[told], shares.going_on[told] / shares.neighbours[told]
-    mean = float(np.clip(np.average(share, weights=n), 0.01, 0.99))
+def _distribution(count: Ints, going_on: Ints, weight: Floats) -> tuple[float, float]:
+    """The Beta distribution of the share of points that go on, by the moments of neighbourhoods (n,) of two and more.
+
+    It has no peaks at both ends: those would be two kinds of neighbourhoods.
+    """
+    share = going_on / count
+    mean = float(np.clip(np.average(share, weights=weight * count), 0.01, 0.99))
     # The variance of a share of n is mean (1 - mean) (1 + (n - 1) correlation) / n.
     binomial = mean * (1.0 - mean)
-    excess = float(np.mean((share - mean) ** 2 - binomial / n))
-    correlation = float(np.clip(excess / (binomial * np.mean(1.0 - 1.0 / n)), *CORRELATION))
+    excess = float(np.average((share - mean) ** 2 - binomial / count, weights=weight))
+    peak = max(mean, 1.0 - mean)
+    correlation = excess / (binomial * float(np.average(1.0 - 1.0 / count, weights=weight)))
+    correlation = min(max(correlation, LEAST_CORRELATION), peak / (1.0 + peak))
     both = (1.0 - correlation) / correlation
     return mean * both, (1.0 - mean) * both
 

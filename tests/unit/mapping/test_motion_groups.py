@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, SHARED, MotionGroups, group
+from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MotionGroups, group
 from mrasfm_engine.triangulation.track_motion import SPEED_M_S, TrackMotion
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 
@@ -36,53 +37,64 @@ def grouped(
         observations=np.full(count, 2),
         reference=np.arange(count),
     )
-    known = np.zeros(count) if known is None else known
+    known = np.full(count, np.nan) if known is None else known
     suspects = np.flatnonzero((log_evidence > 0.0) | (known > 0.0))
     tracks = Tracks.from_labels(np.arange(count))
-    return group(motion, suspects, known, keypoints, tracks, np.array([500.0]), lambda _: None)
+    return group(motion, suspects, known, keypoints, tracks, focal_px=np.array([500.0]), weigh=lambda _: None)
+
+
+def around(value: float, middle: float) -> np.ndarray:
+    """One value for all tracks but that in the middle."""
+    result = np.full(9, value)
+    result[IN_THE_MIDDLE] = middle
+    return result
 
 
 def test_a_track_that_hardly_tells_moves_as_its_neighbours_are_known_to() -> None:
-    evidence = np.full(9, np.nan)
-    evidence[IN_THE_MIDDLE] = HARDLY_TELLS
-    known = np.full(9, 3.0)
-    known[IN_THE_MIDDLE] = 0.0
-    found = grouped(evidence, known)
+    found = grouped(around(np.nan, HARDLY_TELLS), known=around(3.0, np.nan))
     assert found.tracks.tolist() == list(range(9))
     assert found.reason[IN_THE_MIDDLE] == BESIDE
     assert set(np.delete(found.reason, IN_THE_MIDDLE)) == {ALONE}
-    assert not len(grouped(evidence).tracks)
+
+
+def test_what_is_known_to_stand_does_not_move_with_its_neighbours() -> None:
+    evidence = around(np.nan, 0.0)
+    assert IN_THE_MIDDLE in grouped(evidence, known=around(3.0, np.nan)).tracks
+    assert IN_THE_MIDDLE not in grouped(evidence, known=around(3.0, -9.0)).tracks
 
 
 def test_one_neighbour_that_moves_is_not_enough() -> None:
-    known = np.zeros(9)
+    known = np.full(9, np.nan)
     known[0] = 3.0
     found = grouped(np.full(9, HARDLY_TELLS), known)
     assert IN_THE_MIDDLE not in found.tracks
 
 
 def test_what_is_sure_to_stand_stays_among_those_that_move() -> None:
-    evidence = np.full(9, np.nan)
-    evidence[IN_THE_MIDDLE] = -30.0
-    known = np.full(9, 3.0)
-    known[IN_THE_MIDDLE] = 0.0
-    assert IN_THE_MIDDLE not in grouped(evidence, known).tracks
+    assert IN_THE_MIDDLE not in grouped(around(np.nan, -30.0), known=around(3.0, np.nan)).tracks
 
 
-def test_a_velocity_that_neighbours_share_is_no_motion_where_it_is_that_of_what_stands() -> None:
-    """Eight tracks with a velocity of 5 m/s, or of some centimetres a second as errors of poses make it."""
-    evidence = np.full(9, 2.0)
-    evidence[IN_THE_MIDDLE] = -4.0
-    moves, stands = np.tile([5.0, 0.0], (9, 1)), np.tile([0.05, 0.0], (9, 1))
-    assert grouped(evidence, velocity_m_s=moves, sigma_m_s=0.1).reason[IN_THE_MIDDLE] == SHARED
-    found = grouped(evidence, velocity_m_s=stands, sigma_m_s=0.1)
-    assert IN_THE_MIDDLE not in found.tracks or found.reason[found.tracks == IN_THE_MIDDLE] != SHARED
+@pytest.mark.parametrize(("speed_m_s", "moves"), [(5.0, True), (0.05, False)])
+def test_a_velocity_that_errors_of_poses_explain_is_no_motion(speed_m_s: float, moves: bool) -> None:
+    """Neighbours with some evidence for a velocity; a track that has it as well, and is fairly sure to stand."""
+    velocity = np.tile([speed_m_s, 0.0], (9, 1))
+    found = grouped(around(1.5, -10.0), velocity_m_s=velocity, sigma_m_s=0.1)
+    assert (IN_THE_MIDDLE in found.tracks) == moves
 
 
 def test_what_has_another_velocity_than_its_neighbours_does_not_go_with_them() -> None:
-    velocity, sigma = np.tile([5.0, 0.0], (9, 1)), np.full(9, 0.1)
-    evidence = np.full(9, 2.0)
-    evidence[IN_THE_MIDDLE], velocity[IN_THE_MIDDLE] = -4.0, 0.0
-    assert IN_THE_MIDDLE not in grouped(evidence, velocity_m_s=velocity, sigma_m_s=sigma).tracks
-    sigma[IN_THE_MIDDLE] = SPEED_M_S
-    assert IN_THE_MIDDLE in grouped(evidence, velocity_m_s=velocity, sigma_m_s=sigma).tracks
+    velocity = np.column_stack([around(5.0, 0.0), np.zeros(9)])
+    evidence = around(2.0, -4.0)
+    assert IN_THE_MIDDLE not in grouped(evidence, velocity_m_s=velocity, sigma_m_s=0.1).tracks
+    assert IN_THE_MIDDLE in grouped(evidence, velocity_m_s=velocity, sigma_m_s=around(0.1, SPEED_M_S)).tracks
+
+
+def test_neighbours_whose_velocity_nothing_tells_go_with_any_velocity() -> None:
+    velocity = np.column_stack([around(0.0, 14.0), np.zeros(9)])
+    found = grouped(
+        around(np.nan, HARDLY_TELLS),
+        known=around(3.0, np.nan),
+        velocity_m_s=velocity,
+        sigma_m_s=around(SPEED_M_S, 0.3),
+    )
+    assert IN_THE_MIDDLE in found.tracks

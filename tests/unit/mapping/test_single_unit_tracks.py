@@ -4,11 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from scipy.stats import betabinom
 
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.moving_objects import IN_ONE_UNIT, drop_moving
-from mrasfm_engine.mapping.single_unit_tracks import SHARE_THAT_MOVES, log_odds_of_moving, moving_in_single_units
+from mrasfm_engine.mapping.single_unit_tracks import MOVING, log_odds_in_single_units, log_odds_of_moving
 from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
@@ -43,7 +45,9 @@ def mapped(simulated: SimulatedDrive, only_within_units: Callable[[np.ndarray], 
 
 
 def found_in(mapper: Mapper) -> np.ndarray:
-    return moving_in_single_units(mapper, np.zeros(len(mapper.tracks), np.bool_), ground_path(mapper))[0]
+    """Tracks (n,) that move by what is around them."""
+    none = np.zeros(len(mapper.tracks), np.bool_)
+    return np.flatnonzero(log_odds_in_single_units(mapper, none, ground_path(mapper)) > 0.0)
 
 
 def on_car(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
@@ -65,20 +69,19 @@ def test_points_of_a_car_that_two_cameras_see_at_one_instant_go() -> None:
     assert IN_ONE_UNIT in found.reason
 
 
-def test_the_share_that_moves_is_told_by_all_of_them() -> None:
-    """Log likelihood ratios of which none, one in three or nearly all speak for a motion, and of no track at all."""
-    rng = np.random.default_rng(5)
-    standing, moving = rng.normal(-2.0, 1.0, 300), rng.normal(3.0, 1.0, 300)
-
-    def share_found(log_ratios: np.ndarray) -> float:
-        return float(1.0 / (1.0 + np.exp(-log_odds_of_moving(log_ratios))))
-
-    for share in (0.3, 0.9):
-        mixed = np.concatenate([moving[: round(300 * share)], standing[: round(300 * (1.0 - share))]])
-        assert abs(share_found(mixed) - share) < 0.05
-    assert share_found(standing) < 0.01
-    moving_of_prior, standing_of_prior = SHARE_THAT_MOVES
-    assert np.isclose(share_found(np.zeros(0)), moving_of_prior / (moving_of_prior + standing_of_prior))
+@pytest.mark.parametrize("moving", [0, 60, 600])
+@pytest.mark.parametrize(("mean", "correlation"), [(0.3, 0.2), (0.5, 0.3), (0.7, 0.2), (0.85, 0.4), (0.95, 0.1)])
+def test_how_many_move_is_told_by_all_neighbourhoods(mean: float, correlation: float, moving: int) -> None:
+    """3000 neighbourhoods of points that stand, and some that move, beside who knows how many and how they differ."""
+    rng, both = np.random.default_rng(5), (1.0 - correlation) / correlation
+    stands = (mean * both, (1.0 - mean) * both)
+    going_on = rng.binomial(13, np.concatenate([rng.beta(*stands, 3000), rng.beta(*MOVING, moving)]))
+    found = log_odds_of_moving(np.full(len(going_on), 13), going_on) > 0.0
+    true_gain = betabinom.logpmf(going_on, 13, *MOVING) - betabinom.logpmf(going_on, 13, *stands)
+    ideal = true_gain + np.log(max(moving, 1) / 3000) > 0.0
+    assert found[:3000].mean() <= ideal[:3000].mean() + 0.02
+    if mean > 0.9:  # else what stands looks much as what moves
+        assert found[3000:].sum() >= 0.8 * ideal[3000:].sum()
 
 
 def test_points_of_a_parked_car_stay_as_other_units_see_it_too() -> None:
