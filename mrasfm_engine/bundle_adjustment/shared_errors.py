@@ -29,8 +29,8 @@ from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats
 
-MIN_UNITS = 3  # fewer tell no covariance
-SIGMAS = 3.0  # of few units they are as improbable as of many
+MIN_UNITS = 4  # fewer tell no covariance
+SIGMAS = 3.0  # at which what few units tell is as improbable as of a normal distribution
 LEVELS = 10  # rounds, in which directions that stood out no longer do
 SINGULAR = 1e-9  # eigenvalues of a correlation below this are rounding
 POINT_GROUPS = 4096  # points that share nothing add up to as much as one by one; so many tell a variance to 2 %
@@ -69,15 +69,17 @@ def _widened(covariance: Floats, scores: Floats) -> Floats:
     Few units scatter far in some directions although they share nothing: the eigenvalues of their covariance over the
     true one reach (1 + sqrt(k / n))^2 [Marchenko and Pastur, Mathematics of the USSR-Sbornik 1967]. One that stands out
     is l (1 + k / n / (l - 1)), where l is the true one [Baik and Silverstein, Journal of Multivariate Analysis 2006].
-    What n units tell of a direction alone, errors exceed as Student's distribution exceeds the normal one.
+    What n units tell of a direction alone, errors exceed as Student's distribution exceeds the normal one. Scores
+    cancel, so that n is one less than there are units.
     """
-    count, ratio = len(scores), scores.shape[1] / len(scores)
+    freedoms = len(scores) - 1
+    ratio = scores.shape[1] / freedoms
     sigma = np.sqrt(np.diagonal(covariance))
     values, vectors = np.linalg.eigh(covariance / sigma / sigma[:, None])
     lengths = np.sqrt(np.maximum(values, SINGULAR))
     root = sigma[:, None] * vectors * lengths  # times its transpose: the covariance
     white = scores @ (vectors / lengths / sigma[:, None])
-    found, directions = np.linalg.eigh(white.T @ white * (count / (count - 1)))
+    found, directions = np.linalg.eigh(white.T @ white * (len(scores) / freedoms))
     edge, level = (1.0 + np.sqrt(ratio)) ** 2, 1.0
     for _ in range(LEVELS):
         others = found[found <= edge * level]
@@ -85,7 +87,7 @@ def _widened(covariance: Floats, scores: Floats) -> Floats:
     found = found / level
     half = np.maximum(found + 1.0 - ratio, 0.0) / 2.0
     own = np.where(found > edge, half + np.sqrt(np.maximum(half**2 - found, 0.0)), 1.0)
-    own[found > edge] *= (stdtrit(count - 1, ndtr(SIGMAS)) / SIGMAS) ** 2
+    own = 1.0 + (own - 1.0) * (stdtrit(freedoms, ndtr(SIGMAS)) / SIGMAS) ** 2
     spread = root @ directions * np.sqrt(level * own)
     result: Floats = spread @ spread.T
     return result

@@ -17,7 +17,7 @@ from mrasfm_engine.types import Bools, Floats
 
 STRAIGHT = "held as given: without GNSS a drive this straight does not observe it"
 FEW_UNITS = "held as given: too few units to tell what they err by together"
-MANY_UNITS = 10  # leave nothing open but what the prior knows
+MANY_UNITS = 10  # that correct a calibration without positions, and leave nothing open but what its prior knows
 MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
 

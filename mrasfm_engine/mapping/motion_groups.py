@@ -83,7 +83,7 @@ def group(
     is_known, is_weighed = np.isfinite(known[nodes]), np.isfinite(motion.log_evidence[nodes])
     evidence = np.where(is_known, 0.0, -MOST_EVIDENCE)
     evidence[is_weighed] = motion.log_evidence[nodes[is_weighed]]
-    evidence[is_known] += known[nodes[is_known]]
+    evidence[is_known] += known[nodes[is_known]] + PRIOR  # which log odds have already
     covariance = np.tile([SPEED_M_S**2, 0.0, SPEED_M_S**2], (len(nodes), 1))
     covariance[is_weighed] = motion.covariance[nodes[is_weighed]]
     mixed = np.where(is_weighed, 0.5 * motion.observations[nodes] * (motion.misfit[nodes] - MIXED), -np.inf)

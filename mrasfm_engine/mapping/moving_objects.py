@@ -88,7 +88,7 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
 
 
 def _among(tracks: Ints, may_move: Bools) -> Bools:
-    """Which of the tracks (tracks,) are in a list, and may move."""
+    """Mask (tracks,) of the tracks in a list that may move."""
     result = np.zeros(len(may_move), dtype=np.bool_)
     result[tracks] = may_move[tracks]
     return result

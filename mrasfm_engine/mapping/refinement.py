@@ -251,7 +251,9 @@ def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel 
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return
-    sigma_scale = sigma_scale_of_images(mapper, covariances(problem, problem.state))
+    # At no solution: of few units, what a wrong camera leaves in each passes for an error that they share.
+    many = bool(mapper.registered.sum() >= MANY_UNITS)
+    sigma_scale = sigma_scale_of_images(mapper, covariances(problem, problem.state, shared_errors=many))
     if not np.isfinite(sigma_scale):
         return
     lens = scale_of_given_rotations(mapper, free_units=free_units, free_times=None, terms=terms, options=options)
@@ -329,7 +331,8 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
         terms=_terms(mapper, result),
         options=_options(mapper, result.sigma_px),
     )
-    found, wrong = _directions(mapper, covariances(problem, problem.state)), np.zeros_like(result.recalibrated)
+    found = _directions(mapper, covariances(problem, problem.state, shared_errors=False))
+    wrong = np.zeros_like(result.recalibrated)
     if found is not None:
         wrong[[one.camera for one in find_miscalibrations(calibration_prior(mapper), mapper.state, found)]] = True
     if wrong.any() and (~wrong).sum() < MIN_OTHERS:

@@ -53,8 +53,8 @@ def log_odds_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> 
     result = np.full(len(mapper.tracks), np.nan)
     shares, single = _neighbourhoods(mapper, moves)
     rows = np.flatnonzero(shares.neighbours > 0)
-    points_m = mapper.state.points_m[shares.track[rows]]
-    rows = rows[_off_the_ground(points_m, path) & _seen_by_next(mapper, points_m, shares.unit[rows])]
+    rows = rows[_off_the_ground(mapper.state.points_m[shares.track[rows]], path)]
+    rows = rows[_seen_by_next(mapper, mapper.state.points_m[shares.track[rows]], shares.unit[rows])]
     # The track itself is one more of its neighbourhood.
     alone = single[shares.track[rows]]
     count, going_on = shares.neighbours[rows] + 1, shares.going_on[rows] + ~alone
@@ -71,15 +71,18 @@ def log_odds_of_moving(count: Ints, going_on: Ints) -> Floats:
     """
     mode, others = (number - 1.0 for number in SHARE_THAT_MOVES)
     share = mode / (mode + others)
-    gain = belief = np.zeros(len(count))
+    # Thousands of neighbourhoods are of a hundred kinds.
+    pairs = np.stack([count, going_on])
+    (count, going_on), kind, number = np.unique(pairs, axis=1, return_inverse=True, return_counts=True)
+    gain = belief = np.zeros(len(number))
     for _ in range(ROUNDS):
-        stands = _distribution(count, going_on, 1.0 - belief)
+        stands = _distribution(count, going_on, number * (1.0 - belief))
         gain = _log_likelihood(going_on, count, *MOVING) - _log_likelihood(going_on, count, *stands)
         belief = expit(gain + logit(share))
-        before, share = share, float((mode + belief.sum()) / (mode + others + len(count)))
+        before, share = share, float((mode + number @ belief) / (mode + others + len(kind)))
         if abs(share - before) < CONVERGED * before:
             break
-    result: Floats = gain + logit(share)
+    result: Floats = (gain + logit(share))[kind.reshape(-1)]
     return result
 
 

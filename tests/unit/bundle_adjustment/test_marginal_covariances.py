@@ -128,7 +128,7 @@ def test_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> No
         options=SolverOptions(sigma_px=0.5),
     )
     prior = prior_of(case.truth, rotation_deg=2.0, translation_m=0.05)
-    found = covariances(replace(case.problem, terms=[prior]), case.truth)
+    found = covariances(replace(case.problem, terms=[prior]), case.truth, shared_errors=False)
     assert found.calibration.shape == (24, 24)
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.calibration)).reshape(4, 6), found.sigma_camera[:, :6])
     verdict = assess_directions(
