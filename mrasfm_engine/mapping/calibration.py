@@ -78,7 +78,7 @@ def assess_calibration(
     # Without priors nothing bounds what the drive does not observe, without reassessment nothing takes it back.
     if not (settings.priors and settings.reassessment) and not georeferenced and is_straight(mapper):
         return CalibrationDecision(False, STRAIGHT)
-    if mapper.registered.sum() < MANY_UNITS:
+    if has_few_units(mapper):
         problem, _ = mapper.problem(
             free_units,
             free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
@@ -90,6 +90,11 @@ def assess_calibration(
     return CalibrationDecision(
         True, "GNSS makes it observable" if georeferenced else "varies as far as the drive observes it"
     )
+
+
+def has_few_units(mapper: Mapper) -> bool:
+    """True where fewer than MANY_UNITS are registered."""
+    return bool(mapper.registered.sum() < MANY_UNITS)
 
 
 def is_straight(mapper: Mapper) -> bool:

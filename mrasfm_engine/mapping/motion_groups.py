@@ -84,12 +84,11 @@ def group(
     evidence = np.where(is_known, 0.0, -MOST_EVIDENCE)
     evidence[is_weighed] = motion.log_evidence[nodes[is_weighed]]
     evidence[is_known] += known[nodes[is_known]] + PRIOR  # which log odds have already
-    covariance = np.tile([SPEED_M_S**2, 0.0, SPEED_M_S**2], (len(nodes), 1))
-    covariance[is_weighed] = motion.covariance[nodes[is_weighed]]
     mixed = np.where(is_weighed, 0.5 * motion.observations[nodes] * (motion.misfit[nodes] - MIXED), -np.inf)
     score, reason = np.empty(len(nodes)), np.empty(len(nodes), dtype=np.int64)
     _mean_field(
-        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], covariance, mixed, score, reason
+        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], motion.covariance[nodes], mixed,
+        score, reason,
     )  # fmt: skip
     order = np.argsort(nodes)
     # What was not weighed, with too few observations, is not known to move.
@@ -133,14 +132,18 @@ def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_key
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _moving_against_standing(v0: float, v1: float, xx: float, xy: float, yy: float) -> float:
+def _distance2(d0: float, d1: float, xx: float, xy: float, yy: float) -> Any:
+    """Squared distance of a difference in standard deviations, by its covariance xx, xy, yy, and the determinant."""
+    det = xx * yy - xy * xy
+    return (yy * d0 * d0 - 2.0 * xy * d0 * d1 + xx * d1 * d1) / det, det
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _moving_against_standing(v0: float, v1: float, xx: float, xy: float, yy: float) -> Any:
     """Logarithm of how much likelier a velocity of covariance xx, xy, yy is on what moves than on what stands."""
-    result = 0.0
-    for sign, spread2 in ((1.0, SPEED_M_S**2), (-1.0, DRIFT_M_S**2)):
-        x, y = xx + spread2, yy + spread2
-        det = x * y - xy * xy
-        result -= 0.5 * sign * ((y * v0 * v0 - 2.0 * xy * v0 * v1 + x * v1 * v1) / det + math.log(det))
-    return result
+    moving, moving_det = _distance2(v0, v1, xx + SPEED_M_S**2, xy, yy + SPEED_M_S**2)
+    standing, standing_det = _distance2(v0, v1, xx + DRIFT_M_S**2, xy, yy + DRIFT_M_S**2)
+    return 0.5 * (standing - moving - math.log(moving_det / standing_det))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -208,9 +211,7 @@ def _mean_field(
                 common0, common1 = (i2 * v0 - i1 * v1) / det, (i0 * v1 - i1 * v0) / det
                 cxx, cxy, cyy = i2 / det, -i1 / det, i0 / det
                 xx, xy, yy = covariance[n, 0] + slack2 + cxx, covariance[n, 1] + cxy, covariance[n, 2] + slack2 + cyy
-                d0, d1 = common0 - velocity[n, 0], common1 - velocity[n, 1]
-                det = xx * yy - xy * xy
-                away = (yy * d0 * d0 - 2.0 * xy * d0 * d1 + xx * d1 * d1) / det
+                away, det = _distance2(common0 - velocity[n, 0], common1 - velocity[n, 1], xx, xy, yy)
                 speed = (common0 * common0 + common1 * common1) / speed2
                 shared = evidence[n] + 0.5 * (speed - away - math.log(det / (speed2 * speed2)))
                 shared += min(_moving_against_standing(common0, common1, cxx, cxy, cyy), 0.0)

@@ -16,10 +16,10 @@ from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
     FEW_UNITS,
-    MANY_UNITS,
     CalibrationDecision,
     assess_calibration,
     calibration_prior,
+    has_few_units,
     hold_baselines,
     resolve_scale,
     sigma_scale_of_images,
@@ -159,7 +159,7 @@ def refine(
             options=_options(mapper, result.sigma_px),
         )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    few = not result.georeferenced and _reassesses(mapper) and mapper.registered.sum() < MANY_UNITS
+    few = not result.georeferenced and _reassesses(mapper) and has_few_units(mapper)
     if result.calibration.free and few:
         _hold_unless_wrong(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)
@@ -252,8 +252,8 @@ def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel 
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return
     # At no solution: of few units, what a wrong camera leaves in each passes for an error that they share.
-    many = bool(mapper.registered.sum() >= MANY_UNITS)
-    sigma_scale = sigma_scale_of_images(mapper, covariances(problem, problem.state, shared_errors=many))
+    certainty = covariances(problem, problem.state, shared_errors=not has_few_units(mapper))
+    sigma_scale = sigma_scale_of_images(mapper, certainty)
     if not np.isfinite(sigma_scale):
         return
     lens = scale_of_given_rotations(mapper, free_units=free_units, free_times=None, terms=terms, options=options)

@@ -72,8 +72,8 @@ def log_odds_of_moving(count: Ints, going_on: Ints) -> Floats:
     mode, others = (number - 1.0 for number in SHARE_THAT_MOVES)
     share = mode / (mode + others)
     # Thousands of neighbourhoods are of a hundred kinds.
-    pairs = np.stack([count, going_on])
-    (count, going_on), kind, number = np.unique(pairs, axis=1, return_inverse=True, return_counts=True)
+    kinds, kind, number = np.unique(count * (NEIGHBOURS + 2) + going_on, return_inverse=True, return_counts=True)
+    count, going_on = np.divmod(kinds, NEIGHBOURS + 2)
     gain = belief = np.zeros(len(number))
     for _ in range(ROUNDS):
         stands = _distribution(count, going_on, number * (1.0 - belief))
@@ -82,7 +82,7 @@ def log_odds_of_moving(count: Ints, going_on: Ints) -> Floats:
         before, share = share, float((mode + number @ belief) / (mode + others + len(kind)))
         if abs(share - before) < CONVERGED * before:
             break
-    result: Floats = (gain + logit(share))[kind.reshape(-1)]
+    result: Floats = (gain + logit(share))[kind]
     return result
 
 

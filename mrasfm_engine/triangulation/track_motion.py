@@ -79,12 +79,12 @@ class TrackMotion:
 
     @staticmethod
     def empty(count: int) -> TrackMotion:
-        """Nothing is known of any track."""
+        """Nothing is known of any track but what its velocity is as a rule."""
         return TrackMotion(
             log_evidence=np.full(count, np.nan),
             log_prior=np.zeros(count),
             velocity_m_s=np.zeros((count, 2)),
-            covariance=np.zeros((count, 3)),
+            covariance=np.tile([SPEED_M_S**2, 0.0, SPEED_M_S**2], (count, 1)),
             distance_m=np.full(count, np.inf),
             misfit=np.zeros(count),
             observations=np.zeros(count, dtype=np.int64),

@@ -128,7 +128,8 @@ def test_what_cannot_be_in_a_map(street: Path, two: Path, tmp_path: Path, mrasfm
     # One scene that is georeferenced would place the other.
     unplaced = [changed_copy(of, tmp_path / of.name, "frame.json", {"georeferenced": False}) for of in (scene, other)]
     assert "is not georeferenced" in refused(*unplaced, *out)
-    shutil.copytree(other, copy, ignore=shutil.ignore_patterns(".stages", "pictures", "manifest.json"))
+    copy = changed_copy(other, tmp_path / "copy", "frame.json", {})
+    (copy / "manifest.json").unlink()
     assert "earlier version" in refused(scene, copy, *out)
     assert not (tmp_path / "out").exists() or not (tmp_path / "out" / "report.json").exists()
 
