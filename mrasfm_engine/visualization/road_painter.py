@@ -1,13 +1,14 @@
 """Paints the road, block by block along the path, in time by its length and in bounded memory.
 
 Views come in the order of the path, those of a second visit with those of the first. A block is under way while views
-may still reach it, then decided, written and forgotten.
+may still reach it, then decided, written and forgotten, while the next views are painted.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from mrasfm_engine.visualization.running_gains import RunningGains
 from mrasfm_engine.visualization.standing_points import StandingPoints
 from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile, TileIndex
 from mrasfm_engine.visualization.views import REFINED, VIEW_M, PlacedView, View, place_view
+
+UNDECIDED_BLOCKS = 8  # that may wait in memory, of 5 MB each
 
 
 @dataclass
@@ -68,6 +71,8 @@ class RoadPainter:
         self._store = BlockStore(self.folder)
         self._gains = RunningGains(self._cameras)
         self._left = Counter(block for view in self.views for block in self._reached(view))
+        self._decider = ThreadPoolExecutor(1)
+        self._undecided: deque[Future[None]] = deque()
 
     def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
         """Paint one view; see `views.Painter`."""
@@ -83,6 +88,16 @@ class RoadPainter:
                 del self._left[block]
                 self._finish(block)
 
+    def finish(self) -> None:
+        """Wait until all blocks are decided and written; raises what went wrong."""
+        while self._undecided:
+            self._undecided.popleft().result()
+        self._decider.shutdown()
+
+    def stop(self) -> None:
+        """Leave all blocks that are not decided."""
+        self._decider.shutdown(cancel_futures=True)
+
     def _reached(self, view: View) -> list[Block]:
         return self._plan.reached(view.plan_from_cam[REFINED][:2, 3], VIEW_M)
 
@@ -97,6 +112,11 @@ class RoadPainter:
         candidates = self._store.pop(block)
         if candidates is None or not candidates.count.any():
             return
+        while self._undecided and (self._undecided[0].done() or len(self._undecided) >= UNDECIDED_BLOCKS):
+            self._undecided.popleft().result()
+        self._undecided.append(self._decider.submit(self._decide, block, candidates))
+
+    def _decide(self, block: Block, candidates: Candidates) -> None:
         found = find_consensus(candidates, cameras=self._cameras)
         inside = slice(APRON_CELLS, -APRON_CELLS), slice(APRON_CELLS, -APRON_CELLS)
         agreed = found.agreed[inside]

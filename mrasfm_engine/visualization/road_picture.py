@@ -63,7 +63,7 @@ def painting_road(plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Flo
     (scratch / BLOCKS).mkdir()
     try:
         with TileFile(scratch / TILES) as tiles:
-            yield RoadPainter(
+            painter = RoadPainter(
                 views=plan.views,
                 ground=ground,
                 standing=StandingPoints(plan.points_m, plan.seen_by, plan.ground),
@@ -72,12 +72,17 @@ def painting_road(plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Flo
                 tiles=tiles,
                 own_car_m=own_car_m,
             )
+            try:
+                yield painter
+            finally:
+                painter.stop()
     finally:
         _remove_work(scratch)
 
 
 def discard_road(painter: RoadPainter, scratch: Path) -> None:
     """Give back the disk space of a road that failed: the scene, which is still to be written, may need it."""
+    painter.stop()
     painter.tiles.close()  # an open file would keep its space
     _remove_work(scratch)
     (scratch / TIFF).unlink(missing_ok=True)
@@ -102,6 +107,7 @@ def finish_road(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path, e
 
 
 def _finished(scene: Scene, plan: Plan, painter: RoadPainter, scratch: Path) -> RoadPicture:
+    painter.finish()
     pyramid = build_pyramid(painter.tiles)
     painter.tiles.flush()
     if pyramid is None:

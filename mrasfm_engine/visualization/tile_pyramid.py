@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit
 
 from mrasfm_engine.types import Bytes
 from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile, TileIndex
@@ -104,9 +106,22 @@ def _build_level(pyramid: TilePyramid, level: int) -> None:
 
 def halved(tile: Bytes) -> Bytes:
     """Half as many rows and columns (h, w, 4): the mean of every four cells, by their opacity."""
-    height, width = tile.shape[0] // 2, tile.shape[1] // 2
-    cells = tile.reshape(height, 2, width, 2, 4).astype(np.uint32)
-    opacity = cells[..., 3:]
-    total = opacity.sum((1, 3))
-    color = ((cells[..., :3] * opacity).sum((1, 3)) + total // 2) // np.maximum(total, 1)
-    return np.concatenate([color, (total + 2) // 4], axis=-1).astype(np.uint8)
+    result: Bytes = np.empty((tile.shape[0] // 2, tile.shape[1] // 2, 4), np.uint8)
+    _halve(tile, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _halve(tile: Any, result: Any) -> None:
+    for i in range(result.shape[0]):
+        for j in range(result.shape[1]):
+            total: Any = np.int64(0)  # of unsigned numbers numba makes floats
+            for a in range(4):
+                total += tile[2 * i + a // 2, 2 * j + a % 2, 3]
+            for k in range(3):
+                color: Any = total // 2
+                for a in range(4):
+                    cell = tile[2 * i + a // 2, 2 * j + a % 2]
+                    color += np.int64(cell[k]) * np.int64(cell[3])
+                result[i, j, k] = color // max(total, 1)
+            result[i, j, 3] = (total + 2) // 4

@@ -5,8 +5,10 @@ Every image is read once, whatever is painted of it.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Protocol
@@ -24,7 +26,8 @@ VIEW_M = 15.0  # how far from a camera its image is used
 MIN_RESOLUTION_PX = 5.0  # of an image on the ground, pixels a metre along the line of sight
 OWN_CAR_LEVEL = 0.5  # of the cameras' height: up to there the car's body hides the ground
 FOOTPRINT_MARGIN_M = 1.0  # around where the corners of an image meet the ground: it is not level
-PREFETCHED = 3  # images that wait decoded
+PREFETCHED = 2  # images that wait decoded
+AHEAD = 3  # views by which a painter may be ahead of another one
 
 Read = Callable[[int], tuple[Bytes, Bools | None]]  # image (h, w, 3) and usable pixels (h, w), None where all are
 
@@ -56,6 +59,8 @@ def paint_views(
 ) -> None:
     """Hand every view to all painters, in order, each in a thread of its own; every image is read once.
 
+    A painter that is slow with one view does not hold up the others, which may be a few views ahead of it.
+
     Parameters
     ----------
     read
@@ -63,12 +68,27 @@ def paint_views(
     step
         Called after every view with how many are done; may raise.
     """
-    with ThreadPoolExecutor(len(painters)) as pool:
-        for done, (index, rgb, usable) in enumerate(_read_ahead(len(views), read), 1):
-            painted = [pool.submit(painter.paint, index, views[index], rgb, usable) for painter in painters]
-            for each in painted:
-                each.result()
-            step(done)
+    under_way: deque[list[Future[None]]] = deque()
+    done = 0
+
+    def finish_first() -> None:
+        nonlocal done
+        for each in under_way[0]:
+            each.result()
+        under_way.popleft()
+        done += 1
+        step(done)
+
+    with ExitStack() as stack:
+        pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in painters]
+        stack.callback(lambda: [each.cancel() for view in under_way for each in view])  # of an error, before all ends
+        for index, rgb, usable in _read_ahead(len(views), read):
+            both = zip(painters, pools, strict=True)
+            under_way.append([pool.submit(painter.paint, index, views[index], rgb, usable) for painter, pool in both])
+            if len(under_way) > AHEAD:
+                finish_first()
+        while under_way:
+            finish_first()
 
 
 def _read_ahead(count: int, read: Read) -> Iterator[tuple[int, Bytes, Bools | None]]:
