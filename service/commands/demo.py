@@ -169,14 +169,15 @@ class _Demo:
         import httpx
 
         until_s = time.monotonic() + _START_TIMEOUT_S
-        while time.monotonic() < until_s:
-            if process.poll() is not None:
-                raise DemoError(f"the service ended with exit code {process.returncode}. {self._log()}")
-            try:
-                if httpx.get(f"http://127.0.0.1:{port}/readyz", trust_env=False).is_success:
-                    return
-            except httpx.TransportError:
-                time.sleep(0.2)
+        with httpx.Client(trust_env=False) as client:
+            while time.monotonic() < until_s:
+                if process.poll() is not None:
+                    raise DemoError(f"the service ended with exit code {process.returncode}. {self._log()}")
+                try:
+                    if client.get(f"http://127.0.0.1:{port}/readyz").is_success:
+                        return
+                except httpx.TransportError:
+                    time.sleep(0.2)
         raise DemoError(f"the service was not ready after {_START_TIMEOUT_S:.0f} s. {self._log()}")
 
     def _log(self) -> str:
