@@ -1,6 +1,7 @@
 // Builds the console: the same bytes from the same sources, wherever it runs.
 import { build } from "esbuild";
-import { copyFile, mkdir, readFile, rm, writeFile } from "node:fs/promises";
+import { createHash } from "node:crypto";
+import { copyFile, mkdir, readFile, readdir, rm, writeFile } from "node:fs/promises";
 import { dirname, join, relative, resolve } from "node:path";
 import { fileURLToPath } from "node:url";
 
@@ -33,6 +34,26 @@ await copyFile("src/icon.svg", join(console_, "icon.svg"));
 await copyFile("node_modules/laz-perf/lib/web/laz-perf.wasm", join(console_, "laz-perf.wasm"));
 await copyFile("node_modules/maplibre-gl/dist/maplibre-gl-worker.mjs", join(console_, "maplibre-gl-worker.mjs"));
 await writeFile(join(console_, "licences.txt"), await licences(metafiles));
+await writeFile("build.sha256", await digests());
+
+/** What was built of what, as sha256sum writes it: whoever changes a source sees without node that it is not built. */
+async function digests() {
+  const sources = (await readdir("src", { recursive: true, withFileTypes: true }))
+    .filter((entry) => entry.isFile())
+    .map((entry) => relative(here, join(entry.parentPath ?? entry.path, entry.name)));
+  const fixed = ["build.mjs", "build/openapi.json", "package-lock.json", "package.json", "tsconfig.json"];
+  const built = [];
+  for (const folder of [console_, report]) {
+    const as = folder === console_ ? "static" : "report";
+    built.push(...(await readdir(folder)).map((name) => [`${as}/${name}`, join(folder, name)]));
+  }
+  const files = [...fixed, ...sources].map((name) => [name, join(here, name)]).concat(built);
+  files.sort(([a], [b]) => (a < b ? -1 : 1));
+  const lines = files.map(async ([name, path]) => {
+    return `${createHash("sha256").update(await readFile(path)).digest("hex")}  ${name}\n`;
+  });
+  return (await Promise.all(lines)).join("");
+}
 
 /** Licences of all packages whose code is in a bundle. */
 async function licences(all) {

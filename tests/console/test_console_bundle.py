@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -19,7 +20,8 @@ from tests.helpers.live_api import REPOSITORY
 
 CONSOLE = REPOSITORY / "service" / "console"
 REPORT = REPOSITORY / "mrasfm_engine" / "visualization" / "static"
-OLDEST_NODE = 18
+BUILT = {"static": FOLDER, "report": REPORT}
+OLDEST_NODE = 20
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if int(said.removeprefix("v").partition(".")[0]) < OLDEST_NODE:
         pytest.skip(f"node {said.strip()} is older than {OLDEST_NODE}")
     folder = tmp_path_factory.mktemp("sources") / "service" / "console"
-    ignored = shutil.ignore_patterns("node_modules", "static", "build")
+    ignored = shutil.ignore_patterns("node_modules", "static", "build", "build.sha256")
     shutil.copytree(CONSOLE, folder, ignore=ignored)
     done = subprocess.run([npm, "ci", "--ignore-scripts"], cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -40,6 +42,19 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_it_is_built_of_these_sources() -> None:
+    """What `build.mjs` built of what; the slow test builds it again."""
+    lines = (CONSOLE / "build.sha256").read_text(encoding="utf-8").splitlines()
+    named = {name: digest for digest, name in (line.split("  ", 1) for line in lines)}
+    files = {str(path.relative_to(CONSOLE)): path for path in (CONSOLE / "src").rglob("*") if path.is_file()}
+    files |= {name: CONSOLE / name for name in ("build.mjs", "package-lock.json", "package.json", "tsconfig.json")}
+    files |= {f"{label}/{path.name}": path for label, of in BUILT.items() for path in of.iterdir()}
+    contents = {name: path.read_bytes() for name, path in files.items()}
+    contents["build/openapi.json"] = openapi_text().encode()
+    assert named == {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}, "make console"
+
+
+@pytest.mark.slow  # a minute, for packages and compilers
 def test_it_is_built_again_byte_by_byte(sources: Path) -> None:
     (sources / "build").mkdir()
     (sources / "build" / "openapi.json").write_text(openapi_text())
@@ -58,6 +73,7 @@ def test_it_is_built_again_byte_by_byte(sources: Path) -> None:
         ):
             one.result()
     assert (sources / "src" / "api.d.ts").read_bytes() == (CONSOLE / "src" / "api.d.ts").read_bytes()
+    assert (sources / "build.sha256").read_bytes() == (CONSOLE / "build.sha256").read_bytes()
     for built, committed in ((own, FOLDER), (report, REPORT)):
         names = {path.name for path in built.iterdir()}
         assert names == {path.name for path in committed.iterdir()}
