@@ -1,4 +1,7 @@
-"""Every figure of README.md and docs/: `python -m tests.benchmarks.acceptance`.
+"""Figures of README.md and docs/: `python -m tests.benchmarks.acceptance`.
+
+Without arguments it measures the headline figures, with --thorough all lines but 4, which takes many hours; --only N
+makes parts of it. The results of a line are kept with commit and date, see --kept.
 
 | line | what |
 |---|---|
@@ -6,7 +9,7 @@
 | 2 | time of mapping a real drive beside COLMAP's mappers on the same matches, and of the whole way from images |
 | 3 | rendered drives: calibration found again, scale, a route that returns |
 | 4 | a fresh clone: tests and demo (only with --fresh-clone) |
-| 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests, crashes |
+| 5 | the service: the command's result over HTTP, large uploads, many clients, made-up requests |
 | 6 | the road: bumps and bays, moving shadows, a real drive on held-out images, with and without semantics |
 | 7 | covered cameras: their images' poses, and what is left without camera set registration |
 | 8 | a camera with a wrong extrinsic; what a straight street lets a drive observe |
@@ -40,6 +43,8 @@
 | 36 | simulated routes whose descriptors lie on disk: memory and time of matching and mapping |
 | 37 | maps of 15 and of 60 simulated scenes: time and memory of a scene |
 | 38 | the web console: five million points as they stream, a camera turned by 3 deg, the wheel in a fresh environment |
+| 39 | tests of the engine that make test leaves out for their time |
+| 40 | tests of service, workers and console that make test leaves out for their time |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -49,9 +54,12 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -59,6 +67,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 from rich.console import Console
 
@@ -93,11 +102,12 @@ from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.sigmas import halves, simulated
 from tests.benchmarks.simulated_routes import simulated_routes
+from tests.benchmarks.slow_tests import slow_tests_of_engine, slow_tests_of_service
 from tests.benchmarks.speed import from_descriptors, long_routes, speed, surround_speed
 from tests.benchmarks.stops import stops
 from tests.benchmarks.submaps import loop_over_borders, submaps
 from tests.benchmarks.surround_peers import surround_peers
-from tests.benchmarks.table import Figure, failed, save, show
+from tests.benchmarks.table import Figure, failed, load, save, show
 from tests.benchmarks.vehicles import vehicles
 from tests.benchmarks.whole_command import whole_command
 from tests.benchmarks.wrong_manifests import wrong_manifests
@@ -114,6 +124,10 @@ class Line:
     repeated: tuple[Callable[[Path, Path, int], Iterator[Figure]], ...] = ()  # timed, and how often: medians count
     untimed: tuple[Callable[[Path, Path], Iterator[Figure]], ...] = ()
     by_seed: tuple[Callable[[Path, int], Iterator[Figure]], ...] = ()  # of a folder of work and a seed
+
+    def tasks(self, seeds: int) -> int:
+        """Number of measurements with so many seeds."""
+        return len(self.timed) + len(self.repeated) + len(self.untimed) + seeds * len(self.by_seed)
 
 
 LINES = {
@@ -155,7 +169,12 @@ LINES = {
     "36": Line(timed=(from_descriptors,)),
     "37": Line(timed=(many_scenes,)),
     "38": Line(timed=(console,), untimed=(turned_camera, wheel)),
+    "39": Line(timed=(slow_tests_of_engine,)),
+    "40": Line(timed=(slow_tests_of_service,)),
 }
+# Accuracy on real drives, speed of mapping, of the adjustment and of the whole command, and drives with gaps.
+HEADLINE = ("1", "2", "13", "28", "35")
+KEPT = REPOSITORY / ".acceptance"
 
 
 @dataclass
@@ -164,19 +183,42 @@ class Run:
 
     data: Path
     work: Path
+    about: dict[str, Any]  # what is kept with the figures of every line
     started_s: float = field(default_factory=time.perf_counter)
     figures: dict[tuple[str, int], list[Figure]] = field(default_factory=dict)
+    seconds: Counter[str] = field(default_factory=Counter)  # by line, of all its tasks
+    measured: Counter[str] = field(default_factory=Counter)  # tasks by line
+    keeping: threading.Lock = field(default_factory=threading.Lock)
 
     def measure(self, line: str, part: int, measure: Callable[[Path], Iterator[Figure]], work: Path) -> None:
-        """Run one task; what keeps it from its end is a figure that fails."""
-        figures = self.figures[line, part]
+        """Run one task and keep the line's figures; what keeps it from its end is a figure that fails."""
+        figures, started_s = self.figures[line, part], time.perf_counter()
         try:
             for figure in measure(work):
                 figures.append(figure)
                 print(_progress(figure, time.perf_counter() - self.started_s), file=sys.stderr, flush=True)
-        except (CommandFailed, AssertionError) as problem:
-            figures.append(failed(line, "the line was not measured to its end", str(problem)))
-            print(f"line {line}: {problem}", file=sys.stderr, flush=True)
+        except Exception as problem:  # whatever it is: other lines can be measured
+            said = str(problem) if isinstance(problem, CommandFailed | AssertionError) else repr(problem)
+            figures.append(failed(line, "the line was not measured to its end", said))
+            print(f"line {line}: {said}", file=sys.stderr, flush=True)
+        with self.keeping:
+            self.seconds[line] += time.perf_counter() - started_s
+            self.measured[line] += 1
+            self._keep(line)
+
+    def _keep(self, line: str) -> None:
+        """Keep the line's figures; those of an earlier measurement go once all tasks are done."""
+        tasks = LINES[line].tasks(len(self.about["seeds"]))
+        path = KEPT / f"{line}{'-thorough' if self.about['thorough'] else ''}.json"
+        partial_path = path.with_suffix(".partial.json")
+        about = {"seconds": round(self.seconds[line], 1), "tasks": f"{self.measured[line]} of {tasks}"}
+        save(self.of_line(line), partial_path, self.about | about)
+        if self.measured[line] == tasks:
+            partial_path.replace(path)
+
+    def of_line(self, line: str) -> list[Figure]:
+        """Figures of a line, in the order of its tasks."""
+        return [figure for key, part in list(self.figures.items()) if key[0] == line for figure in part]
 
     def alone(self, lines: Sequence[str], repeat: int) -> None:
         """What is timed, one after the other in one folder: scenes are used again."""
@@ -209,12 +251,11 @@ class Run:
                 cores.put(core)
 
         with ThreadPoolExecutor(cores.qsize()) as pool:
-            futures = []
+            begun = []
             for line, measure in tasks:
-                part = len(self.figures)
-                self.figures[line, part] = []
-                futures.append(pool.submit(run, line, part, measure))
-            for future in futures:
+                begun.append((line, len(self.figures), measure))
+                self.figures[line, len(self.figures)] = []
+            for future in [pool.submit(run, *task) for task in begun]:
                 future.result()
 
 
@@ -230,6 +271,31 @@ def _repeated(
 
 def main() -> int:
     """Measure, print, and save; 1 where a figure is out of its bounds."""
+    arguments = _arguments()
+    if arguments.kept:
+        return _show_kept()
+    data = Path(os.environ.get("MRASFM_TEST_DATA", REPOSITORY.parent / "shared")) / "data"
+    if not data.is_dir():
+        sys.exit(f"real drives are missing: {data} (set MRASFM_TEST_DATA)")
+    about = _about() | {name: getattr(arguments, name) for name in ("thorough", "seeds", "repeat")}
+    with tempfile.TemporaryDirectory(prefix="mrasfm-acceptance-") as work:
+        run = Run(data.resolve(), Path(work), about)
+        run.alone(arguments.lines, arguments.repeat)
+        run.side_by_side(arguments.lines, arguments.seeds)
+        seconds = time.perf_counter() - run.started_s
+    figures = [figure for line in arguments.lines for figure in run.of_line(line)]
+    console = Console(width=140)
+    show(figures, console)
+    bad = [figure for figure in figures if not figure.passed]
+    if arguments.out is not None:
+        save(figures, arguments.out, about | {"seconds": round(seconds, 1)})
+    console.print(f"{len(bad)} of {sum(f.bounded for f in figures)} figures out of bounds, {seconds / 60:.0f} min")
+    console.print(f"Kept in {KEPT}", soft_wrap=True)
+    return 1 if bad or not figures else 0
+
+
+def _arguments() -> argparse.Namespace:
+    """Arguments, with `lines` to measure, `seeds` and `repeat` as numbers."""
     parser = argparse.ArgumentParser(
         prog="acceptance", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -237,32 +303,46 @@ def main() -> int:
     parser.add_argument("--seeds", default="1", help="of rendered drives (default: %(default)s)")
     parser.add_argument("--repeat", type=int, default=1, help="times that count by their median (default: %(default)s)")
     parser.add_argument(
-        "--thorough", action="store_true", help=f"as published: seeds {','.join(map(str, SEEDS))}, medians of three"
+        "--thorough",
+        action="store_true",
+        help=f"all lines but 4, as published: seeds {','.join(map(str, SEEDS))}, medians of three",
     )
     parser.add_argument("--fresh-clone", action="store_true", help="line 4 too")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "build" / "acceptance.json", metavar="FILE")
+    parser.add_argument("--kept", action="store_true", help="measure nothing, show the kept results of all lines")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write all figures there as well")
     arguments = parser.parse_args()
-    seeds = list(SEEDS) if arguments.thorough else [int(seed) for seed in arguments.seeds.split(",")]
-    lines = arguments.only.split(",") if arguments.only else [line for line in LINES if line != "4"]
-    lines += ["4"] if arguments.fresh_clone and "4" not in lines else []
-    if unknown := set(lines) - set(LINES):
+    arguments.seeds = list(SEEDS) if arguments.thorough else [int(seed) for seed in arguments.seeds.split(",")]
+    arguments.repeat = THOROUGH_REPEAT if arguments.thorough else arguments.repeat
+    default = [line for line in LINES if line != "4"] if arguments.thorough else list(HEADLINE)
+    arguments.lines = list(dict.fromkeys(arguments.only.split(","))) if arguments.only else default
+    arguments.lines += ["4"] if arguments.fresh_clone and "4" not in arguments.lines else []
+    if unknown := set(arguments.lines) - set(LINES):
         parser.error(f"there is no line {', '.join(sorted(unknown))}")
-    data = Path(os.environ.get("MRASFM_TEST_DATA", REPOSITORY.parent / "shared")) / "data"
-    if not data.is_dir():
-        parser.error(f"real drives are missing: {data} (set MRASFM_TEST_DATA)")
-    with tempfile.TemporaryDirectory(prefix="mrasfm-acceptance-") as work:
-        run = Run(data.resolve(), Path(work))
-        run.alone(lines, THOROUGH_REPEAT if arguments.thorough else arguments.repeat)
-        run.side_by_side(lines, seeds)
-        seconds = time.perf_counter() - run.started_s
-    figures = [figure for line in lines for key, part in run.figures.items() if key[0] == line for figure in part]
-    console = Console(width=140)
-    show(figures, console)
-    bad = [figure for figure in figures if not figure.passed]
-    save(figures, arguments.out, _about(seconds))
-    console.print(f"{len(bad)} of {sum(f.bounded for f in figures)} figures out of bounds, {seconds / 60:.0f} min")
-    console.print(f"Written to {arguments.out}", soft_wrap=True)
-    return 1 if bad or not figures else 0
+    return arguments
+
+
+def _show_kept() -> int:
+    """Print all kept results; 1 where a figure is out of its bounds, a task is missing, or a line has none.
+
+    Line 4 is measured where it is asked for.
+    """
+    console, bad = Console(width=140), False
+    for line in LINES:
+        paths = [path for path in sorted(KEPT.glob("*.json")) if path.name.split(".")[0].split("-")[0] == line]
+        for path in paths:
+            about, figures = load(path)
+            done, _, tasks = about["tasks"].partition(" of ")
+            seeds = ", ".join(map(str, about["seeds"]))
+            console.print(
+                f"line {line}: {about['at']}, commit {about['commit']}, {about['seconds'] / 60:.0f} min on "
+                f"{about['cores']} cores, seeds {seeds}, medians of {about['repeat']}, {about['tasks']} tasks"
+            )
+            show(figures, console)
+            bad = bad or done != tasks or not all(figure.passed for figure in figures)
+        if not paths and line != "4":
+            console.print(f"line {line}: not measured here")
+            bad = True
+    return 1 if bad else 0
 
 
 def _progress(figure: Figure, elapsed_s: float) -> str:
@@ -270,13 +350,26 @@ def _progress(figure: Figure, elapsed_s: float) -> str:
     return f"[{elapsed_s:6.0f} s] {figure.line} {figure.what}: {figure.value:.4g} {figure.unit}{verdict}"
 
 
-def _about(seconds: float) -> dict[str, object]:
+def _about() -> dict[str, Any]:
     return {
         "version": __version__,
+        "commit": _commit(),
         "at": datetime.now(UTC).isoformat(timespec="seconds"),
         "cores": os.cpu_count(),
-        "seconds": round(seconds, 1),
     }
+
+
+def _commit() -> str:
+    """The commit that is measured, with a plus where files differ from it."""
+    run = partial(subprocess.run, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    try:
+        commit, changed = (
+            run(["git", *arguments]).stdout.strip()
+            for arguments in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain"))
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return commit + ("+" if changed else "")
 
 
 if __name__ == "__main__":

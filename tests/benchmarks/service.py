@@ -18,17 +18,13 @@ from tests.benchmarks.commands import CommandFailed, mrasfm, read_report
 from tests.benchmarks.real_drives import imported, reconstructed
 from tests.benchmarks.service_load import FUZZED_REQUESTS, MAX_RSS_BYTES, MIN_RATE_RATIO
 from tests.benchmarks.service_under_load import MAX_POLL_P99_S, MAX_SLOWDOWN
+from tests.benchmarks.slow_tests import OF_MAPS, passed
 from tests.benchmarks.standalone import standalone
 from tests.benchmarks.table import Figure, exactly
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DRIVE = "kitti06"
 DIFFERENCE_M = 0.02
-OF_MAPS = (
-    ("tests/worker/test_map_over_http.py", "seven drives over HTTP, one broken, a worker killed: one map of six"),
-    ("tests/service/test_upload_kills.py", "an upload whose API is killed at 50 random bytes has the right digest"),
-)
-
 KILLS = 10
 OF_KILLS = {
     "lost": "after them, lost: drives, files, jobs, scenes, maps",
@@ -74,7 +70,6 @@ def service(data: Path, work: Path) -> Iterator[Figure]:
         above=FUZZED_REQUESTS - 1,
         most=1e6,
     )
-    yield _passed("5", "long tests, of crashes and leases among them", "tests", *(f"--ignore={t}" for t, _ in OF_MAPS))
 
 
 def _under_load() -> Iterator[Figure]:
@@ -102,7 +97,7 @@ def _under_load() -> Iterator[Figure]:
 def maps_over_http(data: Path, work: Path) -> Iterator[Figure]:
     """Line 20f: the service's part of aggregation."""
     for test, what in OF_MAPS:
-        yield _passed("20f", what, test)
+        yield passed("20f", what, test)
 
 
 def kills(data: Path, work: Path) -> Iterator[Figure]:
@@ -129,11 +124,6 @@ def kills(data: Path, work: Path) -> Iterator[Figure]:
         above=-1.0,
         most=MOST_HELD_S,
     )
-
-
-def _passed(line: str, what: str, *arguments: str) -> Figure:
-    done = subprocess.run([sys.executable, "-m", "pytest", "-q", "-m", "slow", *arguments], cwd=REPOSITORY, check=False)
-    return exactly(line, f"{what}: exit code + 1", done.returncode + 1, 1)
 
 
 def _same_scene(data: Path, work: Path) -> Iterator[Figure]:

@@ -83,4 +83,17 @@ def save(figures: Sequence[Figure], path: Path, about: dict[str, Any]) -> None:
         for key in ("value", "most"):
             row[key] = float(row[key]) if row[key] is not None and math.isfinite(row[key]) else None
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**about, "figures": rows}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    beside = path.with_name(f"{path.name}.new")  # no reader sees half a file
+    beside.write_text(json.dumps({**about, "figures": rows}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    beside.replace(path)
+
+
+def load(path: Path) -> tuple[dict[str, Any], list[Figure]]:
+    """Read what `save` wrote: what the figures are about, and the figures."""
+    about = json.loads(path.read_text(encoding="utf-8"))
+    rows = about.pop("figures")
+    for row in rows:
+        row["most"] = math.inf if row["passed"] is not None and row["most"] is None else row["most"]
+        row["value"] = math.nan if row["value"] is None else row["value"]
+        del row["passed"]
+    return about, [Figure(**row) for row in rows]

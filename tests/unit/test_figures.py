@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.benchmarks.table import Figure, exactly, failed, save
+from tests.benchmarks.table import Figure, exactly, failed, load, save
 
 
 def test_figures_are_saved_as_they_were_measured(tmp_path: Path) -> None:
@@ -24,6 +24,9 @@ def test_figures_are_saved_as_they_were_measured(tmp_path: Path) -> None:
     assert saved["cores"] == 2
     rows = [(row["value"], row["most"], row["passed"]) for row in saved["figures"]]
     assert rows == [(0.5, 0.4, False), (3, 3, True), (2.5, None, None), (None, None, False)]
+    about, again = load(tmp_path / "deep" / "figures.json")
+    assert about == {"cores": 2}
+    assert [(f.what, f.bounded, f.passed) for f in again] == [(f.what, f.bounded, f.passed) for f in figures]
 
 
 @pytest.mark.parametrize("value", [0.0, -0.1, 0.11, math.nan, math.inf])
