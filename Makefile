@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 ACCEPTANCE ?=
 
-.PHONY: help setup demo test check docs console acceptance lock wheels schema clean
+.PHONY: help setup demo test slow check docs console acceptance lock wheels schema clean
 
 help: ## what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -23,7 +23,10 @@ demo: setup ## render two drives of a street, get their scenes and the map of bo
 	$(BIN)/mrasfm demo --out demo
 
 test: setup ## the fast suite and one real drive
-	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -m "not slow" -n 4 --dist loadfile --no-loadscope-reorder
+
+slow: setup ## the tests that make test leaves out for their time: an hour or two
+	$(BIN)/python -m pytest -m slow -n 2 --dist loadfile --no-loadscope-reorder
 
 check: setup ## lint, types, import contracts, links and generated pages of the documentation
 	$(BIN)/ruff check .
@@ -35,12 +38,12 @@ check: setup ## lint, types, import contracts, links and generated pages of the 
 docs: setup ## rewrite the generated pages of docs/
 	$(BIN)/python -m tests.documentation
 
-console: setup ## build the web console and the report's script from service/console/src (needs node 18 or newer and npm)
+console: setup ## build the web console and the report's script from service/console/src (needs node 20 or newer and npm)
 	mkdir -p service/console/build
 	$(BIN)/python -m service.api.openapi_export service/console/build/openapi.json
 	cd service/console && npm ci --ignore-scripts && npm run build
 
-acceptance: setup ## every figure of README.md and docs/, as a table (real drives needed; ACCEPTANCE="--only 1,2", ACCEPTANCE=--thorough)
+acceptance: setup ## the headline figures of README.md as a table (real drives needed; ACCEPTANCE="--only 5,7", ACCEPTANCE=--thorough)
 	$(BIN)/python -m tests.benchmarks.acceptance $(ACCEPTANCE)
 
 lock: ## renew the locks: of pyproject.toml all, and what the container image needs; readers of others (needs uv)

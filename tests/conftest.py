@@ -30,13 +30,20 @@ sys.dont_write_bytecode = False
 
 # Kernels are compiled once for all test processes, while these run the tests that need none.
 _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
-_WITHOUT_KERNELS = (REPOSITORY / "tests" / "service", REPOSITORY / "tests" / "unit" / "schemas")
+NICENESS = 5  # of test processes while kernels are compiled
+_OF_UNIT = ("commands", "documentation", "importers", "io", "learned", "preflight", "scene", "schemas")
+_WITHOUT_KERNELS = (  # or with a few that compile in a second
+    REPOSITORY / "tests" / "service",
+    *(REPOSITORY / "tests" / "unit" / name for name in (*_OF_UNIT, "test_vocabulary.py")),
+)
 _compiler = pytest.StashKey[subprocess.Popen[bytes]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin to compile before the test processes begin."""
+    """Begin to compile before the test processes begin, which give way to it: all of them wait for it in the end."""
     several = getattr(config.option, "numprocesses", None)
+    if "PYTEST_XDIST_WORKER" in os.environ and _KERNEL_LOCK in os.environ:
+        os.nice(NICENESS)
     if "PYTEST_XDIST_WORKER" in os.environ or not several or _is_compiled(config):
         return
     path = Path(config.cache.mkdir("kernels")) / "lock" if config.cache else REPOSITORY / ".kernels.lock"

@@ -31,6 +31,7 @@ def components(*folders: str) -> list[SceneComponent]:
     ]
 
 
+@pytest.mark.slow
 def test_a_component_is_exported_from_its_scenes_page(
     open_console: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

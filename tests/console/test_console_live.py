@@ -30,6 +30,7 @@ def shown_percent(page: Page) -> float:
     return float(page.locator(".row .progress .number").inner_text().removesuffix(" %"))
 
 
+@pytest.mark.slow
 def test_eight_pages_live_with_one_stream(open_console: Open, world: World) -> None:
     """A browser opens six connections to a host: a stream for each page would leave none for requests."""
     client = world.api.client()

@@ -39,7 +39,7 @@ def choose(page: Page, what: Path) -> None:
     page.locator(f"input[name={'folder' if what.is_dir() else 'archive'}]").set_input_files(what)
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "mrasfm.test"])
+@pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("mrasfm.test", marks=pytest.mark.slow)])
 def test_a_folder_is_uploaded_once(open_console: Open, world: World, tmp_path: Path, host: str) -> None:
     """Also on a host name that is no secure context, where browsers have no crypto.subtle."""
     client, drive = world.api.client(), tiny_drive("uploaded", seed=f"uploaded {host}")
@@ -95,6 +95,7 @@ def stored_files(client: Client) -> int:
     return sum(drive["files_stored"] for drive in client.get("/v1/drives").json()["items"])
 
 
+@pytest.mark.slow
 def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
     open_console: Open, world: World, tmp_path: Path
 ) -> None:
@@ -147,6 +148,7 @@ def archive_of(drive: TinyDrive, path: Path, *, top: str = "my drive/", **others
     return path
 
 
+@pytest.mark.slow
 def test_archives_are_uploaded_once(open_console: Open, world: World, tmp_path: Path) -> None:
     page = open_console(world.api.url).new_page()
     client = world.api.client()
@@ -189,6 +191,7 @@ def test_an_archive_with_a_wrong_name_is_refused_before_its_bytes_are_sent(
     assert client.get("/v1/drives").json()["items"] == [], "no drive is left open"
 
 
+@pytest.mark.slow
 def test_what_is_dropped_is_taken(open_console: Open, world: World, tmp_path: Path) -> None:
     page, client = open_console(world.api.url).new_page(), world.api.client()
     log_in(page, world.api.url, client.key)

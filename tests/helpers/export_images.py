@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry.camera_model import pack_camera, unproject_pixels
 from mrasfm_engine.preflight.drive_reader import write_manifest
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.types import Bytes, Floats
+from mrasfm_engine.types import Floats
 from schemas import Camera, FrameImage, Pose
 from tests.helpers.export_example import make_scene
 
@@ -36,10 +37,13 @@ def camera_of(model: str, params: Sequence[float]) -> Camera:
     return Camera(name="c", model=model, width=WIDTH, height=HEIGHT, params=list(params), rig_from_cam=pose)
 
 
-def image_of(model: str, params: Floats) -> Bytes:
+@cache
+def image_of(model: str, params: tuple[float, ...], kind: str) -> bytes:
+    """A file of what a camera shows."""
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     rays = unproject_pixels(*pack_camera(model, params), np.stack([u, v], -1).reshape(-1, 2))
-    return np.round(seen_along(rays)).reshape(HEIGHT, WIDTH, 3).astype(np.uint8)
+    rgb = np.round(seen_along(rays)).reshape(HEIGHT, WIDTH, 3).astype(np.uint8)
+    return cv2.imencode(f".{kind}", rgb[..., ::-1])[1].tobytes()
 
 
 def written(
@@ -66,7 +70,7 @@ def written(
     manifest = manifest.model_copy(update={"frames": frames})
     for camera, found in zip(manifest.rig.cameras, scene.calibration, strict=True):
         (tmp_path / "drive" / camera.name).mkdir()
-        pixels = cv2.imencode(f".{kind}", image_of(camera.model, found.params)[..., ::-1])[1].tobytes()
+        pixels = image_of(camera.model, tuple(map(float, found.params)), kind)
         mask = np.zeros((HEIGHT, WIDTH), np.uint8)
         mask[:, 500:600] = 13  # a car
         for frame in manifest.frames:

@@ -192,13 +192,19 @@ def true_matches(
 ) -> list[PairMatches]:
     """Matches of all image pairs up to `window` units apart that share points; `wrong` more in each are mismatched."""
     rng = np.random.default_rng(seed)
-    images, result = simulated.drive.images, []
+    images, result, points = simulated.drive.images, [], simulated.point_of_keypoint
+    by_point = [np.argsort(of)[np.count_nonzero(of < 0) :] for of in points]  # keypoints of each image
+    keypoint_a = np.full(1 + max(int(of.max(initial=0)) for of in points), -1)  # of every point in image a
     for a in range(len(images)):
+        of_a = points[a]
+        keypoint_a[:] = -1
+        keypoint_a[of_a[by_point[a]]] = by_point[a]
         for b in range(a + 1, len(images)):
             if images[b].unit - images[a].unit > window:
                 break
-            of_a, of_b = simulated.point_of_keypoint[a], simulated.point_of_keypoint[b]
-            _, i, j = np.intersect1d(np.where(of_a < 0, -2, of_a), np.where(of_b < 0, -3, of_b), return_indices=True)
+            of_b = points[b]
+            i = keypoint_a[of_b[by_point[b]]]
+            i, j = i[i >= 0], by_point[b][i >= 0]
             if len(i) < min_matches:
                 continue
             k = min(wrong, len(i))

@@ -16,6 +16,7 @@ import httpx
 import psutil
 
 from service.standalone.broker import JOURNAL
+from tests.helpers.live_api import NO_CERTIFICATES
 from tests.helpers.service_world import DEADLINE_S, wait_until
 
 ORDER_SEED = 5  # of killing everything
@@ -45,7 +46,7 @@ class Standalone:
         self._command += ["--workers", str(workers)]
         self._environment = environment
         self.process: subprocess.Popen[bytes] | None = None
-        self._client = httpx.Client(timeout=30, trust_env=False)
+        self._client = httpx.Client(timeout=30, trust_env=False, verify=NO_CERTIFICATES)
 
     def start(self) -> None:
         environment = {

@@ -35,6 +35,7 @@ def test_every_part_is_on_by_default_and_each_switch_turns_off_one() -> None:
         assert before == after
 
 
+@pytest.mark.slow
 def test_what_the_road_is_known_by_without_masks_depends_on_a_model_for_them(small: Variant) -> None:
     for frame in small.document["frames"]:
         for image in frame["images"].values():

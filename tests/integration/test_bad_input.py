@@ -141,6 +141,7 @@ def test_damaged_manifest(variant: Variant, mrasfm: Run, damage: Callable[[Docum
     assert words in refused(variant.save(), mrasfm)
 
 
+@pytest.mark.slow
 def test_no_gnss_ignores_a_bad_receiver(variant: Variant, mrasfm: Run) -> None:
     gnss_on_gps_time(variant.document)
     variant.keep(cameras=["front", "left"], units=3)
@@ -174,6 +175,7 @@ def test_nothing_matches(variant: Variant, mrasfm: Run) -> None:
     assert [path.name for path in variant.scene.iterdir()] == [".stages"]
 
 
+@pytest.mark.slow
 def test_oddities_are_warned_of_and_used(variant: Variant, mrasfm: Run) -> None:
     """An image that is not listed, one of 16 bits, one with alpha."""
     variant.keep(cameras=["front", "left"], units=4)
@@ -196,6 +198,7 @@ def test_oddities_are_warned_of_and_used(variant: Variant, mrasfm: Run) -> None:
         assert words in result.out
 
 
+@pytest.mark.slow
 def test_two_frames(variant: Variant, mrasfm: Run) -> None:
     variant.keep(units=2)
     result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES)

@@ -45,6 +45,7 @@ def test_the_own_car_is_left_out(tmp_path: Path, mrasfm: Callable[..., CommandRe
     assert (scene / "own_car" / "front.png").is_file()
 
 
+@pytest.mark.slow
 def test_the_search_can_be_switched_off(variant: Variant, tmp_path: Path, mrasfm: Callable[..., CommandResult]) -> None:
     config, scene = tmp_path / "off.toml", tmp_path / "scene"
     config.write_text("[features]\nown_car = false\n[output]\npictures = false\n", encoding="utf-8")

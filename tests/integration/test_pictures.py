@@ -48,6 +48,7 @@ def test_cameras_agree_better_with_the_refined_calibration(perturbed_scene: Path
     assert 0 < after["displacement_m"] < 0.7 * before["displacement_m"] < 0.3
 
 
+@pytest.mark.slow
 def test_markings_are_where_they_are(surround_scene: Path, surround_drive: Path) -> None:
     off_m = _off_the_stripes_m(surround_scene, surround_drive, "birds_eye_after.png")
     assert 0.01 < np.median(off_m) < 0.05  # the stripes are 12 to 14 cm wide

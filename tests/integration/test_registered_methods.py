@@ -36,6 +36,7 @@ def test_a_name_without_a_line_is_refused() -> None:
         ReconstructionSettings(matcher="cross-check")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("registered")
 def test_a_drive_is_reconstructed_with_it(
     mrasfm: Callable[..., CommandResult], variant: Variant, tmp_path: Path

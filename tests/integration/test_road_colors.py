@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import laspy
 import numpy as np
+import pytest
 from pyproj import Transformer
 
 DOUBLE_BYTES = 8
@@ -26,6 +27,7 @@ def doubles(path: Path, tag: int) -> np.ndarray:
     raise AssertionError(f"{path} has no tag {tag}")
 
 
+@pytest.mark.slow
 def test_points_have_the_colours_of_the_picture_at_their_place_only(surround_scene: Path) -> None:
     """It ties the points, their reference system, the picture and its projection together."""
     las = laspy.read(surround_scene / "points.copc.laz")

@@ -80,6 +80,7 @@ def test_the_report_has_every_sub_map(drive: Path, scene: Path) -> None:
     assert {f"{stage}" for stage in report["by_stage"]} >= set(STAGES)
 
 
+@pytest.mark.slow
 def test_sub_maps_that_others_have_done_are_not_done_again(drive: Path, scene: Path, tmp_path: Path) -> None:
     """As workers do them: each has its own files alone, and what the plan left."""
     out, seen = tmp_path / "scene", list[tuple[str, int, int]]()

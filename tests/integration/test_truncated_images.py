@@ -83,6 +83,7 @@ def test_all_truncated(variant: Variant, mrasfm: Run) -> None:
     assert not variant.scene.exists()
 
 
+@pytest.mark.slow
 def test_nothing_of_the_grey_rest_is_in_the_scene(variant: Variant, mrasfm: Run, tmp_path: Path) -> None:
     """A truncated image counts as one that was never recorded."""
     variant.keep(cameras=CAMERAS, units=5)

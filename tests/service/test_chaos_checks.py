@@ -27,6 +27,8 @@ from tests.benchmarks.chaos.records import Records
 from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, api_in_thread, settings_of
 from tests.helpers.tiny_drive import TinyDrive, tiny_drive
 
+pytestmark = pytest.mark.slow  # a benchmark checks with them
+
 FILES = {"points.ply": b"ply\n" * 100, "report.json": b"{}"}
 
 

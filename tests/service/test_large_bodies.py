@@ -93,6 +93,7 @@ def seconds_of_a_large_one(client: Client, timeout_s: float) -> float:
     return time.perf_counter() - started_s
 
 
+@pytest.mark.slow
 def test_slow_bodies_of_one_key_hold_up_no_other_project(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     alone_s = seconds_of_a_large_one(api.client(), 60)
     monkeypatch.setattr(body_reading, "_GRACE_S", 600.0)

@@ -35,7 +35,7 @@ class Older:
     standalone: Standalone
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
 def older(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Older]:
     with tarfile.open(ARCHIVE) as archive:
         # Python before 3.11.4 has no filters, and those from 3.12 on want one.

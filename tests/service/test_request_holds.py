@@ -215,6 +215,7 @@ def check_committed_once(client: Client, drive_id: str, answer: httpx.Response) 
         assert session.get_one(Drive, drive_id).preflight_job_id == answer.json()["preflight_job_id"]
 
 
+@pytest.mark.slow
 def test_a_kill_between_hold_and_effect(tmp_path: Path) -> None:
     with api_process(settings_of(tmp_path / "data"), tmp_path) as api:
         client = api.client()

@@ -50,6 +50,7 @@ def test_processes_serve_count_and_end_together(api: ApiProcess) -> None:
     assert not [process for process in left if process.is_running()]
 
 
+@pytest.mark.slow
 def test_a_parent_that_is_killed_leaves_nobody(api: ApiProcess) -> None:
     wait_until(lambda: len(serving(api)) == 2, "both")
     left = serving(api)

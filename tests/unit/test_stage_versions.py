@@ -41,6 +41,7 @@ def key_in(packages: Path, drive: Path) -> str:
     return key
 
 
+@pytest.mark.slow
 def test_a_comment_invalidates_nothing(
     tmp_path: Path, write_drive: Callable[[Any], Path], drive_document: dict[str, Any]
 ) -> None:

@@ -107,6 +107,7 @@ def test_reconstruction_and_another_that_reuses_its_stages(
     assert seen[-1].reused == ("features", "matches", "mapping")
 
 
+@pytest.mark.slow
 def test_bad_input_has_the_words_of_the_command(
     own_drive: Path, scratch: Path, settings: Settings, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,6 +160,7 @@ def test_models_are_looked_for_where_the_worker_says(
     assert isinstance(attempt(small_drive, scratch, settings, segmentation_model="streets"), Succeeded)
 
 
+@pytest.mark.slow
 def test_drive_that_cannot_be_reconstructed(own_drive: Path, scratch: Path, settings: Settings) -> None:
     """Every image is the same grey."""
     from cv2 import imread, imwrite
@@ -172,6 +174,7 @@ def test_drive_that_cannot_be_reconstructed(own_drive: Path, scratch: Path, sett
     assert (outcome.code, outcome.retryable, outcome.stage) == ("no-features", False, "features")
 
 
+@pytest.mark.slow
 def test_preflight_of_a_sound_drive(small_drive: Path, scratch: Path, settings: Settings) -> None:
     outcome = attempt(small_drive, scratch, settings, work=Work.PREFLIGHT)
     assert isinstance(outcome, Succeeded)
@@ -179,6 +182,7 @@ def test_preflight_of_a_sound_drive(small_drive: Path, scratch: Path, settings: 
     assert all(finding["severity"] == "warning" for finding in outcome.report["findings"])
 
 
+@pytest.mark.slow
 def test_preflight_finds_a_damaged_image(own_drive: Path, scratch: Path, settings: Settings) -> None:
     file = sorted((own_drive / "images").rglob("*.jpg"))[0]
     file.write_bytes(b"")
@@ -188,6 +192,7 @@ def test_preflight_finds_a_damaged_image(own_drive: Path, scratch: Path, setting
     assert [finding["code"] for finding in outcome.report["findings"]] == ["empty-file"]
 
 
+@pytest.mark.slow
 def test_preflight_finds_an_inverted_calibration(own_drive: Path, scratch: Path, settings: Settings) -> None:
     """Of a stereo pair in axes where its inverse stands upright too: only the images tell."""
     path = own_drive / "drive.json"
@@ -214,6 +219,7 @@ def test_killed_child(small_drive: Path, scratch: Path, settings: Settings) -> N
     assert "was killed" in outcome.what
 
 
+@pytest.mark.slow
 def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
     outcome = attempt_with_a_signal(small_drive, scratch, settings, signal.SIGABRT)
     assert isinstance(outcome, Failed)
@@ -238,6 +244,7 @@ def test_cancel(small_drive: Path, scratch: Path, settings: Settings) -> None:
     assert '"cancelled"' in AttemptFolder(scratch).result.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_timeout(small_drive: Path, scratch: Path, tmp_path: Path) -> None:
     outcome = attempt(small_drive, scratch, settings_with(tmp_path, job_timeout_seconds=0.5))
     assert isinstance(outcome, Failed)
@@ -245,6 +252,7 @@ def test_timeout(small_drive: Path, scratch: Path, tmp_path: Path) -> None:
     assert "0.5 s" in outcome.what
 
 
+@pytest.mark.slow
 def test_full_disk(small_drive: Path, scratch: Path, settings: Settings) -> None:
     """Writing into the scene's folder fails, as the engine says; later it may not."""
     AttemptFolder(scratch).out.write_text("a file where the folder belongs", encoding="utf-8")

@@ -84,6 +84,7 @@ def test_a_silent_worker_after_a_database_that_was_away(clocks: Clocks) -> None:
     assert clocks.counts(clock_guard, waits_s=15.0)
 
 
+@pytest.mark.slow
 def test_step_of_the_clock(world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Live workers keep their jobs; who died is replaced in the time of a lease, however far the clock was set back."""
     off_us = 0

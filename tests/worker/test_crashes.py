@@ -172,6 +172,7 @@ def test_everything_is_killed(world: World, brief_drive: Path) -> None:
     assert_one_scene(world, job_id, ["worker-lost", "succeeded"])
 
 
+@pytest.mark.slow
 def test_killed_worker_leaves_no_temporary_files(
     world: World, brief_drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,7 +285,14 @@ def test_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:
     wait_until(lambda: not JobQueue(world.settings).waiting(), "no message is left behind")
 
 
-@pytest.mark.parametrize("signals", [["SIGTERM", "SIGTERM"], ["SIGQUIT"], ["SIGTERM", "SIGQUIT"]])
+@pytest.mark.parametrize(
+    "signals",
+    [
+        pytest.param(["SIGTERM", "SIGTERM"], marks=pytest.mark.slow),
+        ["SIGQUIT"],
+        pytest.param(["SIGTERM", "SIGQUIT"], marks=pytest.mark.slow),
+    ],
+)
 def test_impatient_stop(world: World, brief_drive: Path, signals: list[str]) -> None:
     """With a stage that does not listen: the job is given back all the same."""
     worker = world.start_worker()
@@ -335,6 +343,7 @@ def test_cancel_while_it_runs(world: World, brief_drive: Path) -> None:
     assert world.scenes() == []
 
 
+@pytest.mark.slow
 def test_cancel_of_a_stage_that_hangs(world: World, brief_drive: Path) -> None:
     """A stopped process acts neither on the request nor on SIGTERM."""
     world.start_worker()
@@ -346,6 +355,7 @@ def test_cancel_of_a_stage_that_hangs(world: World, brief_drive: Path) -> None:
     wait_until(lambda: list(world.settings.scratch_dir.iterdir()) == [], "the end of the scratch folder")
 
 
+@pytest.mark.slow
 def test_cancel_when_the_worker_is_dead(world: World, brief_drive: Path) -> None:
     worker = world.start_worker()
     job_id = world.ask(world.add_drive(brief_drive))

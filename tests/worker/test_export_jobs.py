@@ -118,6 +118,7 @@ def test_an_export_with_images_is_made_of_the_drives_files(world: World, scene_i
     assert ask(world, scene_id, "colmap", image_size_px=320)[1] is not None
 
 
+@pytest.mark.slow
 @pytest.mark.engine
 def test_what_the_engine_refuses_ends_the_job_with_its_words(world: World, scene_id: str) -> None:
     """An image of the drive is another by now: as if a disk had lied."""

@@ -230,7 +230,7 @@ def break_endings(
     return broken
 
 
-@pytest.mark.parametrize("answer_lost", [False, True])
+@pytest.mark.parametrize("answer_lost", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_database_that_is_away_when_the_scene_is_published(
     world: World,
     brief_drive: Path,
@@ -257,6 +257,7 @@ def test_database_that_is_away_when_the_scene_is_published(
     assert all(world.artifacts.read(key) is not None for key in keys)
 
 
+@pytest.mark.slow
 def test_database_that_is_away_when_a_check_ends(
     world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def never(monkeypatch: pytest.MonkeyPatch, error: Exception) -> list[bool]:
     return asked
 
 
+@pytest.mark.slow
 def test_store_that_is_away_for_seconds(world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While the drive is brought, and when hours of work are published."""
     job_id = world.ask(world.add_drive(brief_drive), wake=False)

@@ -212,6 +212,7 @@ def test_ends_without_a_result(scratch: Path, settings: Settings, source: str, c
     assert len(outcome.remedy) > 10
 
 
+@pytest.mark.slow
 def test_output_is_bounded_and_its_end_is_kept(scratch: Path, settings: Settings) -> None:
     source = "import sys\nfor i in range(1_000_000): print(f'line {i:07d}')\nsys.stderr.write('the \\0end\\xff\\n')"
     outcome = run(source, scratch, settings)

@@ -293,6 +293,7 @@ def test_an_address_where_nobody_listens(database: Database, settings: Settings,
     assert "ConnectError" in str(delivery.error)
 
 
+@pytest.mark.slow
 def test_messages_survive_a_kill_of_the_reconciler(tmp_path: Path, receiver: Receiver) -> None:
     """The service is killed between the end of a job and its message, and sends it when it is back."""
     world = World(tmp_path / "world", webhook_private_addresses=True, webhook_seconds=0.2)

@@ -44,6 +44,7 @@ def test_it_replaces_an_earlier_build_and_nothing_else(assembled: Path, tmp_path
     assert not (assembled / "mrasfm_client" / "left.py").exists()
 
 
+@pytest.mark.slow
 def test_it_works_beside_folders_of_the_same_names(assembled: Path, tmp_path: Path) -> None:
     """And takes nothing from the product, which is not there."""
     for name in ("service", "schemas", "worker", "mrasfm_engine"):

@@ -168,6 +168,7 @@ def test_interrupted_it_says_how_to_go_on(client: Client, large_drive: Path) -> 
     assert "Traceback" not in told
 
 
+@pytest.mark.slow
 def test_interrupted_while_the_service_is_silent_it_ends_at_once(client: Client, drive: Path) -> None:
     with bad_network(client.api.url, silent := Cut(b"PUT ", answer_bytes=0, times=4, silent=True)) as network:
         running = Upload(drive, url=network.url, key=client.key)
@@ -182,6 +183,7 @@ def test_interrupted_while_the_service_is_silent_it_ends_at_once(client: Client,
     assert upload(client, drive)[0] == 0
 
 
+@pytest.mark.slow
 def test_interrupted_while_waiting_the_job_goes_on(client: Client, drive: Path) -> None:
     running = Upload(drive, "--wait", url=client.api.url, key=client.key)
     wait_until(lambda: _reconstructions(client), "the job's start")
@@ -246,6 +248,7 @@ def test_without_a_key_it_says_where_to_put_one(drive: Path) -> None:
     assert "MRASFM_API_KEY" in told
 
 
+@pytest.mark.slow
 def test_a_service_that_is_not_there_is_4(drive: Path) -> None:
     url = f"http://127.0.0.1:{free_port()}"
     code, summary, told = Upload(drive, url=url, key="key").ended()

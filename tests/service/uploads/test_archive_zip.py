@@ -312,6 +312,7 @@ def test_an_archive_behind_a_program(unpacked: Unpacker) -> None:
     unpacked.refused(b"PK\3\4" + archive_of(Liar(data=IMAGE)), "damaged-archive", "where it says")
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(tmp_path: Path) -> None:
     """Forty thousand entries with long names and an image of 256 MB."""
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:

@@ -131,6 +131,7 @@ def test_adding_to_the_map_reuses_seams_and_removing_a_drive_takes_its_component
     assert sorted(scene["name"] for scene in document["scenes"]) == ["lit", "more", "tunnel"]
 
 
+@pytest.mark.slow
 def test_a_component_that_nothing_places_is_left_out_with_the_reason(
     street: Street, elsewhere: Street, tmp_path: Path
 ) -> None:
@@ -147,6 +148,7 @@ def test_a_component_that_nothing_places_is_left_out_with_the_reason(
     assert report["left_out"][0]["code"] == "not-georeferenced"
 
 
+@pytest.mark.slow
 def test_a_component_that_nothing_places_is_an_error_where_all_are_required(
     street: Street, elsewhere: Street, tmp_path: Path
 ) -> None:

@@ -131,6 +131,7 @@ def test_the_cost_grows_with_the_seams() -> None:
     assert counts[1] <= 2.3 * counts[0]
 
 
+@pytest.mark.slow
 def test_misclosures_are_as_large_as_their_covariance_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of right loops: chi-squared, with six degrees of freedom."""
     monkeypatch.setattr(loops, "LEAST_SIGMA_RAD", 0.0)

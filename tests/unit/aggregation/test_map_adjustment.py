@@ -375,6 +375,7 @@ def test_drives_of_unlike_vehicles_are_untouched(
     np.testing.assert_array_equal(shared.points_m, alone.points_m)
 
 
+@pytest.mark.slow
 def test_points_that_only_fixed_units_see_follow_their_calibration(folder: Path) -> None:
     """Only the first drive's calibration was refined: points of the second one stay where none of its units vary."""
     long = make_street(length_m=260.0, points=4000, seed=4)

@@ -25,6 +25,7 @@ CONFIG = EngineConfig.model_validate({"aggregation": {"min_inliers": 20}, "threa
 REPORT: dict[str, Any] = {"settings": {"features": {"extractor": "sift"}}}
 
 
+@pytest.mark.slow
 def test_pictures_of_seams_whose_names_could_be_mixed_up(tmp_path: Path) -> None:
     """`a-b` and `c` against `a` and `b-c`."""
     names = ("a", "a-b", "b-c", "c")

@@ -43,6 +43,7 @@ def made(folders: dict[str, Path], out: Path) -> tuple[dict[str, Any], dict[str,
     return json.loads((out / "map.json").read_text()), report
 
 
+@pytest.mark.slow
 def test_the_drive_is_named_whose_camera_was_knocked(folders: dict[str, Path], tmp_path: Path) -> None:
     document, report = made(folders, tmp_path / "map")
     (vehicle,) = document["vehicles"]

@@ -33,7 +33,8 @@ def test_an_image_has_the_same_descriptors_at_every_use_and_its_points_look_alik
     assert abs(int(is_distinct.sum()) - common) < 0.05 * common
 
 
-@pytest.mark.parametrize(("units", "submaps"), [(10, 1), pytest.param(20, 2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("units", "submaps"), [(10, 1), (20, 2)])
 def test_a_route_is_matched_and_mapped_from_descriptors(tmp_path: Path, units: int, submaps: int) -> None:
     config = EngineConfig.model_validate(
         {

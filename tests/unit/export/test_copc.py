@@ -152,6 +152,7 @@ def test_projecting_in_parts_changes_nothing(
     assert (tmp_path / COPC_FILE).read_bytes() == written.read_bytes()
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
     """Every 19th byte; the bits of a compressed stream's end may say nothing."""
     scene, path = scene_with_road(), tmp_path / COPC_FILE

@@ -158,6 +158,7 @@ def test_a_scene_without_poses_has_rows_without_geometry(tmp_path: Path) -> None
     assert disagreement(bare, path) is None
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_that_changes_what_it_says_is_found(tmp_path: Path) -> None:
     scene, path, rng = make_scene(), tmp_path / TRAJECTORY_FILE, np.random.default_rng(3)
     write_geopackage(scene, NAMES, path)

@@ -145,6 +145,7 @@ def written_work(tmp_path: Path) -> tuple[Any, Path]:
     return WRITERS["nuscenes"](ExportWork(source=source, options=ExportOptions(), folder=folder, step=_nothing)), folder
 
 
+@pytest.mark.slow
 def test_a_changed_character_withholds_the_format_and_names_the_file(tmp_path: Path) -> None:
     """By what the tables say: digests, which would find it first, are left out."""
     made, folder = written_work(tmp_path)

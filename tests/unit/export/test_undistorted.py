@@ -84,6 +84,7 @@ def test_pinhole_images_show_the_rays_of_their_pixels(models: dict[str, list[flo
     assert 0.9 < shown_points <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("models", [USUAL, FISHEYES], ids=["usual", "fisheyes"])
 def test_by_the_rule_of_3dgs_points_are_as_near_as_in_the_scene(models: dict[str, list[float]], tmp_path: Path) -> None:
     """Keypoints are half a pixel off, as real ones: a principal point or a pixel's centre that is off would show."""

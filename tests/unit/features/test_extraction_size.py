@@ -88,6 +88,7 @@ def test_masked_keypoints_do_not_count(tmp_path: Path) -> None:
     assert sides(write_drive(tmp_path / "covered", {"rich": 1.0}, covered), 700) == {}
 
 
+@pytest.mark.slow
 def test_keypoints_of_reduced_images_lie_where_those_of_full_ones_do(tmp_path: Path) -> None:
     drive = write_drive(tmp_path, {"rich": 2.5})
     whole = SiftExtractor(FeatureConfig(max_keypoints=20_000))
@@ -109,7 +110,11 @@ def test_keypoints_of_reduced_images_lie_where_those_of_full_ones_do(tmp_path: P
 
 @pytest.mark.parametrize(
     ("size", "side_px"),
-    [((1242, 375), 621), ((1920, 1208), 800), pytest.param((1920, 1208), 1131, marks=pytest.mark.slow)],
+    [
+        ((1242, 375), 621),
+        pytest.param((1920, 1208), 800, marks=pytest.mark.slow),
+        pytest.param((1920, 1208), 1131, marks=pytest.mark.slow),
+    ],
 )
 def test_reducing_moves_nothing_up_or_down(size: tuple[int, int], side_px: int) -> None:
     """Sides that do not come out whole are rounded, and content must follow the rounded side to the last row."""

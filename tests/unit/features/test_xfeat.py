@@ -138,6 +138,7 @@ def test_brightness_may_be_0_to_1_or_0_to_255(models: Path, image: np.ndarray) -
     assert 0.97 * len(small) < len(both) <= len(small)
 
 
+@pytest.mark.slow
 def test_lighterglue_gets_the_units_it_was_trained_with(models: Path, shared_data: Path, found: ImageFeatures) -> None:
     """Six frames on, keypoints in pixels match worse, and nearest neighbours find fewer."""
     loaded = components(models)

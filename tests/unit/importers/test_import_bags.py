@@ -163,6 +163,7 @@ def test_a_bag_without_definitions_is_read_by_those_of_ros(tmp_path: Path) -> No
     assert import_recording(tmp_path / "bag", tmp_path / "drive").images == 8
 
 
+@pytest.mark.slow
 def test_images_are_read_one_at_a_time(tmp_path: Path) -> None:
     made, pixels = stereo(frames=1), np.random.default_rng(0).integers(0, 256, (1000, 1000), dtype=np.uint8)
     made.kept[:] = [row for row in made.kept if row[0] == STATIC]

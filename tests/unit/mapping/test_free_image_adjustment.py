@@ -185,6 +185,7 @@ def distances(mapper: Mapper) -> np.ndarray:
     return result
 
 
+@pytest.mark.slow
 def test_without_priors_gnss_aligns_but_does_not_pull() -> None:
     held = BundleAdjustmentConfig(refine_calibration=False)
     unpulled, _ = refined(held, bent=False)

@@ -58,7 +58,7 @@ def late() -> tuple[Mapper, SimulatedDrive, Refinement]:
     return mapper, simulated, refined(mapper, simulated)
 
 
-@pytest.mark.parametrize("apart", [True, False])
+@pytest.mark.parametrize("apart", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_time_offsets_are_found_to_what_is_stated_of_them(
     apart: bool, late: tuple[Mapper, SimulatedDrive, Refinement]
 ) -> None:
@@ -77,6 +77,7 @@ def test_time_offsets_are_found_to_what_is_stated_of_them(
     assert result.late_cameras == []
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_late_no_longer_bends_the_trajectory(late: tuple[Mapper, SimulatedDrive, Refinement]) -> None:
     config = EngineConfig(threads=1, bundle_adjustment=BundleAdjustmentConfig(refine_time_offsets=False))
     mapper, simulated = model(LATE_MS, config)

@@ -110,6 +110,7 @@ def test_cameras_that_are_off_as_their_prior_says_are_not_voted_out() -> None:
         assert 1e-4 < errors(agreement.world_from_rig, simulated)[1] < 1.5
 
 
+@pytest.mark.slow
 def test_votes_err_as_their_covariances_say() -> None:
     squares = []
     for seed in range(8):
