@@ -30,7 +30,7 @@ sys.dont_write_bytecode = False
 
 # Kernels are compiled once for all test processes, while these run the tests that need none.
 _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
-NICENESS = 5  # of test processes while kernels are compiled
+NICENESS = 5  # of test processes beside which kernels are compiled, to their end: only root can take it back
 _OF_UNIT = ("commands", "documentation", "importers", "io", "learned", "preflight", "scene", "schemas")
 _WITHOUT_KERNELS = (  # or with a few that compile in a second
     REPOSITORY / "tests" / "service",
@@ -41,10 +41,10 @@ _compiler = pytest.StashKey[subprocess.Popen[bytes]]()
 
 def pytest_configure(config: pytest.Config) -> None:
     """Begin to compile before the test processes begin, which give way to it: all of them wait for it in the end."""
-    several = getattr(config.option, "numprocesses", None)
-    if "PYTEST_XDIST_WORKER" in os.environ and _KERNEL_LOCK in os.environ:
-        os.nice(NICENESS)
-    if "PYTEST_XDIST_WORKER" in os.environ or not several or _is_compiled(config):
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.nice(NICENESS if _KERNEL_LOCK in os.environ else 0)
+        return
+    if not getattr(config.option, "numprocesses", None) or _is_compiled(config):
         return
     path = Path(config.cache.mkdir("kernels")) / "lock" if config.cache else REPOSITORY / ".kernels.lock"
     with path.open("w") as lock:

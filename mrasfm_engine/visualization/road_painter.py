@@ -94,8 +94,8 @@ class RoadPainter:
             self._undecided.popleft().result()
         self._decider.shutdown()
 
-    def stop(self) -> None:
-        """Leave all blocks that are not decided."""
+    def close(self) -> None:
+        """End; blocks that nobody began to decide are left."""
         self._decider.shutdown(cancel_futures=True)
 
     def _reached(self, view: View) -> list[Block]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,17 +72,15 @@ def painting_road(plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Flo
                 tiles=tiles,
                 own_car_m=own_car_m,
             )
-            try:
+            with closing(painter):
                 yield painter
-            finally:
-                painter.stop()
     finally:
         _remove_work(scratch)
 
 
 def discard_road(painter: RoadPainter, scratch: Path) -> None:
     """Give back the disk space of a road that failed: the scene, which is still to be written, may need it."""
-    painter.stop()
+    painter.close()
     painter.tiles.close()  # an open file would keep its space
     _remove_work(scratch)
     (scratch / TIFF).unlink(missing_ok=True)

@@ -6,11 +6,10 @@ Every image is read once, whatever is painted of it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,6 +17,7 @@ from numba import njit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project, unproject_pixels
+from mrasfm_engine.parallel import in_order
 from mrasfm_engine.types import Bools, Bytes, Floats
 from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundTiles
 
@@ -26,8 +26,7 @@ VIEW_M = 15.0  # how far from a camera its image is used
 MIN_RESOLUTION_PX = 5.0  # of an image on the ground, pixels a metre along the line of sight
 OWN_CAR_LEVEL = 0.5  # of the cameras' height: up to there the car's body hides the ground
 FOOTPRINT_MARGIN_M = 1.0  # around where the corners of an image meet the ground: it is not level
-PREFETCHED = 2  # images that wait decoded
-AHEAD = 3  # views by which a painter may be ahead of another one
+AHEAD = 1  # views by which a painter may be ahead of another one
 
 Read = Callable[[int], tuple[Bytes, Bools | None]]  # image (h, w, 3) and usable pixels (h, w), None where all are
 
@@ -59,7 +58,7 @@ def paint_views(
 ) -> None:
     """Hand every view to all painters, in order, each in a thread of its own; every image is read once.
 
-    A painter that is slow with one view does not hold up the others, which may be a few views ahead of it.
+    A painter that is slow with one view does not hold up the others, which may be `AHEAD` views ahead of it.
 
     Parameters
     ----------
@@ -80,30 +79,16 @@ def paint_views(
         step(done)
 
     with ExitStack() as stack:
+        images = stack.enter_context(closing(in_order(1, read, range(len(views)))))
         pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in painters]
         stack.callback(lambda: [each.cancel() for view in under_way for each in view])  # of an error, before all ends
-        for index, rgb, usable in _read_ahead(len(views), read):
+        for index, (view, (rgb, usable)) in enumerate(zip(views, images, strict=True)):
             both = zip(painters, pools, strict=True)
-            under_way.append([pool.submit(painter.paint, index, views[index], rgb, usable) for painter, pool in both])
+            under_way.append([pool.submit(painter.paint, index, view, rgb, usable) for painter, pool in both])
             if len(under_way) > AHEAD:
                 finish_first()
         while under_way:
             finish_first()
-
-
-def _read_ahead(count: int, read: Read) -> Iterator[tuple[int, Bytes, Bools | None]]:
-    """Images in order, decoded while others are painted, never more than a few at a time."""
-    with ThreadPoolExecutor(1) as pool:
-        todo = iter(range(count))
-        waiting = [(i, pool.submit(read, i)) for i in islice(todo, PREFETCHED)]
-        try:
-            while waiting:
-                index, image = waiting.pop(0)
-                rgb, usable = image.result()
-                waiting += [(i, pool.submit(read, i)) for i in islice(todo, 1)]
-                yield index, rgb, usable
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from mrasfm_engine.visualization.birds_eye import grids_along
 from mrasfm_engine.visualization.drawing import framed
 from mrasfm_engine.visualization.exposure import camera_gains
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic, make_mosaics
-from mrasfm_engine.visualization.views import AHEAD, GIVEN, PREFETCHED, REFINED, View, sample
+from mrasfm_engine.visualization.views import AHEAD, GIVEN, REFINED, View, sample
 from tests.helpers.painted_ground import SIZE_PX, Level, Slope, looking, pattern, photographed, view_of
 
 MAX_TEXTURE_PX = 16_384  # of browsers and graphics cards
@@ -185,9 +185,10 @@ def test_a_corner_asks_for_heights_by_its_length_and_not_by_the_land_it_encloses
 
         with pytest.raises(KeyboardInterrupt):
             make_mosaics(views, [grid], ground, lambda _: (image, None), own_car_m=None, step=stop)
-        assert (
-            0 < ground.asked < 0.25 * asked[-1]
-        )  # nothing is computed before it is needed: a run can be stopped at once
+        # Nothing is computed before it is needed: a run can be stopped at once, but for the view that is under way.
+        begun = Level()
+        make_mosaics(views[: 1 + AHEAD], [grid], begun, lambda _: (image, None), own_car_m=None)
+        assert ground.asked <= begun.asked < 11_000
     assert 10_000 < asked[0] < asked[1] < 2.2 * asked[0]
 
 
@@ -266,7 +267,7 @@ def test_every_image_is_read_once_and_an_error_ends_it() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         make_mosaics(views, [grid], Level(), read, own_car_m=None, step=stop)
-    assert 2 <= len(reads) <= 2 + 1 + AHEAD + PREFETCHED
+    assert 2 <= len(reads) <= 6
 
 
 @pytest.mark.parametrize("shape", [(1, 5, 3), (5, 1, 3), (1, 1, 3)])

@@ -311,7 +311,7 @@ def test_a_road_that_fails_leaves_nothing_on_the_disk(tmp_path: Path, monkeypatc
         (tmp_path / "blocks").mkdir()
         (tmp_path / "blocks" / "block 0 0.npz").write_bytes(b"block")
         tiles = TileFile(tmp_path / "tiles")
-        fail(SimpleNamespace(tiles=tiles, stop=lambda: None))
+        fail(SimpleNamespace(tiles=tiles, close=lambda: None))
         assert tiles._file.closed
         assert not list(tmp_path.iterdir())
 
