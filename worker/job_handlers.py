@@ -16,7 +16,13 @@ from sqlalchemy.orm import Session
 from schemas.api.jobs import JobKind
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
-from schemas.artifacts import PLAN_CHECKPOINTS, Stage, checkpoint_file, submap_checkpoint, submap_number
+from schemas.artifacts import (
+    PLAN_CHECKPOINTS,
+    SUBMAP_STAGES,
+    checkpoint_file,
+    submap_checkpoint,
+    submap_number,
+)
 from service.database.connections import Database
 from service.database.tables import now_us
 from service.domain import checkpoints, exports, jobs, maps, scenes, workers
@@ -30,8 +36,6 @@ from service.storage.blob_writer import StoredFile
 from worker.attempt import AttemptFolder
 from worker.child_protocol import Attempt, SubmapPlan, Work
 from worker.outcomes import Succeeded
-
-SUBMAP_STAGES = (Stage.FEATURES, Stage.MATCHES, Stage.MAPPING)
 
 
 class PreflightHandler:

@@ -6,6 +6,7 @@ Each takes its input, leaves its result and a report in the store, and is skippe
 from __future__ import annotations
 
 from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
+from mrasfm_engine.stages._cut import count_of_submaps, cut_drive, is_cut
 from mrasfm_engine.stages._extraction_size import extraction_sizes
 from mrasfm_engine.stages._features import features, store_features
 from mrasfm_engine.stages._mapping import mapping
@@ -14,7 +15,8 @@ from mrasfm_engine.stages._own_car import own_cars
 from mrasfm_engine.stages._run import VERSIONS, Run, store_of
 from mrasfm_engine.stages._scene import components, numbered_components, pictures, scene
 from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
-from mrasfm_engine.stages._submaps import SubmapRun, count_of_submaps, cut_drive, is_cut, mapped
+from mrasfm_engine.stages._submap_run import SubmapRun
+from mrasfm_engine.stages._submaps import mapped
 
 __all__ = [
     "VERSIONS",

@@ -14,13 +14,12 @@ from sqlalchemy import select
 from mrasfm_engine.pipeline import reconstruct
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
-from schemas.artifacts import checkpoint_file, submap_checkpoint
+from schemas.artifacts import SUBMAP_STAGES, checkpoint_file, submap_checkpoint
 from service.database.tables import Blob, Checkpoint, Job, SceneFile, now_us
 from service.domain.jobs import number_of
 from tests.helpers.service_world import FAST, World, is_gone, wait_until
 from worker.engine_settings import engine_config
 from worker.job_execution import Runner
-from worker.job_handlers import SUBMAP_STAGES
 
 SUBMAPS = 3
 
