@@ -70,18 +70,18 @@ def decode_jpeg(data: Bytes, colours: Colours, header: ImageHeader, path: Path) 
     return _of_size(pixels, header, path)
 
 
-def decode_jpeg_small(data: Bytes, width_px: int) -> Bytes | None:
-    """Pixels (height, width, 3) reduced by a power of two to `width_px` or somewhat more.
+def decode_jpeg_small(data: Bytes, colours: Colours, width_px: int) -> Bytes | None:
+    """Pixels as of `decode_jpeg`, reduced by a power of two to `width_px` or somewhat more.
 
     None where libjpeg has any complaint: `decode_jpeg` judges it.
     """
     try:
         pixels = simplejpeg.decode_jpeg(
-            data, "RGB", fastdct=False, fastupsample=False, min_width=width_px, min_factor=1, strict=True
+            data, colours, fastdct=False, fastupsample=False, min_width=width_px, min_factor=1, strict=True
         )
     except ValueError:
         return None
-    return np.asarray(pixels, dtype=np.uint8)
+    return _without_channel(pixels, colours)
 
 
 def decode_png(data: Bytes, flags: int, header: ImageHeader, path: Path) -> Bytes | NDArray[np.uint16]:
@@ -105,6 +105,11 @@ def decode_png(data: Bytes, flags: int, header: ImageHeader, path: Path) -> Byte
 
 def _simply_decoded(data: Bytes, colours: Colours, *, strict: bool) -> Bytes:
     pixels = simplejpeg.decode_jpeg(data, colours, fastdct=False, fastupsample=False, strict=strict)
+    return _without_channel(pixels, colours)
+
+
+def _without_channel(pixels: Bytes, colours: Colours) -> Bytes:
+    """Pixels of simplejpeg, which gives grey ones a channel."""
     return np.asarray(pixels[..., 0] if colours == "GRAY" else pixels, dtype=np.uint8)
 
 

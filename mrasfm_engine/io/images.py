@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.io.image_decoding import decode_jpeg, decode_jpeg_small, decode_png
+from mrasfm_engine.io.image_decoding import Colours, decode_jpeg, decode_jpeg_small, decode_png
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular
 from mrasfm_engine.types import Bytes
 from schemas import LabelMap
@@ -55,8 +55,10 @@ def read_image_rgb(path: Path) -> Bytes:
     return np.ascontiguousarray(image[..., 2::-1])
 
 
-def read_image_small(path: Path, size_px: tuple[int, int], width_px: int) -> Bytes | None:
-    """An image as `read_image_rgb`, at a width of `width_px` at most; a JPEG is not decoded to its full size.
+def read_image_small(path: Path, size_px: tuple[int, int], width_px: int, *, colours: Colours = "RGB") -> Bytes | None:
+    """An image as `read_image_rgb` or `read_image_gray`, at a width of `width_px` at most.
+
+    A JPEG is not decoded to its full size.
 
     Returns
     -------
@@ -65,8 +67,9 @@ def read_image_small(path: Path, size_px: tuple[int, int], width_px: int) -> Byt
     data, header = _load(path)
     if (header.width, header.height) != size_px:
         return None
-    image = decode_jpeg_small(data, width_px) if header.format == "JPEG" else None
-    image = read_image_rgb(path) if image is None else image
+    image = decode_jpeg_small(data, colours, width_px) if header.format == "JPEG" else None
+    if image is None:
+        image = read_image_rgb(path) if colours == "RGB" else read_image_gray(path)
     if header.width <= width_px:
         return image
     size = (width_px, max(1, round(header.height * width_px / header.width)))

@@ -211,15 +211,14 @@ def _small_images(drive: Drive, images: Sequence[DriveImage]) -> dict[int, Float
     for image in images:
         camera = drive.cameras[image.camera]
         try:
-            rgb = read_image_small(
-                drive.root / image.file, (camera.width, camera.height), max(camera.width // REDUCED, 1)
-            )
+            size_px, width_px = (camera.width, camera.height), max(camera.width // REDUCED, 1)
+            grey = read_image_small(drive.root / image.file, size_px, width_px, colours="GRAY")
         except InputError:
             return {}
-        if rgb is None:
+        if grey is None:
             return {}
-        grey = rgb.mean(axis=2, dtype=np.float32)
-        result[image.camera] = np.asarray(cv2.GaussianBlur(grey, (0, 0), SMOOTHING_PX), dtype=np.float32)
+        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)
+        result[image.camera] = np.asarray(smooth, dtype=np.float32)
     return result
 
 

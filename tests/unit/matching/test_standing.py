@@ -75,6 +75,19 @@ def test_the_first_and_the_last_unit_of_a_stop_are_kept(tmp_path: Path) -> None:
     assert found.compared == 11
 
 
+def test_jpegs_in_colour_with_noise_of_each_channel(tmp_path: Path) -> None:
+    """They are decoded small and grey."""
+    drive = write(tmp_path, 11, lambda unit, camera: view(camera, stop_px(unit)))
+    rng = np.random.default_rng(5)
+    for image in drive.images:
+        grey = view(image.camera, stop_px(image.unit))
+        pixels = np.clip(grey[..., None] * [0.8, 1.0, 1.1] + rng.normal(0, 4, (*grey.shape, 3)), 0, 255)
+        (drive.root / image.file).write_bytes(cv2.imencode(".jpg", pixels.astype(np.uint8))[1].tobytes())
+    found = standing_of(drive)
+    assert found.included.tolist() == [True] * 3 + [False] * 4 + [True] * 4
+    assert found.moved_px[~found.included].max() < 0.5, "noise is no motion"
+
+
 def test_grey_images_do_not_stand(tmp_path: Path) -> None:
     """They show nothing: as a picture of another exposure, each would be any other."""
 
