@@ -8,7 +8,7 @@ Corrections x of the cameras' rotations minimise
 
     sum of rho(e^2 / variance) + x' P^-1 x
 
-with the Sampson distances e of `relative_pose` and the prior P. The variance is the keypoints' and what the prior of
+with the Sampson distances e of `epipolar_errors` and the prior P. The variance is the keypoints' and what the prior of
 the cameras' places adds: matches say little of these. Of the result only what the images demand is used: along the
 principal directions of their information against the prior, those corrections that are significant. A rig that is given
 well enough stays exactly as given.
@@ -25,13 +25,9 @@ from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
-from mrasfm_engine.matching.relative_pose import (
-    Errors,
-    MedianSpread,
-    UncertainRig,
-    epipolar_derivatives,
-    most_likely_correction,
-)
+from mrasfm_engine.matching.epipolar_errors import epipolar_derivatives
+from mrasfm_engine.matching.relative_pose import UncertainRig
+from mrasfm_engine.matching.robust_correction import Errors, most_likely_correction
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
@@ -243,7 +239,7 @@ def estimate_rig(
         focal_px=focal_px,
     )
     at_least = MIN_SIGMA_PX * np.array([problem.pixel_rad(one) for one in problem.found])
-    correction = most_likely_correction(problem.errors, 3 * len(rig_from_cam), MedianSpread(at_least))
+    correction = most_likely_correction(problem.errors, 3 * len(rig_from_cam), least_spread=at_least)
     known, directions = np.linalg.eigh(correction.information)
     posterior = 1.0 / np.sqrt(1.0 + np.maximum(known, 0.0))
     along = directions.T @ correction.x
@@ -288,15 +284,15 @@ class _RotationProblem:
         rig, result = self.corrected(x), []
         for one in self.found:
             a, b = one.camera_a, one.camera_b
-            error, by_rotation, by_shift, _ = epipolar_derivatives(rig[a], rig[b], one.rays_a, one.rays_b)
+            error, derivatives, _ = epipolar_derivatives(rig[a], rig[b], one.rays_a, one.rays_b)
             rows = np.concatenate([3 * a + np.arange(3), 3 * b + np.arange(3)])
             shift_m2 = self.variance_translation_m2[[a, b]].sum()
             result.append(
                 Errors(
                     rows=rows,
                     error=error,
-                    jacobian=np.concatenate(by_rotation, axis=1) * self.sigma_rad[rows],
-                    variance=shift_m2 * (by_shift**2).sum(1),
+                    jacobian=derivatives[:, :6] * self.sigma_rad[rows],
+                    variance=shift_m2 * (derivatives[:, 6:] ** 2).sum(1),
                     weight=min(1.0, INDEPENDENT_MATCHES / len(error)),
                 )
             )

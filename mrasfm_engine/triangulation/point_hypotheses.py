@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.geometry.small_cholesky import factorise, solve
 from mrasfm_engine.types import Bools, Floats, Ints
 
 STANDS, MOVES = 3, 5  # number of unknowns
@@ -147,47 +148,6 @@ def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views
         squared = ((out[0] - sight.xy_px[m, 0]) ** 2 + (out[1] - sight.xy_px[m, 1]) ** 2) / views.sigma_px[c] ** 2
         total += loss2 * math.log(1.0 + squared / loss2)
     return total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def factorise(a: Any, unknowns: int, factor: Any) -> bool:
-    """Cholesky factor of an information matrix; False where it is not positive."""
-    for i in range(unknowns):
-        for j in range(i + 1):
-            s = a[i, j]
-            for k in range(j):
-                s -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                factor[i, i] = math.sqrt(s)
-            else:
-                factor[i, j] = s / factor[j, j]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve(factor: Any, b: Any, unknowns: int, out: Any) -> None:
-    """Solve with the factor of `factorise`."""
-    for i in range(unknowns):
-        s = b[i]
-        for k in range(i):
-            s -= factor[i, k] * out[k]
-        out[i] = s / factor[i, i]
-    for i in range(unknowns - 1, -1, -1):
-        s = out[i]
-        for k in range(i + 1, unknowns):
-            s -= factor[k, i] * out[k]
-        out[i] = s / factor[i, i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def log_determinant(factor: Any, unknowns: int) -> float:
-    """Logarithm of the determinant of what was factorised."""
-    result = 0.0
-    for i in range(unknowns):
-        result += 2.0 * math.log(factor[i, i])
-    return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
+from mrasfm_engine.geometry.small_cholesky import log_determinant, solve
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.triangulation.point_hypotheses import (
     MOVES,
@@ -26,9 +27,7 @@ from mrasfm_engine.triangulation.point_hypotheses import (
     Views,
     cost_of_standing,
     fit,
-    log_determinant,
     new_scratch,
-    solve,
 )
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.types import Bools, Floats, Ints
