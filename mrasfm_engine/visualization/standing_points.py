@@ -40,21 +40,31 @@ class StandingPoints:
 
     def __init__(self, points_m: Floats, seen_by: Sequence[Ints], ground: GroundHeights) -> None:
         self._points_m, self._seen_by, self._ground = points_m, seen_by, ground
+        self._above_m = np.full(len(points_m), np.nan)  # the ground, where a view has asked for it
 
     def hidden_from(self, view: int, placed: PlacedView) -> Bools:
         """Raster (301, 301) of `STEP_M` around a view's camera, y growing with the rows: whether things hide the
         ground."""
         count = np.zeros((SIDE, SIDE), np.uint8)
-        points = self._points_m[self._seen_by[view]]
-        points = points[np.hypot(*(points[:, :2] - placed.centre_m[:2]).T) < VIEW_M]
-        if len(points):
-            above_m = points[:, 2] - self._ground.height_m(points[:, :2])
+        seen = self._seen_by[view]
+        foot_m = self._points_m[seen, :2] - placed.centre_m[:2]
+        near = np.hypot(*foot_m.T) < VIEW_M
+        if near.any():
+            above_m = self._above_ground_m(seen[near])
             share = above_m / placed.above_ground_m
             stands = (above_m > STANDING_M) & (share < OVERHEAD)
             # By similar triangles, the ray over the point meets the ground that many times as far away.
             times = np.where(share < TALL, 1 / (1 - np.minimum(share, TALL)), np.inf)
-            _hide(points[stands, :2] - placed.centre_m[:2], times[stands], count)
+            _hide(foot_m[near][stands], times[stands], count)
         return count >= MIN_POINTS
+
+    def _above_ground_m(self, points: Ints) -> Floats:
+        """Heights (n,) of points above the ground, each computed once: tens of views see a point."""
+        unknown = points[np.isnan(self._above_m[points])]
+        if len(unknown):
+            xyz_m = self._points_m[unknown]
+            self._above_m[unknown] = xyz_m[:, 2] - self._ground.height_m(xyz_m[:, :2])
+        return self._above_m[points]
 
 
 @njit(cache=True, nogil=True)
