@@ -33,7 +33,7 @@ makes parts of it. The results of a line are kept with commit and date, see --ke
 | 26 | traffic without masks: tracks on vehicles that move, and those of the street |
 | 27 | the road's picture of the best views: markings against the painted ones |
 | 28 | a real drive with grey images: parts that images, positions or nothing links, and a map that joins them |
-| 29 | a stop of a minute: what it costs, and where its units are |
+| 29 | a stop of a minute: what it costs beyond hashing, and where its units are |
 | 30 | drives cut into sub-maps, beside the same in one piece; a loop of 600 units that closes over their borders |
 | 31 | files for other programs, as readers of others read them; colours of points; a COPC of five million points |
 | 32 | fisheyes of 190 deg beside pinholes |
@@ -45,6 +45,8 @@ makes parts of it. The results of a line are kept with commit and date, see --ke
 | 38 | the web console: five million points as they stream, a camera turned by 3 deg, the wheel in a fresh environment |
 | 39 | tests of the engine that make test leaves out for their time |
 | 40 | tests of service, workers and console that make test leaves out for their time |
+| 41 | a drive of 3,600 images by the command: memory, and the time of a unit beside a quarter of it |
+| 42 | the same drive on two workers beside one, and while workers are killed |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -85,6 +87,7 @@ from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
 from tests.benchmarks.gaps import components_in_map, gaps
 from tests.benchmarks.learned import learned
+from tests.benchmarks.long_drives import memory_of_long_drives, on_several_workers
 from tests.benchmarks.many_scenes import many_scenes
 from tests.benchmarks.motion import motion
 from tests.benchmarks.moving_objects import moving_objects
@@ -171,6 +174,8 @@ LINES = {
     "38": Line(timed=(console,), untimed=(turned_camera, wheel)),
     "39": Line(timed=(slow_tests_of_engine,)),
     "40": Line(timed=(slow_tests_of_service,)),
+    "41": Line(timed=(memory_of_long_drives,)),
+    "42": Line(timed=(on_several_workers,)),
 }
 # Accuracy on real drives, speed of mapping, of the adjustment and of the whole command, and drives with gaps.
 HEADLINE = ("1", "2", "13", "28", "35")

@@ -32,7 +32,8 @@ class DidNotStartError(Exception):
 class Installation:
     """One data folder, and the service that works in it. All times are the defaults."""
 
-    def __init__(self, folder: Path, rng: random.Random) -> None:
+    def __init__(self, folder: Path, rng: random.Random, *, workers: int = WORKERS) -> None:
+        self._workers = workers
         self.data = folder / "data"
         self.temporary = folder / "temporary"
         self.temporary.mkdir()
@@ -88,7 +89,7 @@ class Installation:
         own = {name: value for name, value in os.environ.items() if not name.startswith("MRASFM_")}
         given = {"MRASFM_ENGINE_THREADS": "1", "MRASFM_MIN_FREE_DISK_BYTES": "0", "TMPDIR": str(self.temporary)}
         argv = [sys.executable, "-m", "service", "standalone", "--data", str(self.data)]
-        argv += ["--port", str(self._port), "--workers", str(WORKERS)]
+        argv += ["--port", str(self._port), "--workers", str(self._workers)]
         with self._lock, self._output.open("ab") as output:
             self._process = subprocess.Popen(
                 argv, cwd=REPOSITORY, env={**own, **given}, stdin=subprocess.DEVNULL, stdout=output, stderr=output
