@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -130,7 +131,8 @@ def _seen_by(scene: Scene, images: Ints) -> list[Ints]:
     # One number for both: rows of pairs take ten times as long to sort.
     pairs = np.unique(unit[scene.observation_image] * points + scene.observation_point)
     bounds = np.searchsorted(pairs, np.arange(len(scene.unit_registered) + 1) * points)
-    return [pairs[bounds[u] : bounds[u + 1]] % points for u in unit[images]]
+    by_unit = [pairs[begin:end] % points for begin, end in pairwise(bounds)]  # shared by the images of a unit
+    return [by_unit[u] for u in unit[images]]
 
 
 def place_numbers(scene: Scene) -> Ints:
