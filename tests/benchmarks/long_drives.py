@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -190,15 +190,19 @@ class _Service:
             self._installation.stop()
 
     def _kill(self, ended: threading.Event, kills: int) -> None:
-        """Kill a worker that is in a stage of a sub-map so many times; Celery puts another one in its place."""
-        rng, next_s = random.Random(SEED), None
+        """Kill a worker that is in a stage of a sub-map so many times; Celery puts another one in its place.
+
+        Sub-maps take turns: one whose stage takes longer than the time between kills would else get no further.
+        """
+        next_s = None
         while len(self.kills) < kills and not ended.wait(LOOK_EVERY_S):
             busy = self._busy()
             if busy and next_s is None:
                 next_s = time.monotonic() + KILLED_EVERY_S
             if not busy or next_s is None or time.monotonic() < next_s:
                 continue
-            owner, planned = rng.choice(busy)
+            killed = Counter(one.job_id for one in self.kills)
+            owner, planned = min(busy, key=lambda each: killed[each[1].job_id])
             victims = [one for one in tree_of(self._installation.pid or 0) if one.pid == owner]
             if [victim.role for victim in victims] == [Role.WORKER_POOL] and kill(victims[0]):
                 self.kills.append(planned)
