@@ -1,6 +1,6 @@
 """Relative pose of two cameras with its covariance: the gate for matches that follows, and the correction they demand.
 
-Errors of matches are those of `epipolar_errors`: a covariance of the poses gives their variance, and matches correct
+Errors of matches are those of `sampson`: a covariance of the poses gives their variance, and matches correct
 poses under them as a prior.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.matching.epipolar_errors import epipolar_derivatives, most_likely_pose
+from mrasfm_engine.matching.sampson import epipolar_derivatives, most_likely_pose
 from mrasfm_engine.matching.verification import signed_parallax
 from mrasfm_engine.types import Bools, Floats
 
@@ -126,10 +126,10 @@ class RelativePose:
         keep = np.linspace(0, len(rays_a) - 1, min(len(rays_a), MAX_REFINING)).astype(np.int64)
         rays_a, rays_b = rays_a[keep], rays_b[keep]
         variance, axes = np.linalg.eigh(self.covariance)
-        whole = axes * np.sqrt(np.maximum(variance, 0.0))
-        x, information = most_likely_pose(self.base_from_a, self.base_from_b, rays_a, rays_b, whole, sigma_rad)
-        posterior = whole @ np.linalg.inv(np.eye(9) + information) @ whole.T
-        moved = self.corrected(whole @ x)
+        prior_root = axes * np.sqrt(np.maximum(variance, 0.0))
+        x, information = most_likely_pose(self.base_from_a, self.base_from_b, rays_a, rays_b, prior_root, sigma_rad)
+        posterior = prior_root @ np.linalg.inv(np.eye(9) + information) @ prior_root.T
+        moved = self.corrected(prior_root @ x)
         refined = RelativePose(base_from_a=moved.base_from_a, base_from_b=moved.base_from_b, covariance=posterior)
         return refined, float(x @ x)
 

@@ -8,7 +8,7 @@ Corrections x of the cameras' rotations minimise
 
     sum of rho(e^2 / variance) + x' P^-1 x
 
-with the Sampson distances e of `epipolar_errors` and the prior P. The variance is the keypoints' and what the prior of
+with the Sampson distances e of `sampson` and the prior P. The variance is the keypoints' and what the prior of
 the cameras' places adds: matches say little of these. Of the result only what the images demand is used: along the
 principal directions of their information against the prior, those corrections that are significant. A rig that is given
 well enough stays exactly as given.
@@ -25,9 +25,9 @@ from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
-from mrasfm_engine.matching.epipolar_errors import epipolar_derivatives
 from mrasfm_engine.matching.relative_pose import UncertainRig
 from mrasfm_engine.matching.robust_correction import Errors, most_likely_correction
+from mrasfm_engine.matching.sampson import epipolar_derivatives
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches

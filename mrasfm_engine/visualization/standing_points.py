@@ -29,6 +29,7 @@ class StandingPoints:
     """Points above the ground, by the views that see them.
 
     A view is hidden from by what it sees itself: a car that moves slowly enough to have points is elsewhere for others.
+    One thread asks at a time.
 
     Parameters
     ----------

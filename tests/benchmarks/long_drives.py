@@ -41,7 +41,7 @@ THREADS, TIMEOUT_S = 2, 3600.0
 SAMPLED_EVERY_S = 0.5
 MOST_MEMORY_GB, MOST_TIMES_MEMORY, MOST_TIMES_A_UNIT = 3.0, 1.4, 1.15
 MOST_TIME_OF_TWO = 0.6
-KILLED_EVERY_S, KILLS, LOOK_EVERY_S = 120.0, 5, 0.2
+KILLED_EVERY_S, KILLS = 120.0, 5
 SAME_M, SAME_DEG = 0.001, 0.005
 
 
@@ -69,7 +69,8 @@ def memory_of_long_drives(data: Path, work: Path) -> Iterator[Figure]:
         yield Figure(line="41", what=title, value=values[UNITS] / values[FIRST_UNITS], most=most)
     further_s = (seconds[UNITS] - seconds[FIRST_UNITS]) / (UNITS - FIRST_UNITS)
     title = f"time of a further unit beside one of {FIRST_UNITS}"
-    yield Figure(line="41", what=title, value=further_s / per_unit_s[FIRST_UNITS])
+    ratio = further_s / per_unit_s[FIRST_UNITS]
+    yield Figure(line="41", what=title, value=ratio, most=MOST_TIMES_A_UNIT)
 
 
 def on_several_workers(data: Path, work: Path) -> Iterator[Figure]:
@@ -195,7 +196,7 @@ class _Service:
         Sub-maps take turns: one whose stage takes longer than the time between kills would else get no further.
         """
         next_s = None
-        while len(self.kills) < kills and not ended.wait(LOOK_EVERY_S):
+        while len(self.kills_that_counted()) < kills and not ended.wait(SAMPLED_EVERY_S):
             busy = self._busy()
             if busy and next_s is None:
                 next_s = time.monotonic() + KILLED_EVERY_S
@@ -296,28 +297,36 @@ def _peak_gb(*arguments: object) -> float:
     """
     command = [sys.executable, "-c", "import sys; from mrasfm_engine.cli import main; sys.exit(main())"]
     peak_bytes, end_s = 0, time.monotonic() + TIMEOUT_S
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen([*command, *map(str, arguments)], stdout=said, stderr=said)
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen([*command, *map(str, arguments)], stdout=output, stderr=output)
         try:
-            while process.poll() is None and time.monotonic() < end_s:
-                peak_bytes = max(peak_bytes, _pss_bytes(process.pid))
+            while process.poll() is None:
+                if time.monotonic() > end_s:
+                    raise CommandFailed(f"mrasfm {arguments[0]} has not ended after {TIMEOUT_S:.0f} s")
+                peak_bytes = max(peak_bytes, sum(map(_pss_bytes, _tree(process.pid))))
                 time.sleep(SAMPLED_EVERY_S)
         finally:
-            process.kill()
+            for one in _tree(process.pid):
+                with suppress(psutil.Error):
+                    one.kill()
             process.wait()
         if process.returncode != 0:
-            said.seek(0)
-            last = said.read().decode(errors="replace").strip()[-300:]
+            output.seek(0)
+            last = output.read().decode(errors="replace").strip()[-300:]
             raise CommandFailed(f"mrasfm {arguments[0]} ended with {process.returncode}: {last}")
     return peak_bytes / 1e9
 
 
-def _pss_bytes(pid: int) -> int:
-    """Memory of a process and all below it now."""
-    total = 0
+def _tree(pid: int) -> list[psutil.Process]:
+    """A process and all below it, as far as they live."""
     with suppress(psutil.Error):
         parent = psutil.Process(pid)
-        for process in (parent, *parent.children(recursive=True)):
-            with suppress(psutil.Error):
-                total += process.memory_full_info().pss
-    return total
+        return [parent, *parent.children(recursive=True)]
+    return []
+
+
+def _pss_bytes(process: psutil.Process) -> int:
+    """Memory of a process now; none where it has ended."""
+    with suppress(psutil.Error):
+        return int(process.memory_full_info().pss)
+    return 0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.matching.epipolar_errors import epipolar_derivatives
 from mrasfm_engine.matching.relative_pose import RelativePose, UncertainRig
+from mrasfm_engine.matching.sampson import epipolar_derivatives
 
 DEG = np.pi / 180
 PIXEL_RAD = 1 / 700

@@ -17,13 +17,10 @@ import numpy as np
 from numba import njit
 
 from mrasfm_engine.geometry.small_cholesky import factorise, solve
+from mrasfm_engine.matching.robust_correction import CONVERGED, INITIAL_DAMPING, ITERATIONS, SETTLED
 from mrasfm_engine.types import Floats
 
 MIN_BASELINE_M = 1e-6  # far below what any pose is known to, and far above what rounding leaves of its square
-ITERATIONS = 40
-INITIAL_DAMPING = 1e-3
-CONVERGED = 0.1  # of what matches and prior leave uncertain
-SETTLED = 0.99  # of the spread that errors had before
 SMALL_RAD = 1e-6  # below, the series of a rotation's sine and cosine
 
 
@@ -43,7 +40,7 @@ def epipolar_derivatives(
 
 
 def most_likely_pose(
-    base_from_a: Floats, base_from_b: Floats, rays_a: Floats, rays_b: Floats, whole: Floats, sigma_rad: float
+    base_from_a: Floats, base_from_b: Floats, rays_a: Floats, rays_b: Floats, prior_root: Floats, sigma_rad: float
 ) -> tuple[Floats, Floats]:
     """Correct two poses by matches under a Cauchy loss and a prior, by damped Gauss-Newton steps.
 
@@ -52,7 +49,7 @@ def most_likely_pose(
 
     Parameters
     ----------
-    whole
+    prior_root
         Root (9, 9) of the prior's covariance, of the rotations of a and b and of the place of a against b.
 
     Returns
@@ -63,7 +60,7 @@ def most_likely_pose(
         That of the errors (9, 9), there.
     """
     x, information = np.zeros(9), np.zeros((9, 9))
-    given = _contiguous(base_from_a, base_from_b, rays_a, rays_b, whole)
+    given = _contiguous(base_from_a, base_from_b, rays_a, rays_b, prior_root)
     _correct(*given, float(sigma_rad), x, information)
     return x, information
 
@@ -118,47 +115,55 @@ def _turn(pose: Any, by: Any, out: Any) -> None:
     angle2 = by[0] * by[0] + by[1] * by[1] + by[2] * by[2]
     angle = math.sqrt(angle2)
     if angle < SMALL_RAD:
-        sine, cosine = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+        sine_share, versine_share = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     else:
-        sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+        sine_share, versine_share = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
     for column in range(3):
-        along = cosine * (by[0] * pose[0, column] + by[1] * pose[1, column] + by[2] * pose[2, column])
+        along = versine_share * (by[0] * pose[0, column] + by[1] * pose[1, column] + by[2] * pose[2, column])
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
             across = by[j] * pose[k, column] - by[k] * pose[j, column]
-            out[i, column] = (1.0 - cosine * angle2) * pose[i, column] + sine * across + along * by[i]
+            out[i, column] = (1.0 - versine_share * angle2) * pose[i, column] + sine_share * across + along * by[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _correct(
-    base_from_a: Any, base_from_b: Any, rays_a: Any, rays_b: Any, whole: Any, sigma: float, x: Any, information: Any
+    base_from_a: Any,
+    base_from_b: Any,
+    rays_a: Any,
+    rays_b: Any,
+    prior_root: Any,
+    sigma: float,
+    x: Any,
+    information: Any,
 ) -> None:
     """See `most_likely_pose`."""
     count = len(rays_a)
-    moved_a, moved_b, moved, shift = base_from_a.copy(), base_from_b.copy(), np.empty(9), np.empty(9)
+    moved_a, moved_b, moved, correction = base_from_a.copy(), base_from_b.copy(), np.empty(9), np.empty(9)
     error, derivatives, normal = np.empty(count), np.empty((count, 9)), np.empty((count, 3))
     damped, factor, gradient, step = np.empty((9, 9)), np.empty((9, 9)), np.empty(9), np.empty(9)
     _linearise(base_from_a, base_from_b, rays_a, rays_b, error, derivatives, normal)
     spread = max(sigma, math.sqrt((error * error).sum() / max(count, 1)))
     cost = _cost(error, x, spread)
-    _normal_equations(error, derivatives, whole, spread, information, gradient)
+    _normal_equations(error, derivatives, prior_root, spread, information, gradient)
     damping = INITIAL_DAMPING
     for _ in range(ITERATIONS):
         damped[:] = information
         for i in range(9):
             damped[i, i] += 1.0 + damping * information[i, i]
             step[i] = -(gradient[i] + x[i])
-        if not factorise(damped, 9, factor):
+        if not factorise(damped, 9, factor):  # rays that are no numbers
+            x[:] = np.nan
             break
         solve(factor, step, 9, step)
         moved[:] = x + step
-        shift[:] = 0.0
+        correction[:] = 0.0
         for i in range(9):
             for j in range(9):
-                shift[i] += whole[i, j] * moved[j]
-        _turn(base_from_a, shift[:3], moved_a)
-        _turn(base_from_b, shift[3:6], moved_b)
-        moved_a[:3, 3] = base_from_a[:3, 3] + shift[6:]
+                correction[i] += prior_root[i, j] * moved[j]
+        _turn(base_from_a, correction[:3], moved_a)
+        _turn(base_from_b, correction[3:6], moved_b)
+        moved_a[:3, 3] = base_from_a[:3, 3] + correction[6:]
         _linearise(moved_a, moved_b, rays_a, rays_b, error, derivatives, normal)
         if _cost(error, moved, spread) > cost:
             damping *= 10.0
@@ -173,13 +178,15 @@ def _correct(
         settled = narrower > SETTLED * spread
         spread = narrower
         cost = _cost(error, x, spread)
-        _normal_equations(error, derivatives, whole, spread, information, gradient)
+        _normal_equations(error, derivatives, prior_root, spread, information, gradient)
         if settled and length2 < CONVERGED**2:
             break
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(error: Any, derivatives: Any, whole: Any, spread: float, information: Any, gradient: Any) -> None:
+def _normal_equations(
+    error: Any, derivatives: Any, prior_root: Any, spread: float, information: Any, gradient: Any
+) -> None:
     """J' W J and J' W r of the errors, by the prior's standard deviations."""
     row = np.empty(9)
     information[:] = 0.0
@@ -189,7 +196,7 @@ def _normal_equations(error: Any, derivatives: Any, whole: Any, spread: float, i
         row[:] = 0.0
         for i in range(9):
             for j in range(9):
-                row[j] += derivatives[n, i] * whole[i, j]
+                row[j] += derivatives[n, i] * prior_root[i, j]
         for i in range(9):
             gradient[i] += weight * error[n] * row[i]
             for j in range(9):
