@@ -16,13 +16,7 @@ from sqlalchemy.orm import Session
 from schemas.api.jobs import JobKind
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
-from schemas.artifacts import (
-    PLAN_CHECKPOINTS,
-    SUBMAP_STAGES,
-    checkpoint_file,
-    submap_checkpoint,
-    submap_number,
-)
+from schemas.artifacts import PLAN_CHECKPOINTS, SUBMAP_STAGES, checkpoint_file, submap_checkpoint, submap_number
 from service.database.connections import Database
 from service.database.tables import now_us
 from service.domain import checkpoints, exports, jobs, maps, scenes, workers

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+MRASFM = (sys.executable, "-c", "import sys; from mrasfm_engine.cli import main; sys.exit(main())")
+
 
 class CommandFailed(Exception):
     """A command ended with an error; its last lines are the message."""
@@ -22,9 +24,8 @@ def mrasfm(*arguments: object, timeout_s: float = 1800.0) -> str:
     CommandFailed
         Where it ends with another exit code than 0.
     """
-    command = [sys.executable, "-c", "import sys; from mrasfm_engine.cli import main; sys.exit(main())"]
     words = [str(argument) for argument in arguments]
-    result = subprocess.run([*command, *words], capture_output=True, text=True, timeout=timeout_s, check=False)
+    result = subprocess.run([*MRASFM, *words], capture_output=True, text=True, timeout=timeout_s, check=False)
     if result.returncode != 0:
         last = " / ".join(result.stderr.strip().splitlines()[-2:])
         raise CommandFailed(f"mrasfm {' '.join(words[:2])} ended with {result.returncode}: {last}")

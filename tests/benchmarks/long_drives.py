@@ -11,7 +11,6 @@ import os
 import random
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -33,8 +32,9 @@ from service.storage.data_folder import write_private_file
 from tests.benchmarks.chaos.installation import Installation
 from tests.benchmarks.chaos.processes import Role, kill, tree_of
 from tests.benchmarks.chaos.records import Records
-from tests.benchmarks.commands import CommandFailed, evaluate, mrasfm, read_report
+from tests.benchmarks.commands import MRASFM, CommandFailed, evaluate, mrasfm, read_report
 from tests.benchmarks.table import Figure, exactly, failed
+from tests.helpers.submap_stages import stages_run_in_join
 
 CAMERAS, UNITS, FIRST_UNITS, SEED, SIZE = 6, 600, 150, 1, ("--width", 640, "--height", 360)
 THREADS, TIMEOUT_S = 2, 3600.0
@@ -102,10 +102,10 @@ def _of_scene(line: str, title: str, scene: Path, drive: Path, units: int) -> It
 
 def _of_kills(title: str, run: _Service, scene: Path, undisturbed: Path) -> Iterator[Figure]:
     """Figures of the scene that two workers made of which one was killed again and again."""
-    kills, jobs = run.kills_that_counted(), run.records.rows("SELECT id FROM scenes")
+    kills, scenes = run.kills_that_counted(), run.records.rows("SELECT id FROM scenes")
     remark = ", ".join(sorted(one.stage for one in kills))
     yield replace(exactly("42", f"{title}: kills within sub-maps", len(kills), KILLS), remark=remark)
-    yield exactly("42", f"{title}: scenes", len(jobs), 1)
+    yield exactly("42", f"{title}: scenes", len(scenes), 1)
     a, b = (read_tum(one / "poses.tum") for one in (scene, undisturbed))
     if not np.array_equal(a.timestamps_us, b.timestamps_us):
         yield failed("42", f"{title}: poses as without", "they are of other units")
@@ -197,10 +197,13 @@ class _Service:
         """
         next_s = None
         while len(self.kills_that_counted()) < kills and not ended.wait(SAMPLED_EVERY_S):
+            if next_s is not None and time.monotonic() < next_s:
+                continue
             busy = self._busy()
-            if busy and next_s is None:
+            if not busy:
+                continue
+            if next_s is None:
                 next_s = time.monotonic() + KILLED_EVERY_S
-            if not busy or next_s is None or time.monotonic() < next_s:
                 continue
             killed = Counter(one.job_id for one in self.kills)
             owner, planned = min(busy, key=lambda each: killed[each[1].job_id])
@@ -250,13 +253,7 @@ class _Service:
             finished[one.job_id] = one.finished
         for job_id, reused in self.records.rows("SELECT id, reused FROM jobs WHERE parent_id IS NOT NULL"):
             again += [f"{job_id}: {s}" for s in finished[job_id] - set(json.loads(reused))]
-        again += [
-            f"sub-map {submap['number']} in the join: {stage['stage']}"
-            for submap in read_report(self.folder / "scene")["submaps"]
-            for stage in submap["stages"]
-            if not stage["reused"]
-        ]
-        return again
+        return again + [f"{name} in the join" for name in stages_run_in_join(read_report(self.folder / "scene"))]
 
 
 def _rendered(work: Path) -> Path:
@@ -295,10 +292,9 @@ def _peak_gb(*arguments: object) -> float:
 
     A page that several processes share counts for each of them by its part.
     """
-    command = [sys.executable, "-c", "import sys; from mrasfm_engine.cli import main; sys.exit(main())"]
     peak_bytes, end_s = 0, time.monotonic() + TIMEOUT_S
     with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen([*command, *map(str, arguments)], stdout=output, stderr=output)
+        process = subprocess.Popen([*MRASFM, *map(str, arguments)], stdout=output, stderr=output)
         try:
             while process.poll() is None:
                 if time.monotonic() > end_s:

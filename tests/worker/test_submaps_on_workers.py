@@ -18,6 +18,7 @@ from schemas.artifacts import SUBMAP_STAGES, checkpoint_file, submap_checkpoint
 from service.database.tables import Blob, Checkpoint, Job, SceneFile, now_us
 from service.domain.jobs import number_of
 from tests.helpers.service_world import FAST, World, is_gone, wait_until
+from tests.helpers.submap_stages import stages_run_in_join
 from worker.engine_settings import engine_config
 from worker.job_execution import Runner
 
@@ -54,16 +55,6 @@ def own_stages(submap: Job) -> set[str]:
     return {checkpoint_file(submap_checkpoint(number_of(submap), stage)) for stage in SUBMAP_STAGES}
 
 
-def stages_run(report: dict[str, Any]) -> list[str]:
-    """Stages of sub-maps that the join had to do itself."""
-    return [
-        submap_checkpoint(submap["number"], stage["stage"])
-        for submap in report["submaps"]
-        for stage in submap["stages"]
-        if not stage["reused"]
-    ]
-
-
 def in_one_piece(drive: Path, out: Path) -> dict[str, Any]:
     """The report of the same reconstruction by one process."""
     reconstruct(drive, out, engine_config({**FAST, "submaps": SUBMAPS}, threads=1))
@@ -75,7 +66,7 @@ def assert_same_scene(world: World, job: Job, whole: dict[str, Any]) -> None:
     (scene,) = world.scenes()
     assert scene.id == job.scene_id
     report = report_of(world)
-    assert stages_run(report) == []
+    assert stages_run_in_join(report) == []
     assert report["summary"]["registered_units"] == whole["summary"]["registered_units"] > 30
     assert report["summary"]["points"] == whole["summary"]["points"]
 

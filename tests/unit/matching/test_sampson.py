@@ -1,4 +1,4 @@
-"""The most likely pose of two images under their matches and a prior."""
+"""Errors of matches, and the most likely pose of two images under them and a prior."""
 
 from __future__ import annotations
 
@@ -20,6 +20,29 @@ def views(rng: np.random.Generator, points: int) -> tuple[Floats, list[Floats]]:
     rays = [se3.apply(se3.inverse(pose), points_m) for pose in poses]
     rays = [r / np.linalg.norm(r, axis=1, keepdims=True) + rng.normal(0, SIGMA_RAD / 2, r.shape) for r in rays]
     return poses, [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
+
+
+def test_derivatives_are_those_of_the_error() -> None:
+    rng = np.random.default_rng(0)
+    poses = np.stack([se3.transform(se3.exp_so3(rng.normal(0, 0.2, 3)), rng.normal(0, 0.5, 3)) for _ in range(2)])
+    points = rng.uniform(-2, 2, (20, 3)) + np.array([0, 0, 8])
+    rays = [se3.apply(se3.inverse(pose), points) for pose in poses]
+    rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
+    # Off the epipolar lines by so little that what the derivatives leave out, the length's, does not show.
+    rays[0] = rays[0] @ se3.exp_so3(np.array([1e-7, 2e-7, -1e-7])).T
+    at, derivatives, _ = epipolar_derivatives(*poses, *rays)
+    step = 1e-7
+    for axis in range(3):
+        delta = step * np.eye(3)[axis]
+        for camera in range(2):
+            moved = poses.copy()
+            moved[camera, :3, :3] = se3.exp_so3(delta) @ moved[camera, :3, :3]
+            change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
+            np.testing.assert_allclose(derivatives[:, 3 * camera + axis], change, atol=1e-5)
+        moved = poses.copy()
+        moved[0, :3, 3] += delta
+        change = (epipolar_derivatives(*moved, *rays)[0] - at) / step
+        np.testing.assert_allclose(derivatives[:, 6 + axis], change, atol=1e-5)
 
 
 def test_a_pose_as_far_off_as_its_prior_allows_is_corrected() -> None:
