@@ -4,7 +4,7 @@ The error of a match is the Sampson distance [Hartley and Zisserman, Multiple Vi
 
     e = t . (g_a x g_b) / sqrt(|t x g_a|^2 + |t x g_b|^2)
 
-in radians, with rays g in common axes and t from camera b to camera a. It is linear in t and nearly so in small
+in radians, with rays g in common axes and t from camera b to camera a. It is nearly linear in small changes of t and of
 rotations, so that matches correct poses by Gauss-Newton steps.
 """
 
@@ -101,11 +101,19 @@ def _linearise(
             distance += across[i] * t[i]
         length = max(math.sqrt(ta2 + tb2), 1e-12)
         error[n] = distance / length
+        # How the length changes counts for matches far from their lines. As a and ta are perpendicular,
+        # a x (ta x t) = ta (a . t), and likewise for b.
+        share = error[n] / (length * length)
+        along_a = along_b = 0.0
+        for i in range(3):
+            along_a += a[i] * t[i]
+            along_b += b[i] * t[i]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            derivatives[n, i] = -(a[j] * tb[k] - a[k] * tb[j]) / length
-            derivatives[n, 3 + i] = (b[j] * ta[k] - b[k] * ta[j]) / length
-            derivatives[n, 6 + i] = across[i] / length
+            a_over_ta, b_over_tb = a[j] * ta[k] - a[k] * ta[j], b[j] * tb[k] - b[k] * tb[j]
+            derivatives[n, i] = -(a[j] * tb[k] - a[k] * tb[j]) / length - share * along_a * ta[i]
+            derivatives[n, 3 + i] = (b[j] * ta[k] - b[k] * ta[j]) / length - share * along_b * tb[i]
+            derivatives[n, 6 + i] = across[i] / length - share * (a_over_ta + b_over_tb)
             normal[n, i] = ta[i] / max(math.sqrt(ta2), 1e-12)
 
 
