@@ -3,50 +3,35 @@
 A minute at a red light is hundreds of units that show the same. Of a stop the first and the last unit are included,
 those between take no part in the reconstruction and get their poses from these two (see `scene.standing_units`).
 
-Each unit is compared with the last one that moved, so that the steps of a creeping car add up. An image is divided into
-blocks, and each block's displacement follows from its gradients and its change (Lucas and Kanade, IJCAI 1981), where a
-change of exposure is allowed. A camera moved as the median of its blocks did: traffic covers less than half of most
-images. The car moved where more than half of the cameras did: a lorry beside it fills the cameras of one side. Where
-the prior trajectory shows motion no image is read.
+Each unit is compared with the last one that moved, so that the steps of a creeping car add up. While the car stands
+three units a second are, and what lies between two that stand where the same unit does stands there as well. Where the
+prior trajectory shows motion no image is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
-import cv2
 import numpy as np
-from numba import njit
 
-from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.features.extraction import one_opencv_thread
-from mrasfm_engine.io.images import read_image_small
+from mrasfm_engine.io.images import has_its_end
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.parallel import in_order
+from mrasfm_engine.matching.small_image_motion import small_images, unit_motion_px
+from mrasfm_engine.parallel import IN_FLIGHT
 from mrasfm_engine.scene.drive import Drive, DriveImage
-from mrasfm_engine.types import Bools, Cancel, Floats, Floats32
+from mrasfm_engine.types import Bools, Cancel, Floats, Floats32, Ints
 
-REDUCED = 8  # times smaller: libjpeg then decodes one value of a block; noise averages out
-SMOOTHING_PX = 1.0  # sigma: of finer detail the difference of two neighbours is less than the gradient
-BLOCK_PX = 8  # side of a block in the reduced image
-# Grey levels: a sensor's noise in daylight is about 4 levels, an eighth of which is left, and rounding adds to it.
-SIGMA_GREY = 1.0
-# A block tells if noise moves it by less than this share of the motion that counts.
-MAX_NOISE = 1 / 3
-MIN_BLOCKS = 8  # that tell, of a camera: the median of fewer is that of one passing thing
-# What is left of a block's change may be no more than its gradients would make of this many reduced pixels: where they
-# do not explain the change, the block shows something else.
-MAX_UNEXPLAINED_PX = 1.0
-# Contrast of two images of one view differs by no more than two stops of exposure. A grey image would else be any other
-# with another exposure.
-MAX_CONTRAST_RATIO = 4.0
 # The prior shows motion where it went this many sigmas, and a metre, within a window.
 MOVED_SIGMAS, MOVED_M = 6.0, 1.0
 WINDOWS_S = (0.5, 1.0, 2.0)  # before the unit, and after it: a stop of two seconds and more is seen
+# A car that accelerates and brakes by 4 m/s^2 gets no farther than 3 cm and back within this time.
+UNREAD_S = 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +46,7 @@ class Standing:
         (units,) how far a unit that is left out moved against the first of its stop, at full size: in the camera that
         moved most, but for cameras that show something else; NaN for the other units.
     compared
-        Units whose images were read.
+        Number of units whose images were read.
     """
 
     included: Bools
@@ -87,34 +72,101 @@ def find_standing(
     CancelledError
         Where `cancel` answers True.
     """
-    units = len(drive.timestamps_us)
-    moves = moving_by_prior(drive, prior)
+    moves, of_unit = moving_by_prior(drive, prior), _by_unit(drive)
     # A standing unit is compared with one before it: the last that moves is read as well.
-    read = np.flatnonzero(~moves | np.append(~moves[1:], False)).tolist()
-    stands, moved_px = np.zeros(units, dtype=np.bool_), np.full(units, np.nan)
-    of_unit = _by_unit(drive)
+    wanted = np.flatnonzero(~moves | np.append(~moves[1:], False))
 
-    def small(unit: int) -> dict[int, Floats32]:
+    def small(place: int) -> dict[int, Floats32]:
         if cancel is not None and cancel():
             raise CancelledError
-        return _small_images(drive, of_unit[unit])
+        return small_images(drive, of_unit[wanted[place]])
 
-    way = _PriorWay.from_prior(drive, prior)
-    last, kept_images = 0, dict[int, Floats32]()
-    with one_opencv_thread(), closing(in_order(threads, small, read)) as images:
-        for unit, now in zip(read, images, strict=True):
-            motion_px = (np.inf, np.inf)
-            if not (moves[unit] or way.shows_motion(last, unit)):
-                motion_px = unit_motion_px(kept_images, now, min_motion_px=min_motion_px)
-            if motion_px[0] < min_motion_px:
-                stands[unit], moved_px[unit] = True, motion_px[1]
+    def are_whole(units: Ints) -> bool:
+        return all(has_its_end(drive.root / image.file) for unit in units for image in of_unit[unit])
+
+    last = _LastMoved(moves, _PriorWay.from_prior(drive, prior), min_motion_px)
+    stands, moved_px = np.zeros(len(moves), dtype=np.bool_), np.full(len(moves), np.nan)
+    following = _following(drive.timestamps_us[wanted], wanted, moves)
+    place = one_by_one = 0  # in `wanted`: of the first unit that is not judged, and until where none goes unread
+    with one_opencv_thread(), closing(_ReadAhead(threads, small, following)) as images:
+        while place < len(wanted):
+            stood = place > 0 and bool(stands[wanted[place - 1]])
+            looked_at = following[place - 1] if stood and place >= one_by_one else place
+            now, unit, unread = images.at(looked_at, standing=stood), int(wanted[looked_at]), wanted[place:looked_at]
+            all_px, most_px = last.motion_px(unit, now)
+            if len(unread) and (all_px >= min_motion_px or not are_whole(unread)):
+                one_by_one = looked_at + 1
+                continue
+            if all_px < min_motion_px:
+                stands[wanted[place : looked_at + 1]] = True
+                moved_px[unread] = max(moved_px[wanted[place - 1]], most_px)
+                moved_px[unit] = most_px
             else:
-                last, kept_images = unit, now
+                last.unit, last.images = unit, now
+            place = looked_at + 1
+            images.forget(place)
     included = ~(stands & np.append(stands[1:], False))  # the last one of a stop is included
-    if stands.sum() >= units - 1:
+    if stands.sum() >= len(stands) - 1:
         included[:] = True
-    moved_px[included] = np.nan
-    return Standing(included=included, moved_px=moved_px, compared=len(read))
+    return Standing(included=included, moved_px=np.where(included, np.nan, moved_px), compared=images.count)
+
+
+class _LastMoved:
+    """The last unit that moved, with which those after it are compared."""
+
+    def __init__(self, moves: Bools, way: _PriorWay, min_motion_px: float) -> None:
+        self._moves, self._way, self._min_motion_px = moves, way, min_motion_px
+        self.unit, self.images = 0, dict[int, Floats32]()
+
+    def motion_px(self, unit: int, images: dict[int, Floats32]) -> tuple[float, float]:
+        """Motion of a unit since then, see `unit_motion_px`; infinite where the prior shows motion."""
+        if self._moves[unit] or self._way.shows_motion(self.unit, unit):
+            return np.inf, np.inf
+        return unit_motion_px(self.images, images, min_motion_px=self._min_motion_px)
+
+
+class _ReadAhead:
+    """Small images, read in threads before they are asked for."""
+
+    def __init__(self, threads: int, read: Callable[[int], dict[int, Floats32]], following: Sequence[int]) -> None:
+        self._pool, self._read, self._following = ThreadPoolExecutor(threads), read, following
+        self._most = IN_FLIGHT * threads
+        self._futures: dict[int, Future[dict[int, Floats32]]] = {}
+        self.count = 0
+
+    def at(self, place: int, *, standing: bool) -> dict[int, Floats32]:
+        """Images at a place; meanwhile those are read that come next if the car goes on to stand, or to move."""
+        upcoming = place
+        for _ in range(self._most):
+            if upcoming not in self._futures:
+                self._futures[upcoming] = self._pool.submit(self._read, upcoming)
+                self.count += 1
+            upcoming = self._following[upcoming] if standing else upcoming + 1
+            if upcoming >= len(self._following):
+                break
+        return self._futures[place].result()
+
+    def forget(self, before: int) -> None:
+        """Let go of what lies before a place."""
+        self._futures = {place: future for place, future in self._futures.items() if place >= before}
+
+    def close(self) -> None:
+        """Wait for what is being read, and read no more."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _following(times_us: Ints, units: Ints, moves: Bools) -> list[int]:
+    """The place that is looked at after each place of `units` while the car stands: the next one or a farther one.
+
+    Between the two lie units of the drive that follow one another, of which none moves by the prior, and no more time
+    than may go unread.
+    """
+    count = len(units)
+    ends = np.append(np.flatnonzero((np.diff(units) > 1) | moves[units[1:]]), count - 1)
+    end = ends[np.searchsorted(ends, np.arange(count))]
+    in_time = np.searchsorted(times_us, times_us + round(UNREAD_S * 1e6), side="right") - 1
+    result: list[int] = np.maximum(np.minimum(in_time, end), np.arange(count) + 1).tolist()
+    return result
 
 
 def moving_by_prior(drive: Drive, prior: PriorTrajectory) -> Bools:
@@ -174,100 +226,8 @@ class _PriorWay:
         return bool(self.known[units].all() and self.moved(self.times_s[units[:1]], self.times_s[units[1:]])[0])
 
 
-def unit_motion_px(
-    before: dict[int, Floats32], now: dict[int, Floats32], *, min_motion_px: float
-) -> tuple[float, float]:
-    """Motion (px, at full size) of more than half of the cameras, and of the one that moved most.
-
-    Cameras that show something else count in the first only. Both are infinite where no camera tells.
-    """
-    max_sigma_px = MAX_NOISE * min_motion_px / REDUCED
-    moved = []
-    for camera in before.keys() & now.keys():
-        if before[camera].shape != now[camera].shape:
-            continue
-        blocks = block_motion_px(before[camera], now[camera], max_sigma_px)
-        tell = blocks[~np.isnan(blocks)]
-        if len(tell) >= MIN_BLOCKS:
-            moved.append(float(np.median(tell)) * REDUCED)
-    if not moved:
-        return np.inf, np.inf
-    moved.sort()
-    explained = [way_px for way_px in moved if np.isfinite(way_px)]
-    # The smaller one of the two in the middle: half of the cameras may see one lorry.
-    return moved[(len(moved) - 1) // 2], max(explained, default=np.inf)
-
-
 def _by_unit(drive: Drive) -> list[list[DriveImage]]:
     result: list[list[DriveImage]] = [[] for _ in drive.timestamps_us]
     for image in drive.images:
         result[image.unit].append(image)
-    return result
-
-
-def _small_images(drive: Drive, images: Sequence[DriveImage]) -> dict[int, Floats32]:
-    """Small grey images by camera; none at all where one of them cannot be read."""
-    result: dict[int, Floats32] = {}
-    for image in images:
-        camera = drive.cameras[image.camera]
-        try:
-            size_px, width_px = (camera.width, camera.height), max(camera.width // REDUCED, 1)
-            grey = read_image_small(drive.root / image.file, size_px, width_px, colours="GRAY")
-        except InputError:
-            return {}
-        if grey is None:
-            return {}
-        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)
-        result[image.camera] = np.asarray(smooth, dtype=np.float32)
-    return result
-
-
-@njit(cache=True, nogil=True)
-def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
-    """Displacement (blocks,) of each block between two small images (h, w), in their pixels.
-
-    NaN where a block has too little texture to tell, infinite where neither a displacement nor an exposure
-    explains its change.
-    """
-    height, width = before.shape
-    rows, columns = (height - 2) // BLOCK_PX, (width - 2) // BLOCK_PX
-    result = np.full(rows * columns, np.nan)
-    for block in range(rows * columns):
-        top, left = 1 + (block // columns) * BLOCK_PX, 1 + (block % columns) * BLOCK_PX
-        normal, right, square = np.zeros((4, 4)), np.zeros(4), 0.0
-        contrast_before, contrast_now = 0.0, 0.0  # sums of squared gradients
-        column = np.empty(4)
-        for y in range(top, top + BLOCK_PX):
-            for x in range(left, left + BLOCK_PX):
-                # Gradients of both images' mean: displacements are then right to second order.
-                column[0] = 0.25 * (before[y, x + 1] - before[y, x - 1] + now[y, x + 1] - now[y, x - 1])
-                column[1] = 0.25 * (before[y + 1, x] - before[y - 1, x] + now[y + 1, x] - now[y - 1, x])
-                column[2] = before[y, x] - before[top, left]  # another exposure
-                column[3] = 1.0
-                contrast_before += (before[y, x + 1] - before[y, x - 1]) ** 2 + (
-                    before[y + 1, x] - before[y - 1, x]
-                ) ** 2
-                contrast_now += (now[y, x + 1] - now[y, x - 1]) ** 2 + (now[y + 1, x] - now[y - 1, x]) ** 2
-                change = now[y, x] - before[y, x]
-                square += change * change
-                for i in range(4):
-                    right[i] += column[i] * change
-                    for j in range(4):
-                        normal[i, j] += column[i] * column[j]
-        xx, xy, yy = normal[0, 0], normal[0, 1], normal[1, 1]
-        weakest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        if weakest < (SIGMA_GREY / max_sigma_px) ** 2:
-            continue
-        if max(contrast_before, contrast_now) > MAX_CONTRAST_RATIO**2 * min(contrast_before, contrast_now):
-            result[block] = np.inf
-            continue
-        for i in range(4):
-            normal[i, i] += 1e-6 * (1.0 + normal[i, i])
-        solution = np.linalg.solve(normal, right)
-        left_over = max(square - (solution * right).sum(), 0.0) / BLOCK_PX**2
-        unexplained = max(left_over - 2.0 * SIGMA_GREY**2, 0.0) / (0.5 * (xx + yy) / BLOCK_PX**2)
-        if unexplained > MAX_UNEXPLAINED_PX**2:
-            result[block] = np.inf
-        else:
-            result[block] = np.hypot(solution[0], solution[1])
     return result

@@ -57,8 +57,8 @@ def write(folder: Path, units: int, draw: Draw, cameras: int = 1) -> Drive:
     return drive
 
 
-def standing_of(drive: Drive, prior: PriorTrajectory = NO_PRIOR) -> Standing:
-    return find_standing(drive, prior, min_motion_px=MIN_MOTION_PX, threads=2)
+def standing_of(drive: Drive, prior: PriorTrajectory = NO_PRIOR, threads: int = 2) -> Standing:
+    return find_standing(drive, prior, min_motion_px=MIN_MOTION_PX, threads=threads)
 
 
 def stop_px(unit: int) -> float:
@@ -111,6 +111,23 @@ def test_a_driving_car_keeps_all_units(tmp_path: Path) -> None:
     for number, step_px in enumerate((3.0, 8.0, 40.0)):
         drive = write(tmp_path / str(number), 6, lambda unit, camera, by=step_px: view(camera, by * unit))
         assert standing_of(drive).included.all()
+
+
+def test_three_units_a_second_are_read_of_a_stop(tmp_path: Path) -> None:
+    """Ten are recorded. Steps in it are found where they are; an image that ends early is there for the extraction."""
+
+    def stepped_px(unit: int) -> float:
+        return 25.0 * (min(unit, 2) + (unit > 31) + max(unit - 58, 0))
+
+    drive = write(tmp_path, 60, lambda unit, camera: view(camera, stepped_px(unit)))
+    found = standing_of(drive, threads=1)
+    assert found.spans() == [(2, 31), (32, 58)]
+    assert found.compared < 40
+    assert not np.isnan(found.moved_px[~found.included]).any(), "also those between"
+    assert found.moved_px[~found.included].max() < 0.5
+    path = drive.root / drive.images[16].file
+    path.write_bytes(path.read_bytes()[:-100])
+    assert standing_of(drive).spans() == [(2, 15), (17, 31), (32, 58)]
 
 
 @pytest.mark.parametrize("share", [0.4, 1.0])
