@@ -66,10 +66,11 @@ def test_wrong_matches_do_not_hold_a_pose_where_it_is() -> None:
     noise = []
     for _ in range(40):
         poses, (rays_a, rays_b) = views(rng, 120)
-        given = moved(poses, ROOT @ rng.normal(0, 1, 9))
+        given_a, given_b = moved(poses, ROOT @ rng.normal(0, 1, 9))
         rays_b[:36] = rng.permutation(rays_b)[:36]
-        x, _ = most_likely_pose(*given, rays_a, rays_b, ROOT, SIGMA_RAD)
-        error, _, _ = epipolar_derivatives(*moved(given, ROOT @ x), rays_a[36:], rays_b[36:])
+        x, _ = most_likely_pose(given_a, given_b, rays_a, rays_b, ROOT, SIGMA_RAD)
+        found_a, found_b = moved(np.stack([given_a, given_b]), ROOT @ x)
+        error, _, _ = epipolar_derivatives(found_a, found_b, rays_a[36:], rays_b[36:])
         noise.append(np.median(np.abs(error)))
     assert np.percentile(noise, 90) < 0.5 * SIGMA_RAD
 
