@@ -23,7 +23,7 @@ demo: setup ## render two drives of a street, get their scenes and the map of bo
 	$(BIN)/mrasfm demo --out demo
 
 test: setup ## the fast suite and one real drive
-	$(BIN)/python -m pytest -m "not slow" -n 4 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile --no-loadscope-reorder
 
 slow: setup ## the tests that make test leaves out for their time: an hour or two
 	$(BIN)/python -m pytest -m slow -n 2 --dist loadfile --no-loadscope-reorder

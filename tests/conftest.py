@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import hashlib
 import json
 import os
@@ -9,12 +10,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -33,6 +36,7 @@ _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
 NICENESS = 5  # of test processes beside which kernels are compiled, to their end: only root can take it back
 _OF_UNIT = ("commands", "documentation", "importers", "io", "learned", "preflight", "scene", "schemas")
 _WITHOUT_KERNELS = (  # or with a few that compile in a second
+    REPOSITORY / "tests" / "console",
     REPOSITORY / "tests" / "service",
     *(REPOSITORY / "tests" / "unit" / name for name in (*_OF_UNIT, "test_vocabulary.py")),
 )
@@ -41,6 +45,7 @@ _compiler = pytest.StashKey[subprocess.Popen[bytes]]()
 
 def pytest_configure(config: pytest.Config) -> None:
     """Begin to compile before the test processes begin, which give way to it: all of them wait for it in the end."""
+    gc.disable()  # what is imported and collected stays
     if "PYTEST_XDIST_WORKER" in os.environ:
         os.nice(NICENESS if _KERNEL_LOCK in os.environ else 0)
         return
@@ -85,6 +90,20 @@ def _kernel_version() -> str:
     return digest.hexdigest()
 
 
+class _Scheduling(LoadFileScheduling):
+    """Gives whole files to test processes, and the console's all to one: each would start a browser and a service."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        scope: str = super()._split_scope(nodeid)
+        return "tests/console" if scope.startswith("tests/console/") else scope
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling:
+    """Schedule tests by what they share."""
+    return _Scheduling(config, log)
+
+
 # Files of these take up to two minutes each. What comes last are the many short ones of `tests/unit`: with long files
 # at the end one test process would work alone.
 _LONG = tuple(REPOSITORY / "tests" / name for name in ("integration", "worker", "console"))
@@ -93,7 +112,13 @@ _LONG = tuple(REPOSITORY / "tests" / name for name in ("integration", "worker", 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the tests first that need no kernels, and of the others the long ones."""
     needing = {item.path for item in items if _needs_kernels(item)}  # files go to test processes in one piece
-    items.sort(key=lambda item: (item.path in needing, not any(item.path.is_relative_to(folder) for folder in _LONG)))
+    items.sort(key=lambda item: (item.path in needing, not _is_below(item.path, _LONG)))
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage again, but not among the tests."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -106,9 +131,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def _needs_kernels(item: pytest.Item) -> bool:
-    if item.get_closest_marker("engine") is not None:
-        return True
-    return not any(item.path.is_relative_to(folder) for folder in _WITHOUT_KERNELS)
+    return item.get_closest_marker("engine") is not None or not _is_below(item.path, _WITHOUT_KERNELS)
+
+
+@cache
+def _is_below(path: Path, folders: tuple[Path, ...]) -> bool:
+    return any(path.is_relative_to(folder) for folder in folders)
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from playwright.sync_api import Page, ViewportSize, expect
 
 from service.domain.keys import revoke_key
 from tests.console.conftest import Open, World, go, log_in, wait_for
+from tests.helpers.slow import slow
 
 WIDE: ViewportSize = {"width": 1280, "height": 800}
 NARROW: ViewportSize = {"width": 400, "height": 800}
@@ -21,7 +22,7 @@ OF_LOOKS = ("color-contrast", "scrollable-region-focusable", "target-size")  # w
 AXE = next(Path(axe_playwright_python.__file__).parent.rglob("axe.min.js"))
 
 
-@pytest.mark.parametrize("pages", [5, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pages", [5, *slow(None)])
 def test_pages_are_whole(open_console: Open, world: World, pages: int | None) -> None:
     """No request to another host, no error, nothing beyond the width, no serious finding of axe: wide, and narrow."""
     shown = dict(list(world.pages.items())[:pages])

@@ -13,6 +13,7 @@ from playwright.sync_api import Page, expect
 
 from tests.console.conftest import Open, World, go, log_in
 from tests.helpers.live_api import Client
+from tests.helpers.slow import slow
 from tests.helpers.tiny_drive import TinyDrive, tiny_drive
 
 PIECE_BYTES = 8 << 20
@@ -39,7 +40,7 @@ def choose(page: Page, what: Path) -> None:
     page.locator(f"input[name={'folder' if what.is_dir() else 'archive'}]").set_input_files(what)
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("mrasfm.test", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("host", ["127.0.0.1", *slow("mrasfm.test")])
 def test_a_folder_is_uploaded_once(open_console: Open, world: World, tmp_path: Path, host: str) -> None:
     """Also on a host name that is no secure context, where browsers have no crypto.subtle."""
     client, drive = world.api.client(), tiny_drive("uploaded", seed=f"uploaded {host}")

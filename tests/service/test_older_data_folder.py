@@ -18,6 +18,7 @@ from sqlalchemy import create_engine, text
 from service.database.connections import Database, is_current
 from service.settings import Settings
 from tests.helpers.service_world import TERMINAL, wait_until
+from tests.helpers.slow import slow
 from tests.helpers.standalone import Standalone
 
 ARCHIVE = Path(__file__).parents[1] / "data" / "older_data_folder.tar.xz"
@@ -35,7 +36,7 @@ class Older:
     standalone: Standalone
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
+@pytest.fixture(params=["sqlite", *slow("postgresql")])
 def older(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Older]:
     with tarfile.open(ARCHIVE) as archive:
         # Python before 3.11.4 has no filters, and those from 3.12 on want one.

@@ -12,6 +12,7 @@ import httpx
 import pytest
 
 from tests.helpers.live_api import ApiProcess, api_process, settings_of
+from tests.helpers.slow import slow
 from tests.helpers.tus_client import begin, checksum, head, offset_of, patch
 from tests.service.test_uploads import PATH, image, stored
 
@@ -36,7 +37,7 @@ class _Killer:
             yield data[start : start + PIECE_BYTES]
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [1, *slow(50)])
 def test_kills_at_random_bytes(tmp_path: Path, kills: int) -> None:
     """Each time HEAD says how far it is, no bytes are wrong, and none that was told to be there is missing."""
     rng = random.Random(kills)

@@ -19,6 +19,7 @@ from service.database.tables import Blob, Checkpoint, SceneFile
 from service.job_queue import JobQueue
 from service.settings import Settings
 from tests.helpers.service_world import SHORT_TIMES, World, environment_of, is_gone, kill, wait_until
+from tests.helpers.slow import slow
 
 
 def assert_one_scene(world: World, job_id: str, outcomes: list[str]) -> None:
@@ -285,14 +286,7 @@ def test_worker_is_told_to_stop(world: World, brief_drive: Path) -> None:
     wait_until(lambda: not JobQueue(world.settings).waiting(), "no message is left behind")
 
 
-@pytest.mark.parametrize(
-    "signals",
-    [
-        pytest.param(["SIGTERM", "SIGTERM"], marks=pytest.mark.slow),
-        ["SIGQUIT"],
-        pytest.param(["SIGTERM", "SIGQUIT"], marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("signals", [["SIGQUIT"], *slow(["SIGTERM", "SIGTERM"], ["SIGTERM", "SIGQUIT"])])
 def test_impatient_stop(world: World, brief_drive: Path, signals: list[str]) -> None:
     """With a stage that does not listen: the job is given back all the same."""
     worker = world.start_worker()

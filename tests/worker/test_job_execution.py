@@ -28,6 +28,7 @@ from service.storage.process_folder import process_folder
 from tests.helpers.damaged_images import cut
 from tests.helpers.live_api import LIMITS
 from tests.helpers.service_world import World, is_gone, wait_until
+from tests.helpers.slow import slow
 from worker.attempt import AttemptFolder
 from worker.commit_with_retry import commit_with_retry
 from worker.heartbeat import Heartbeat
@@ -230,7 +231,7 @@ def break_endings(
     return broken
 
 
-@pytest.mark.parametrize("answer_lost", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("answer_lost", [True, *slow(False)])
 def test_database_that_is_away_when_the_scene_is_published(
     world: World,
     brief_drive: Path,

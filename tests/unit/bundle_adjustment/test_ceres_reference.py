@@ -26,6 +26,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import ADJUSTED, FISHEYE, PERSPECTIVE, RADIAL
 from mrasfm_engine.scene.state import State
 from tests.helpers.ceres_reference import CeresProblem, solve_with_ceres
+from tests.helpers.slow import slow
 from tests.helpers.small_problems import focal_prior, make_case, perturbed, project
 
 UNITS, CAMERAS, POINTS = 6, 3, 150
@@ -294,7 +295,7 @@ def apart(a: State, b: State) -> tuple[float, float, float]:
     )
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *slow(1, 2)])
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_the_optimum_is_that_of_ceres(kind: Callable[[Rng], Problem], seed: int) -> None:
     rng = np.random.default_rng(seed)

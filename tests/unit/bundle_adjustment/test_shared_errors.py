@@ -10,6 +10,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, co
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.scene.state import State
+from tests.helpers.slow import slow
 from tests.helpers.small_problems import make_case
 
 UNITS, CAMERAS, NOISE_PX, SHARED_PX = 24, 3, 0.5, 1.5
@@ -92,7 +93,7 @@ def test_sigmas_are_true_under_a_robust_loss() -> None:
     assert 0.8 < np.sqrt(np.mean(np.square(found))) < 1.25
 
 
-@pytest.mark.parametrize("units", [4, 6, 9])
+@pytest.mark.parametrize("units", [4, *slow(6, 9)])
 def test_errors_that_few_observations_share_are_covered(units: int) -> None:
     """Few units hardly tell how far they scatter: three standard deviations are wider for it, and hold as much."""
     shared, independent = [], []

@@ -29,6 +29,7 @@ from mrasfm_engine.io.images import read_image_gray, read_image_rgb
 from mrasfm_engine.preflight.drive_reader import check_drive, read_drive
 from mrasfm_engine.scene.drive import Drive, matrix_from_pose
 from tests.helpers.bag_writing import FORMATS, MOVING, STATIC, Messages, messages_of_drive
+from tests.helpers.slow import slow
 
 START_US = 1_700_000_000_000_000
 PERIOD_US = 100_000
@@ -833,7 +834,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", ["mcap", *slow("ros1", "sqlite")])
 def test_kitti_06_as_a_bag(shared_data: Path, tmp_path: Path, kind: str) -> None:
     import_recording(shared_data / "kitti06", tmp_path / "direct")
     direct = read_drive(tmp_path / "direct")

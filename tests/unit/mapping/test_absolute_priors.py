@@ -24,6 +24,7 @@ from tests.helpers.simulated_drive import (
     true_matches,
     with_true_poses,
 )
+from tests.helpers.slow import slow
 from tests.unit.mapping.test_placement import ARM_M, received
 
 UNITS, ROUGH_M, ROUGH_DEG = 24, 0.1, 0.5
@@ -70,7 +71,7 @@ def mapped(simulated: SimulatedDrive, absolute: AbsolutePriors) -> Mapper:
     return mapper
 
 
-@pytest.mark.parametrize("wrong", [0, 3])
+@pytest.mark.parametrize("wrong", [3, *slow(0)])
 def test_rough_poses_say_how_large_the_scene_is_and_where_it_lies(wrong: int) -> None:
     simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, given=long_baseline)
     poses = rough_poses(simulated, wrong=wrong)

@@ -21,6 +21,7 @@ from tests.helpers.simulated_drive import (
     with_lorry,
     with_true_poses,
 )
+from tests.helpers.slow import slow
 
 UNITS = 10
 
@@ -103,7 +104,7 @@ def mapped(simulated: SimulatedDrive) -> tuple[Mapper, MappingLog]:
     return whole.mapper, whole.log
 
 
-@pytest.mark.parametrize("cameras", [(1, 4), (0, 1, 2, 4, 5)])
+@pytest.mark.parametrize("cameras", [(0, 1, 2, 4, 5), *slow((1, 4))])
 def test_a_lorry_bends_neither_poses_nor_calibration(cameras: tuple[int, ...]) -> None:
     """Two cameras of six, and all but one, are covered for half of the drive."""
     clean = drive()

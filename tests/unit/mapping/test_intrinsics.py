@@ -20,6 +20,7 @@ from tests.helpers.simulated_drive import (
     with_cameras,
     with_true_poses,
 )
+from tests.helpers.slow import slow
 from tests.unit.mapping.test_placement import ARM_M, received
 
 SIGMA_FOCAL = 0.02
@@ -57,7 +58,7 @@ def test_a_turn_observes_focal_lengths_and_frees_what_the_model_has() -> None:
     assert found.findings(mapper) == []
 
 
-@pytest.mark.parametrize("cameras", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cameras", [2, *slow(4)])
 def test_what_is_not_observed_is_held_and_said(cameras: int) -> None:
     mapper, simulated = model(straight=True, cameras=cameras)
     good = mapper.config.bundle_adjustment.model_copy(update={"sigma_focal": 0.001})

@@ -28,6 +28,7 @@ from tests.helpers.simulated_drive import (
     true_matches,
     with_true_poses,
 )
+from tests.helpers.slow import slow
 
 ARM_M = np.array([-0.5, 0.2, 1.6])
 UNITS = 30
@@ -78,7 +79,7 @@ def refined(
 
 
 @pytest.mark.parametrize("while_mapping", [True, False])
-@pytest.mark.parametrize("sigma_m", [0.02, 0.3])
+@pytest.mark.parametrize("sigma_m", [0.02, *slow(0.3)])
 def test_the_better_the_receiver_the_better_the_scene_however_the_calibration_is_off(
     sigma_m: float, while_mapping: bool
 ) -> None:
@@ -177,7 +178,7 @@ def test_what_wanders_is_at_most_what_residuals_exceed_their_sigmas_by() -> None
     assert 1.5 < errors(off_m, likely=True, noise_factor=4.0).wander <= 4.0
 
 
-@pytest.mark.parametrize("sigma_m", [0.02, 0.5])
+@pytest.mark.parametrize("sigma_m", [0.5, *slow(0.02)])
 def test_positions_take_part_while_the_scene_grows(sigma_m: float) -> None:
     """A calibration that is off bends a scene that grows without them, and hardly one that grows with them."""
     simulated = make_simulated_drive(units=UNITS, cameras=2, points=2000, given=turned)

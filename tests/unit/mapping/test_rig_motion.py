@@ -24,6 +24,7 @@ from tests.helpers.simulated_drive import (
     rmse,
     true_matches,
 )
+from tests.helpers.slow import slow
 
 SKEW_MS = [0, 40, -35, 25, -20, 50]
 SPACING_M = 1.1
@@ -113,7 +114,7 @@ def test_a_unit_is_registered_with_the_motion_of_its_neighbours() -> None:
     assert result.inliers > 0.9 * result.correspondences
 
 
-@pytest.mark.parametrize("with_prior", [True, False])
+@pytest.mark.parametrize("with_prior", [False, *slow(True)])
 def test_a_skewed_drive_is_mapped_as_well_as_a_simultaneous_one(with_prior: bool) -> None:
     def mapped(simulated: SimulatedDrive, config: EngineConfig) -> tuple[Mapper, MappingLog]:
         pairs = true_matches(simulated)

@@ -19,6 +19,7 @@ from tests.helpers.simulated_drive import (
     with_cameras,
     with_true_poses,
 )
+from tests.helpers.slow import slow
 from tests.unit.mapping.test_placement import ARM_M, received
 
 UNITS = 30
@@ -58,12 +59,10 @@ def late() -> tuple[Mapper, SimulatedDrive, Refinement]:
     return mapper, simulated, refined(mapper, simulated)
 
 
-@pytest.mark.parametrize("apart", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_time_offsets_are_found_to_what_is_stated_of_them(
-    apart: bool, late: tuple[Mapper, SimulatedDrive, Refinement]
-) -> None:
+@pytest.mark.parametrize("apart", [False, *slow(True)])
+def test_time_offsets_are_found_to_what_is_stated_of_them(apart: bool, request: pytest.FixtureRequest) -> None:
     if apart:
-        mapper, _, result = late
+        mapper, _, result = request.getfixturevalue("late")
     else:
         mapper, simulated = model(LATE_MS, apart=False)
         result = refined(mapper, simulated)

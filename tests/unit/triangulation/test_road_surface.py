@@ -15,6 +15,7 @@ from mrasfm_engine.triangulation.road_surface import (
     rig_height_above,
 )
 from tests.helpers.road_shapes import SHAPES, bump
+from tests.helpers.slow import slow
 
 Profile = Callable[[np.ndarray], np.ndarray]
 LENGTH_M = 60.0
@@ -120,7 +121,7 @@ def is_on(road: FittedRoad) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.2])
-@pytest.mark.parametrize("a_square_metre", [2, 10])
+@pytest.mark.parametrize("a_square_metre", [2, *slow(10)])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_bumps_bays_and_crowns_are_the_road(shape: str, a_square_metre: int, wrong_share: float) -> None:
     """Of the points that the shape moves, at most 3 % are off, 5 % beside wrong ones; of those, most are."""

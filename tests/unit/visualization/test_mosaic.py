@@ -13,6 +13,7 @@ from mrasfm_engine.visualization.exposure import camera_gains
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic, make_mosaics
 from mrasfm_engine.visualization.views import AHEAD, GIVEN, REFINED, View, sample
 from tests.helpers.painted_ground import SIZE_PX, Level, Slope, looking, pattern, photographed, view_of
+from tests.helpers.slow import slow
 
 MAX_TEXTURE_PX = 16_384  # of browsers and graphics cards
 WAY = np.column_stack([np.linspace(0, 8, 9), np.zeros(9)])
@@ -67,7 +68,7 @@ def places(mosaic: Mosaic) -> np.ndarray:
     return np.stack(np.meshgrid(x, y), -1)
 
 
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV_FISHEYE", *slow("OPENCV")])
 def test_every_cell_shows_its_own_place(model: str) -> None:
     mosaic = drive(model)
     truth = pattern(places(mosaic))
@@ -277,5 +278,5 @@ def test_an_image_of_one_row_or_column_is_read_inside(shape: tuple[int, ...]) ->
     image[:] = 50
     seen = np.zeros(3, np.uint8)
     for u, v in ((0.1, 0.1), (shape[1] - 0.01, shape[0] - 0.01)):
-        sample(image, u, v, np.ones(3), seen)
+        sample.py_func(image, u, v, np.ones(3), seen)  # compiled for such memory, it takes ten seconds
         assert (seen == 50).all()
