@@ -35,8 +35,9 @@ sys.dont_write_bytecode = False
 _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
 NICENESS = 5  # of test processes beside which kernels are compiled, to their end: only root can take it back
 _OF_UNIT = ("commands", "documentation", "importers", "io", "learned", "preflight", "scene", "schemas")
+_CONSOLE = REPOSITORY / "tests" / "console"
 _WITHOUT_KERNELS = (  # or with a few that compile in a second
-    REPOSITORY / "tests" / "console",
+    _CONSOLE,
     REPOSITORY / "tests" / "service",
     *(REPOSITORY / "tests" / "unit" / name for name in (*_OF_UNIT, "test_vocabulary.py")),
 )
@@ -106,13 +107,19 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling:
 
 # Files of these take up to two minutes each. What comes last are the many short ones of `tests/unit`: with long files
 # at the end one test process would work alone.
-_LONG = tuple(REPOSITORY / "tests" / name for name in ("integration", "worker", "console"))
+_LONG = tuple(REPOSITORY / "tests" / name for name in ("integration", "worker"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests first that need no kernels, and of the others the long ones."""
+    """Put the tests first that need no kernels, and of the others the long ones.
+
+    Those of the console follow what needs no kernels: their browser leaves an event loop in its process, in which the
+    service's tests could start no other.
+    """
     needing = {item.path for item in items if _needs_kernels(item)}  # files go to test processes in one piece
-    items.sort(key=lambda item: (item.path in needing, not _is_below(item.path, _LONG)))
+    items.sort(
+        key=lambda item: (item.path in needing, item.path.is_relative_to(_CONSOLE), not _is_below(item.path, _LONG))
+    )
 
 
 def pytest_collection_finish() -> None:
