@@ -39,15 +39,15 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
     # One mask may serve many images, as that of the own car's body.
     masks = list({(i.mask, i.camera): i for i in drive.images if i.mask is not None}.values())
     total = len(drive.images) + len(masks)
+    # Headers are read one by one: threads would wait for the interpreter's lock three times as long as it takes.
+    for done, image in enumerate(drive.images, start=1):
+        found_here, codes = _check_image(drive, image, paths)
+        findings += found_here
+        for code in codes:
+            oddities[code].append(image.file)
+        if progress is not None:
+            progress(done, total)
     with ThreadPoolExecutor(MASK_THREADS) as pool:
-        for done, (image, result) in enumerate(
-            zip(drive.images, pool.map(lambda i: _check_image(drive, i, paths), drive.images), strict=True), start=1
-        ):
-            findings += result[0]
-            for code in result[1]:
-                oddities[code].append(image.file)
-            if progress is not None:
-                progress(done, total)
         for done, found in enumerate(pool.map(lambda i: _check_mask(drive, i, paths), masks), start=1):
             findings += found
             if progress is not None:
