@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from tests.benchmarks.table import Figure, exactly
 SEED, CAMERAS, UNITS, SIZE = 1, 6, 28, ("--width", 640, "--height", 360)
 AT, STOP_UNITS = 14, 600  # a minute at 10 Hz
 NOISE = 2.0  # grey levels of the sensor, anew in every image
-MOST_TIMES = 1.1
+MOST_TIMES, RUNS = 1.1, 3  # of which the shortest counts: what else runs on the machine makes the others longer
 ERROR_M = 0.05
 
 
@@ -30,12 +31,14 @@ def stops(data: Path, work: Path) -> Iterator[Figure]:
     mrasfm("synth", "--cameras", CAMERAS, "--units", UNITS, "--seed", SEED, *SIZE, "--no-masks", "--out", drive)
     stopped = _with_stop(drive, work / "with a stop")
     mrasfm("reconstruct", drive, "--no-gnss", "--out", work / "warm-up")  # compiles what no run before has
-    cpu_s, hashing_s = {}, {}
-    for one in (drive, stopped):
+    runs_s, scene = defaultdict(list), work / "scene"
+    for one in (drive, stopped) * RUNS:
+        shutil.rmtree(scene, ignore_errors=True)
         before_s = cpu_time_s()
-        mrasfm("reconstruct", one, "--no-gnss", "--out", work / f"{one.name}, scene")
-        cpu_s[one], hashing_s[one] = cpu_time_s() - before_s, _hashing_s(one)
-    scene = work / f"{stopped.name}, scene"
+        mrasfm("reconstruct", one, "--no-gnss", "--out", scene)
+        runs_s[one].append(cpu_time_s() - before_s)
+    cpu_s = {one: min(seconds) for one, seconds in runs_s.items()}
+    hashing_s = {one: _hashing_s(one) for one in runs_s}
     title = f"a stop of 60 s in a drive of {UNITS} units"
     yield Figure(line="29", what=f"{title}: CPU time without it", value=cpu_s[drive], unit="s")
     ratio = cpu_s[stopped] / cpu_s[drive]
