@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.jit import njit
 from mrasfm_engine.matching.image_motion import Motion, are_following
 from mrasfm_engine.matching.pair_selection import pairs_from_window, units_ahead
 from mrasfm_engine.scene.drive import Drive

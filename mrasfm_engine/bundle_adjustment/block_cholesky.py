@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Ints
 
 BLOCK = 6

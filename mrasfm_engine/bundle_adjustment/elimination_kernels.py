@@ -19,7 +19,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.bundle_adjustment.kernels import (
     Bands,
@@ -30,6 +29,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     linearise,
 )
 from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS, Groups
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats, Ints
 
 UNIT_SUMS = 27  # of an image: its unit's block by its lower triangle, and gradient

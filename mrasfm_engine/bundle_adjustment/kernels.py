@@ -36,9 +36,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import inverse_depth, project
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Ints
 
 BEHIND_PX = 1000.0  # what an observation costs whose point is where its camera shows nothing

@@ -11,10 +11,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.bundle_adjustment.problem import Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, solve
+from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats
 

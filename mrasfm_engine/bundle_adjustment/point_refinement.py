@@ -13,7 +13,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.bundle_adjustment.elimination_kernels import invert3
 from mrasfm_engine.bundle_adjustment.kernels import (
@@ -26,6 +25,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     linearise,
 )
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.jit import njit
 
 CONVERGED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
 WORTH = 3e-2  # gain an observation, after which a point is still far enough from its minimum for one more step

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from numba import njit
 
 from mrasfm_engine.bundle_adjustment.priors import (
     add_to_units,
@@ -30,6 +29,7 @@ from mrasfm_engine.bundle_adjustment.priors import (
 )
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
+from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats, Ints
 

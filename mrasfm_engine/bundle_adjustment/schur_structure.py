@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.bundle_adjustment.block_cholesky import BlockPattern, Elimination
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations, RowBandMotion
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Ints
 
 MAX_BLOCKS = 128  # free units and cameras one point may couple; more observations of it still count for themselves

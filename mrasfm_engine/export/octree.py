@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Ints, Ints32
 
 GRID_BITS = 7

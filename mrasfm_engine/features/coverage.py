@@ -13,8 +13,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats32, Ints
 
 

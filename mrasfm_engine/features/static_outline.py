@@ -13,9 +13,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Floats32, Ints
 
 # Share of a gradient's energy that stays. An edge whose contrast varies by three times its mean keeps a tenth; of n

@@ -30,9 +30,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera
 

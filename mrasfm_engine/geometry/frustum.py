@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import project, unproject_pixels
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats, Ints
 
 GRID = (5, 3)  # rays sampled across and down an image

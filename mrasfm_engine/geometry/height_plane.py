@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Ints
 
 HYPOTHESES = 96  # planes through three points

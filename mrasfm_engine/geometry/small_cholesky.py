@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
+from mrasfm_engine.jit import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

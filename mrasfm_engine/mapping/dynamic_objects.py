@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.jit import njit
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.parallel import mapped
 from mrasfm_engine.scene.scene import PairMatches

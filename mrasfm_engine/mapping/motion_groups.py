@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.triangulation.track_motion import DRIFT_M_S, SPEED_M_S, TrackMotion
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.types import Floats, Ints

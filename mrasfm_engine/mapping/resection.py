@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats, Ints
 
 SIGMAS_PX = (32.0, 8.0, 2.0)  # of the Cauchy loss, one after the other, where nothing else is known

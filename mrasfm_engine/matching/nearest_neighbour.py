@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.jit import njit
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
 from mrasfm_engine.scene.scene import ImageFeatures

@@ -14,9 +14,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.small_cholesky import factorise, solve
+from mrasfm_engine.jit import njit
 from mrasfm_engine.matching.robust_correction import CONVERGED, INITIAL_DAMPING, ITERATIONS, SETTLED
 from mrasfm_engine.types import Floats
 

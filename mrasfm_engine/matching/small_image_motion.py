@@ -13,10 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.images import read_image_small
+from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import Floats32
 

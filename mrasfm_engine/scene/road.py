@@ -8,9 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.neighbours import nearest
+from mrasfm_engine.jit import njit
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.road_relief import Relief
 from mrasfm_engine.types import Bools, Floats, Ints

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats
 
 Junction = tuple[int, int]

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.jit import njit
 from mrasfm_engine.synthetic.city import city_route, in_sight, points_beside
 from mrasfm_engine.synthetic.rigs import TrueCamera, true_cameras
 from mrasfm_engine.types import CountProgress, Floats, Floats32, Ints

@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from mrasfm_engine.jit import njit
 
 NEAR_M = 0.15
 

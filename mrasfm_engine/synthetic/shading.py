@@ -9,7 +9,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from mrasfm_engine.jit import njit
 
 MAX_TAPS = 4
 

@@ -12,10 +12,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.geometry.small_cholesky import factorise, solve
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Ints
 
 STANDS, MOVES = 3, 5  # number of unknowns

@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.types import Bools, Floats, Ints
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.small_cholesky import log_determinant, solve
+from mrasfm_engine.jit import njit
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.triangulation.point_hypotheses import (
     MOVES,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
+from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches

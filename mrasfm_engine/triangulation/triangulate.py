@@ -11,9 +11,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.jit import njit
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks

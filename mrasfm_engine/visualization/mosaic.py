@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
 from mrasfm_engine.visualization.pixel_lattice import (

@@ -11,9 +11,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry.camera_model import project
+from mrasfm_engine.jit import njit
 from mrasfm_engine.visualization.views import MIN_RESOLUTION_PX, OWN_CAR_LEVEL, VIEW_M, height_at
 
 NODE_CELLS = 8  # of a square's side

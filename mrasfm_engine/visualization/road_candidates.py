@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 from mrasfm_engine.visualization.pixel_lattice import (
     LINEAR,

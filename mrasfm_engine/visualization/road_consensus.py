@@ -15,8 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Bytes, Floats32
 from mrasfm_engine.visualization.road_candidates import HIDDEN, QUALITY_UNIT, Candidates
 

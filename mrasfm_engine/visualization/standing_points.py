@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Ints
 from mrasfm_engine.visualization.ground import GroundHeights
 from mrasfm_engine.visualization.views import VIEW_M, PlacedView

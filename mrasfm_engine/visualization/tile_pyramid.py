@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bytes
 from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile, TileIndex
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numba import njit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project, unproject_pixels
+from mrasfm_engine.jit import njit
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.types import Bools, Bytes, Floats
 from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundTiles

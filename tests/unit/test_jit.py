@@ -1,0 +1,72 @@
+"""Compiled kernels on the disk are those of the sources as they are."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mrasfm_engine import jit
+from mrasfm_engine.bundle_adjustment import kernels
+from mrasfm_engine.matching import sampson
+from tests.helpers.slow import slow
+
+OUTER = """
+from mrasfm_engine.constants import SHIFT
+from mrasfm_engine.inner import times
+from mrasfm_engine.jit import njit
+from mrasfm_engine.other import of_python
+
+@njit(cache=True)
+def result(x):
+    return times(x) + SHIFT
+"""
+INNER = """
+from mrasfm_engine.jit import njit
+
+@njit(cache=True)
+def times(x):
+    return FACTOR * x
+"""
+RUN = "from mrasfm_engine.outer import result; print(result(10), sum(result.stats.cache_hits.values()))"
+
+
+def test_sources_are_those_of_kernels_and_constants() -> None:
+    def names(module: str) -> set[str]:
+        return {path.name for path in jit.source_files(module)}
+
+    assert names(kernels.__name__) == {"kernels.py", "camera_model.py"}
+    assert names(sampson.__name__) == {"sampson.py", "small_cholesky.py", "robust_correction.py"}
+
+
+@pytest.mark.parametrize("given_folder", [False, *slow(True)])
+def test_a_kernel_is_renewed_with_what_it_calls_and_its_constants(tmp_path: Path, given_folder: bool) -> None:
+    package = tmp_path / "mrasfm_engine"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    shutil.copy(jit.__file__, package / "jit.py")
+    (package / "outer.py").write_text(OUTER)
+
+    def run(factor: int, shift: int, other: str = "") -> list[int]:
+        (package / "inner.py").write_text(INNER.replace("FACTOR", str(factor)))
+        (package / "constants.py").write_text(f"SHIFT = {shift}")
+        (package / "other.py").write_text(f"def of_python(): {other or 'pass'}")
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment.pop("NUMBA_CACHE_DIR", None)
+        if given_folder:
+            environment["NUMBA_CACHE_DIR"] = str(tmp_path / "kept")
+        command = [sys.executable, "-c", RUN]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
+        assert done.returncode == 0, done.stderr
+        return [int(word) for word in done.stdout.split()]
+
+    assert run(2, 1) == [21, 0]
+    assert run(2, 1, other="return 1") == [21, 1], "it is kept, whatever Python does"
+    assert run(3, 1) == [31, 0]
+    assert run(3, 2) == [32, 0]
+    assert run(3, 2) == [32, 1]
+    assert any((tmp_path / "kept" if given_folder else package).rglob("*.nbi"))
