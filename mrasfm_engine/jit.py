@@ -9,12 +9,14 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
+import time
 from collections.abc import Callable
 from enum import EnumMeta
 from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
+from uuid import uuid4
 
 from numba import njit
 from numba.core import caching
@@ -22,14 +24,15 @@ from numba.core import caching
 __all__ = ["njit", "source_files"]
 
 PACKAGE = Path(__file__).resolve().parent
+BEGUN_S = time.time()
 _IMPORT = re.compile(r"^from ((?:mrasfm_engine|schemas)[\w.]*) import (?:\(([^)]*)\)|([^\n]*))", re.MULTILINE)
 
 
 def source_files(module: str) -> list[Path]:
     """Files that the kernels of an imported module are compiled of: its own, and those of what it takes from others.
 
-    These are the modules of the package that it imports a kernel or a constant from, what these import, and so on.
-    Functions and classes of Python are not compiled into kernels.
+    These are the modules of the package that it imports a kernel, a constant or a named tuple from, what these import,
+    and so on. Other functions and classes of Python are not compiled into kernels.
     """
     found: dict[str, Path] = {}
     waiting = [module]
@@ -46,8 +49,9 @@ def _origins(module: str) -> frozenset[str]:
     """Modules that a module imports from what may be compiled into its kernels."""
     here = sys.modules[module]
     result = set()
-    for origin, in_lines, in_one_line in _IMPORT.findall(_text(Path(str(here.__file__)))):
-        for imported in re.sub("#.*", "", in_lines or in_one_line).split(","):
+    text = re.sub("#.*", "", _text(Path(str(here.__file__))))
+    for origin, in_lines, in_one_line in _IMPORT.findall(text):
+        for imported in (in_lines or in_one_line).split(","):
             names = imported.split()
             value = getattr(here, names[-1], None) if names else None
             if isinstance(value, ModuleType):
@@ -58,8 +62,8 @@ def _origins(module: str) -> frozenset[str]:
 
 
 def _is_of_python(value: object) -> bool:
-    """Functions, classes but for those of constants, and names of types."""
-    is_class = isinstance(value, type) and not isinstance(value, EnumMeta)
+    """Functions, classes but for those of constants and named tuples, and names of types."""
+    is_class = isinstance(value, type) and not (isinstance(value, EnumMeta) or hasattr(value, "_fields"))
     return is_class or isinstance(value, FunctionType) or hasattr(value, "__origin__")
 
 
@@ -70,9 +74,15 @@ def _text(path: Path) -> str:
 
 @cache
 def _stamp(module: str) -> str:
-    """Digest of the content of all sources of a module's kernels."""
+    """Digest of the content of all sources of a module's kernels.
+
+    Where one has changed since this process began, what it imported may not be what is there by now: that has a stamp
+    of its own.
+    """
     digest = hashlib.sha256()
     for path in source_files(module):
+        if path.stat().st_ctime > BEGUN_S:
+            return uuid4().hex
         digest.update(f"{path.name} {len(_text(path))}\n{_text(path)}".encode())
     return digest.hexdigest()
 
@@ -89,7 +99,8 @@ class _OfAllSources:
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
         """The locator of a function in a file; None where it is another's, or has no place on the disk."""
-        if not Path(py_file).resolve().is_relative_to(PACKAGE):
+        path = Path(py_file).resolve()
+        if not (path.is_relative_to(PACKAGE) and path.is_file() and py_func.__module__ in sys.modules):
             return None
         found = super().from_function(py_func, py_file)  # type: ignore[misc]
         if found is not None:

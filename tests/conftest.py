@@ -46,8 +46,8 @@ _compiler = pytest.StashKey[subprocess.Popen[bytes]]()
 
 def pytest_configure(config: pytest.Config) -> None:
     """Begin to compile before the test processes begin, which give way to it: all of them wait for it in the end."""
-    gc.disable()  # what is imported and collected stays
     if "PYTEST_XDIST_WORKER" in os.environ:
+        gc.disable()  # what is imported and collected stays
         os.nice(NICENESS if _KERNEL_LOCK in os.environ else 0)
         return
     if not getattr(config.option, "numprocesses", None) or _is_compiled(config):
@@ -100,9 +100,9 @@ class _Scheduling(LoadFileScheduling):
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling:
-    """Schedule tests by what they share."""
-    return _Scheduling(config, log)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling | None:
+    """Schedule tests by what they share, where whole files are asked for."""
+    return _Scheduling(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 # Files of these take up to two minutes each. What comes last are the many short ones of `tests/unit`: with long files
@@ -123,7 +123,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Look for garbage again, but not among the tests."""
+    """Look for garbage again where it was not looked for, but not among the tests."""
     gc.freeze()
     gc.enable()
 

@@ -10,11 +10,11 @@ prior trajectory shows motion no image is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from mrasfm_engine.features.extraction import one_opencv_thread
 from mrasfm_engine.io.images import has_its_end
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.small_image_motion import small_images, unit_motion_px
-from mrasfm_engine.parallel import IN_FLIGHT
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import Bools, Cancel, Floats, Floats32, Ints
 
@@ -32,6 +31,7 @@ MOVED_SIGMAS, MOVED_M = 6.0, 1.0
 WINDOWS_S = (0.5, 1.0, 2.0)  # before the unit, and after it: a stop of two seconds and more is seen
 # A car that accelerates and brakes by 4 m/s^2 gets no farther than 3 cm and back within this time.
 UNREAD_S = 0.35
+AHEAD = 2  # units that wait to be looked at, by thread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +64,8 @@ def find_standing(
 ) -> Standing:
     """Find the units that moved less than `min_motion_px`, in pixels of full images.
 
-    A drive without any motion keeps all units, as mapping does. Units with an image that cannot be read are not left
-    out: the extraction says what is wrong with it.
+    A drive without any motion keeps all units, as mapping does. Units with an image that is missing or ends early are
+    not left out, nor any with one that is looked at and cannot be read: the extraction says what is wrong with it.
 
     Raises
     ------
@@ -88,11 +88,13 @@ def find_standing(
     stands, moved_px = np.zeros(len(moves), dtype=np.bool_), np.full(len(moves), np.nan)
     following = _following(drive.timestamps_us[wanted], wanted, moves)
     place = one_by_one = 0  # in `wanted`: of the first unit that is not judged, and until where none goes unread
-    with one_opencv_thread(), closing(_ReadAhead(threads, small, following)) as images:
+    with one_opencv_thread(), closing(_ReadAhead(threads, small)) as images:
         while place < len(wanted):
             stood = place > 0 and bool(stands[wanted[place - 1]])
-            looked_at = following[place - 1] if stood and place >= one_by_one else place
-            now, unit, unread = images.at(looked_at, standing=stood), int(wanted[looked_at]), wanted[place:looked_at]
+            goes_on = stood and place >= one_by_one
+            looked_at = following[place - 1] if goes_on else place
+            now = images.at(looked_at, _upcoming(looked_at, following, standing=goes_on))
+            unit, unread = int(wanted[looked_at]), wanted[place:looked_at]
             all_px, most_px = last.motion_px(unit, now)
             if len(unread) and (all_px >= min_motion_px or not are_whole(unread)):
                 one_by_one = looked_at + 1
@@ -108,7 +110,7 @@ def find_standing(
     included = ~(stands & np.append(stands[1:], False))  # the last one of a stop is included
     if stands.sum() >= len(stands) - 1:
         included[:] = True
-    return Standing(included=included, moved_px=np.where(included, np.nan, moved_px), compared=images.count)
+    return Standing(included=included, moved_px=np.where(included, np.nan, moved_px), compared=len(images.asked))
 
 
 class _LastMoved:
@@ -128,22 +130,19 @@ class _LastMoved:
 class _ReadAhead:
     """Small images, read in threads before they are asked for."""
 
-    def __init__(self, threads: int, read: Callable[[int], dict[int, Floats32]], following: Sequence[int]) -> None:
-        self._pool, self._read, self._following = ThreadPoolExecutor(threads), read, following
-        self._most = IN_FLIGHT * threads
+    def __init__(self, threads: int, read: Callable[[int], dict[int, Floats32]]) -> None:
+        self._pool, self._read, self._most = ThreadPoolExecutor(threads), read, AHEAD * threads
         self._futures: dict[int, Future[dict[int, Floats32]]] = {}
-        self.count = 0
+        self.asked: set[int] = set()
 
-    def at(self, place: int, *, standing: bool) -> dict[int, Floats32]:
-        """Images at a place; meanwhile those are read that come next if the car goes on to stand, or to move."""
-        upcoming = place
-        for _ in range(self._most):
-            if upcoming not in self._futures:
-                self._futures[upcoming] = self._pool.submit(self._read, upcoming)
-                self.count += 1
-            upcoming = self._following[upcoming] if standing else upcoming + 1
-            if upcoming >= len(self._following):
-                break
+    def at(self, place: int, upcoming: Iterable[int]) -> dict[int, Floats32]:
+        """Images at a place; of upcoming ones some are read meanwhile, the first ones first."""
+        for one in chain((place,), upcoming):
+            if one not in self._futures:
+                if one != place and len(self._futures) >= self._most:
+                    break
+                self._futures[one] = self._pool.submit(self._read, one)
+        self.asked.add(place)
         return self._futures[place].result()
 
     def forget(self, before: int) -> None:
@@ -153,6 +152,12 @@ class _ReadAhead:
     def close(self) -> None:
         """Wait for what is being read, and read no more."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _upcoming(place: int, following: Sequence[int], *, standing: bool) -> Iterator[int]:
+    """Places that are looked at after one if the car goes on to stand, or does not."""
+    while (place := following[place] if standing else place + 1) < len(following):
+        yield place
 
 
 def _following(times_us: Ints, units: Ints, moves: Bools) -> list[int]:

@@ -39,7 +39,8 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
     # One mask may serve many images, as that of the own car's body.
     masks = list({(i.mask, i.camera): i for i in drive.images if i.mask is not None}.values())
     total = len(drive.images) + len(masks)
-    # Headers are read one by one: threads would wait for the interpreter's lock three times as long as it takes.
+    # Headers are read one by one: on a disk of the machine itself, threads would wait for the interpreter's lock three
+    # times as long as it takes.
     for done, image in enumerate(drive.images, start=1):
         found_here, codes = _check_image(drive, image, paths)
         findings += found_here

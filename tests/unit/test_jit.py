@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine import jit
-from mrasfm_engine.bundle_adjustment import kernels
+from mrasfm_engine.bundle_adjustment import kernels, point_refinement
 from mrasfm_engine.matching import sampson
 from tests.helpers.slow import slow
 
@@ -27,10 +27,24 @@ def result(x):
 """
 INNER = """
 from mrasfm_engine.jit import njit
+from mrasfm_engine.pair import Pair
 
 @njit(cache=True)
 def times(x):
-    return FACTOR * x
+    return Pair(FACTOR, x).factor * x
+"""
+PAIR = """
+from typing import NamedTuple
+
+class Pair(NamedTuple):
+    factor: int
+    other: int
+"""
+CHANGED = """
+import pathlib
+constants = pathlib.Path("mrasfm_engine/constants.py")
+import mrasfm_engine.constants, mrasfm_engine.jit
+constants.write_text("SHIFT = 5")
 """
 RUN = "from mrasfm_engine.outer import result; print(result(10), sum(result.stats.cache_hits.values()))"
 
@@ -41,6 +55,8 @@ def test_sources_are_those_of_kernels_and_constants() -> None:
 
     assert names(kernels.__name__) == {"kernels.py", "camera_model.py"}
     assert names(sampson.__name__) == {"sampson.py", "small_cholesky.py", "robust_correction.py"}
+    of_others = {"elimination_kernels.py", "kernels.py", "schur_structure.py", "camera_model.py"}
+    assert names(point_refinement.__name__) == {"point_refinement.py", *of_others}, "also of those of others"
 
 
 @pytest.mark.parametrize("given_folder", [False, *slow(True)])
@@ -51,15 +67,16 @@ def test_a_kernel_is_renewed_with_what_it_calls_and_its_constants(tmp_path: Path
     shutil.copy(jit.__file__, package / "jit.py")
     (package / "outer.py").write_text(OUTER)
 
-    def run(factor: int, shift: int, other: str = "") -> list[int]:
+    def run(factor: int, shift: int, other: str = "", pair: str = PAIR, first: str = "") -> list[int]:
         (package / "inner.py").write_text(INNER.replace("FACTOR", str(factor)))
         (package / "constants.py").write_text(f"SHIFT = {shift}")
+        (package / "pair.py").write_text(pair)
         (package / "other.py").write_text(f"def of_python(): {other or 'pass'}")
         environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
         environment.pop("NUMBA_CACHE_DIR", None)
         if given_folder:
             environment["NUMBA_CACHE_DIR"] = str(tmp_path / "kept")
-        command = [sys.executable, "-c", RUN]
+        command = [sys.executable, "-c", first + RUN]
         done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
         assert done.returncode == 0, done.stderr
         return [int(word) for word in done.stdout.split()]
@@ -69,4 +86,7 @@ def test_a_kernel_is_renewed_with_what_it_calls_and_its_constants(tmp_path: Path
     assert run(3, 1) == [31, 0]
     assert run(3, 2) == [32, 0]
     assert run(3, 2) == [32, 1]
+    assert run(3, 2, pair=PAIR + "# changed") == [32, 0]
+    assert run(3, 4, first=CHANGED) == [34, 0], "as it was imported, not as it is by now"
+    assert run(3, 5) == [35, 0], "nobody else takes that"
     assert any((tmp_path / "kept" if given_folder else package).rglob("*.nbi"))

@@ -834,7 +834,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("kind", ["mcap", *slow("ros1", "sqlite")])
+@pytest.mark.parametrize("kind", [FORMATS[0], *slow(*FORMATS[1:])])
 def test_kitti_06_as_a_bag(shared_data: Path, tmp_path: Path, kind: str) -> None:
     import_recording(shared_data / "kitti06", tmp_path / "direct")
     direct = read_drive(tmp_path / "direct")
