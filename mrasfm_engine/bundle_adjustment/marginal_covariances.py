@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -123,7 +123,7 @@ def _with_shared_errors(problem: Problem, state: State, unseen: Bools, covarianc
 
     That of independent errors where they are too few to tell, or do not determine all by the curvature of their loss.
     """
-    curved = replace(problem, options=replace(problem.options, is_curved=True))
+    curved = problem.with_curvature()
     system = curved.normal_equations(state, 0.0)
     eliminated = system.eliminate(unseen.astype(np.float64))
     if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:

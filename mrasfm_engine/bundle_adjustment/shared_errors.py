@@ -50,11 +50,11 @@ def shared_error_covariance(
     columns
         (n, k) D^-1 f of every functional.
     """
-    _, unit = np.unique(problem.observations.unit, return_inverse=True)
-    units = int(unit.max(initial=-1)) + 1
-    if units < MIN_UNITS or not columns.any():
+    observes = np.bincount(problem.observations.unit) > 0
+    if observes.sum() < MIN_UNITS or not columns.any():
         return None
-    of_units = problem.scores(state, system, columns, unit)
+    number = np.cumsum(observes) - 1  # among the units that observe anything
+    of_units = problem.scores(state, system, columns, number[problem.observations.unit])
     of_points = problem.scores(state, system, columns, problem.observations.point % POINT_GROUPS)
     covariance = of_points.T @ of_points + _of_terms(problem, state, columns)
     known = np.diagonal(covariance) > 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -203,6 +204,12 @@ class Problem:
     def structure(self) -> SchurStructure:
         """Blocks that the points couple; the same for every state."""
         return SchurStructure.from_observations(self.observations, self.layout, self.motion)
+
+    def with_curvature(self) -> Problem:
+        """The problem with the curvature of its loss; both have one structure."""
+        result = copy.copy(self)
+        result.options = replace(self.options, is_curved=True)
+        return result
 
     def normal_equations(self, state: State, damping: float) -> ReducedCameraSystem:
         """The reduced system at a state."""
