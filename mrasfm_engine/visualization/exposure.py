@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from mrasfm_engine.scene.scene import Scene, observed_colors
-from mrasfm_engine.types import Floats
+from mrasfm_engine.types import Floats, Ints
 from mrasfm_engine.visualization.mosaic import Mosaic
 from mrasfm_engine.visualization.views import REFINED
 
@@ -15,6 +17,7 @@ MAX_GAIN = 4.0
 MAX_CAMERA_GAIN = 1.4
 EVERY_CELL = 3  # of the mosaic, in rows and columns, is compared
 MIN_CELLS = 200
+LOG_COLOR = np.log(np.maximum(np.arange(256.0), 2.0))
 DARK, SATURATED = 8, 247  # colours beyond carry no information on the exposure
 
 
@@ -24,27 +27,32 @@ def exposure_gains(scene: Scene) -> Floats:
     The logarithm of an observation's colour is that of its point plus that of its image's exposure: alternately the
     mean over every point and the median over every image.
     """
-    image, point = scene.observation_image, scene.observation_point
+    image = scene.observation_image
     gains = np.ones((len(scene.drive.images), 3))
     if not len(image):
         return gains
-    colors = observed_colors(scene.features, image, scene.observation_keypoint)
     order = np.argsort(image, kind="stable")
-    image, point = image[order], point[order]
-    log_color = np.log(np.maximum(colors[order].astype(np.float64), 2.0))
-    images, start = np.unique(image, return_index=True)
-    spans = list(zip(images, start, [*start[1:], len(image)], strict=True))
+    colors = observed_colors(scene.features, image, scene.observation_keypoint)[order]
+    point = scene.observation_point[order]
+    images, start = np.unique(image[order], return_index=True)
+    bounds = [*start.tolist(), len(image)]
     count = np.maximum(np.bincount(point), 1)
-    exposure = np.zeros_like(gains)
-    for _ in range(ROUNDS):
-        left = log_color - exposure[image]
-        mean = np.stack([np.bincount(point, left[:, k]) for k in range(3)], 1) / count[:, None]
-        for i, lo, hi in spans:
-            change = np.median(log_color[lo:hi] - mean[point[lo:hi]], axis=0)
-            exposure[i] = change * (hi - lo) / (hi - lo + SHRINKAGE)
-        exposure[images] -= exposure[images].mean(0)
-    gains[:] = np.clip(np.exp(-exposure), 1 / MAX_GAIN, MAX_GAIN)
+    for k in range(3):  # colour by colour: of all at once, logarithms and their means take most of the memory
+        exposure = _exposures(LOG_COLOR[colors[:, k]], point, count, bounds)
+        gains[images, k] = np.clip(np.exp(-exposure), 1 / MAX_GAIN, MAX_GAIN)
     return gains
+
+
+def _exposures(log_color: Floats, point: Ints, count: Ints, bounds: list[int]) -> Floats:
+    """Exposures (i,) of images whose observations (n,), of points with so many (p,), lie between bounds (i + 1,)."""
+    exposure: Floats = np.zeros(len(bounds) - 1)
+    for _ in range(ROUNDS):
+        mean = np.bincount(point, log_color - np.repeat(exposure, np.diff(bounds))) / count
+        for i, (lo, hi) in enumerate(pairwise(bounds)):
+            change = np.median(log_color[lo:hi] - mean[point[lo:hi]])
+            exposure[i] = change * (hi - lo) / (hi - lo + SHRINKAGE)
+        exposure -= exposure.mean()
+    return exposure
 
 
 def camera_gains(mosaic: Mosaic) -> Floats:
