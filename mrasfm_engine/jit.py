@@ -87,6 +87,12 @@ def _stamp(module: str) -> str:
     return digest.hexdigest()
 
 
+@cache
+def _is_of_package(file: str) -> bool:
+    path = Path(file).resolve()
+    return path.is_relative_to(PACKAGE) and path.is_file()
+
+
 class _OfAllSources:
     """Part of a numba cache locator, for functions of this package alone."""
 
@@ -99,8 +105,7 @@ class _OfAllSources:
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
         """The locator of a function in a file; None where it is another's, or has no place on the disk."""
-        path = Path(py_file).resolve()
-        if not (path.is_relative_to(PACKAGE) and path.is_file() and py_func.__module__ in sys.modules):
+        if not (_is_of_package(py_file) and py_func.__module__ in sys.modules):
             return None
         found = super().from_function(py_func, py_file)  # type: ignore[misc]
         if found is not None:

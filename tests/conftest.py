@@ -118,7 +118,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     needing = {item.path for item in items if _needs_kernels(item)}  # files go to test processes in one piece
     items.sort(
-        key=lambda item: (item.path in needing, item.path.is_relative_to(_CONSOLE), not _is_below(item.path, _LONG))
+        key=lambda item: (item.path in needing, _is_below(item.path, (_CONSOLE,)), not _is_below(item.path, _LONG))
     )
 
 

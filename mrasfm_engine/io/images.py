@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -14,8 +13,6 @@ from mrasfm_engine.io.image_decoding import Colours, decode_jpeg, decode_jpeg_sm
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular
 from mrasfm_engine.types import Bytes
 from schemas import LabelMap
-
-JPEG_END, PNG_END = b"\xff\xd9", b"\0\0\0\0IEND\xaeB`\x82"
 
 
 def read_image_gray(path: Path) -> Bytes:
@@ -77,18 +74,6 @@ def read_image_small(path: Path, size_px: tuple[int, int], width_px: int, *, col
         return image
     size = (width_px, max(1, round(header.height * width_px / header.width)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def has_its_end(path: Path) -> bool:
-    """Return whether a file ends as JPEG or PNG files do, which truncated ones do not. Nothing is decoded."""
-    try:
-        with path.open("rb") as file:
-            file.seek(0, os.SEEK_END)
-            file.seek(max(file.tell() - len(PNG_END), 0))
-            end = file.read()
-    except OSError:
-        return False
-    return end == PNG_END or end.endswith(JPEG_END)
 
 
 def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:

@@ -110,10 +110,10 @@ def _linearise(
             along_b += b[i] * t[i]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            a_over_ta, b_over_tb = a[j] * ta[k] - a[k] * ta[j], b[j] * tb[k] - b[k] * tb[j]
+            a_cross_ta, b_cross_tb = a[j] * ta[k] - a[k] * ta[j], b[j] * tb[k] - b[k] * tb[j]
             derivatives[n, i] = -(a[j] * tb[k] - a[k] * tb[j]) / length - share * along_a * ta[i]
             derivatives[n, 3 + i] = (b[j] * ta[k] - b[k] * ta[j]) / length - share * along_b * tb[i]
-            derivatives[n, 6 + i] = across[i] / length - share * (a_over_ta + b_over_tb)
+            derivatives[n, 6 + i] = across[i] / length - share * (a_cross_ta + b_cross_tb)
             normal[n, i] = ta[i] / max(math.sqrt(ta2), 1e-12)
 
 

@@ -15,12 +15,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import chain, pairwise
+from pathlib import Path
 
 import numpy as np
 
-from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.features.extraction import one_opencv_thread
-from mrasfm_engine.io.images import has_its_end
+from mrasfm_engine.io.image_header import read_header
+from mrasfm_engine.io.images import check_image_header
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.small_image_motion import small_images, unit_motion_px
 from mrasfm_engine.scene.drive import Drive, DriveImage
@@ -82,16 +84,15 @@ def find_standing(
         return small_images(drive, of_unit[wanted[place]])
 
     def are_whole(units: Ints) -> bool:
-        return all(has_its_end(drive.root / image.file) for unit in units for image in of_unit[unit])
+        return all(is_whole(drive.root / image.file) for unit in units for image in of_unit[unit])
 
     last = _LastMoved(moves, _PriorWay.from_prior(drive, prior), min_motion_px)
     stands, moved_px = np.zeros(len(moves), dtype=np.bool_), np.full(len(moves), np.nan)
     following = _following(drive.timestamps_us[wanted], wanted, moves)
-    place = one_by_one = 0  # in `wanted`: of the first unit that is not judged, and until where none goes unread
+    place, one_by_one = 0, 1  # in `wanted`: of the first unit that is not judged, and until where none goes unread
     with one_opencv_thread(), closing(_ReadAhead(threads, small)) as images:
         while place < len(wanted):
-            stood = place > 0 and bool(stands[wanted[place - 1]])
-            goes_on = stood and place >= one_by_one
+            goes_on = place >= one_by_one and bool(stands[wanted[place - 1]])
             looked_at = following[place - 1] if goes_on else place
             now = images.at(looked_at, _upcoming(looked_at, following, standing=goes_on))
             unit, unread = int(wanted[looked_at]), wanted[place:looked_at]
@@ -111,6 +112,15 @@ def find_standing(
     if stands.sum() >= len(stands) - 1:
         included[:] = True
     return Standing(included=included, moved_px=np.where(included, np.nan, moved_px), compared=len(images.asked))
+
+
+def is_whole(path: Path) -> bool:
+    """Return whether an image has a sound header and its end; no pixel is decoded."""
+    try:
+        check_image_header(read_header(path), path)
+    except InputError:
+        return False
+    return True
 
 
 class _LastMoved:

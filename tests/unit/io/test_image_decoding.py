@@ -13,7 +13,7 @@ import pytest
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_decoding import IncompleteImageError
-from mrasfm_engine.io.images import has_its_end, read_image_gray, read_image_rgb, read_mask
+from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
 from tests.helpers.damaged_images import cut, patched_frame, png_chunks, png_of_chunks
 
 STORED = cv2.IMREAD_IGNORE_ORIENTATION
@@ -25,15 +25,6 @@ SAMPLINGS = {
     "444": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 }
 VARIANTS = [(sampling, progressive, restart) for sampling in SAMPLINGS for progressive in (0, 1) for restart in (0, 4)]
-
-
-def test_files_that_end_early_lack_their_end(picture: np.ndarray, tmp_path: Path) -> None:
-    path = tmp_path / "image"
-    for data in (encoded(picture), cv2.imencode(".png", picture)[1].tobytes()):
-        for written, is_whole in ((data, True), (data[:-1], False), (data[: len(data) // 2], False), (b"", False)):
-            path.write_bytes(written)
-            assert has_its_end(path) == is_whole
-    assert not has_its_end(tmp_path / "nothing")
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 
 from mrasfm_engine.matching.pair_matching import NO_PRIOR
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.matching.standing import Standing, find_standing, moving_by_prior
+from mrasfm_engine.matching.standing import Standing, find_standing, is_whole, moving_by_prior
 from mrasfm_engine.scene.drive import Drive
 from tests.helpers.simulated_drive import make_drive
 
@@ -129,6 +129,15 @@ def test_three_units_a_second_are_read_of_a_stop(tmp_path: Path) -> None:
     path = drive.root / drive.images[16].file
     path.write_bytes(path.read_bytes()[:-100])
     assert standing_of(drive).spans() == [(2, 15), (17, 31), (32, 58)]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_an_image_that_ends_early_is_not_whole(tmp_path: Path, suffix: str) -> None:
+    path, data = tmp_path / "image", cv2.imencode(suffix, view(0, 0.0).astype(np.uint8))[1].tobytes()
+    for written, whole in ((data, True), (data[:-1], False), (data[: len(data) // 2], False), (b"", False)):
+        path.write_bytes(written)
+        assert is_whole(path) == whole
+    assert not is_whole(tmp_path / "nothing")
 
 
 @pytest.mark.parametrize("share", [0.4, 1.0])
