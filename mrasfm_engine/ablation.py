@@ -217,8 +217,7 @@ def _row(
     matches = stages.matches(run, features, prior)
     if name == FULL:
         warm_up(run, features, matches, prior)
-    model = stages.mapping(run, features, matches, prior)[0]
-    scene = stages.scene(run, model, features, matches, prior)
+    scene, _ = stages.refinement(run, stages.mapping(run, features, matches, prior), prior)
     done = {stage["stage"]: stage for stage in run.report["stages"]}
     took = {stage: seconds.get(stage) if report["reused"] else report["seconds"] for stage, report in done.items()}
     if name == FULL:

@@ -74,9 +74,8 @@ def reconstruct(
     run.report["settings"] = config.model_dump(mode="json")
     with watched_compilation() as compiled:
         prior, spans = _begun(run)
-        features, matches, (model, *others) = stages.mapped(run, spans, prior)
-        scene = stages.scene(run, model, features, matches, prior)
-        components = stages.components(run, model, scene, others, prior)
+        # No name for what was mapped: it is most of what stands in memory, and only the refinement needs it.
+        scene, components = stages.refinement(run, stages.mapped(run, spans, prior), prior)
         with scratch_folder(out) as scratch:
             pictures = stages.pictures(run, scene, scratch)
             if cancel():

@@ -31,7 +31,8 @@ class Stage(StrEnum):
 
 # A finished stage is a file of this folder, inside the scene's or map's. A file of that name is complete.
 CHECKPOINT_FOLDER = ".stages"
-CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING})  # seams are too, each by itself
+# Seams are too, each by itself.
+CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING, Stage.REFINEMENT})
 
 REPORT_FILE = "report.json"
 REPORT_PAGE = "report.html"  # the same for people

@@ -158,8 +158,7 @@ def map_descriptors(progress: StageProgress, folder: Path, config: EngineConfig)
     run.report["findings"] = []
     start_memory_bytes = memory_bytes()
     prior, spans = stages.prior(run), stages.cut_drive(run)
-    features, matches, (model, *_) = stages.mapped(run, spans, prior)
-    scene = stages.scene(run, model, features, matches, prior)
+    scene, _ = stages.refinement(run, stages.mapped(run, spans, prior), prior)
     every = [*run.report["stages"], *(stage for part in run.report.get("submaps", []) for stage in part["stages"])]
     matched = next(stage for stage in run.report["stages"] if stage["stage"] == Stage.MATCHES)
     return replace(
@@ -172,10 +171,10 @@ def map_descriptors(progress: StageProgress, folder: Path, config: EngineConfig)
 
 
 class _MappedAnew(StageStore):
-    """Finished stages, of which mapping is always done again: it is what is timed."""
+    """Finished stages, of which mapping and what follows is always done again: it is what is timed."""
 
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
-        return None if name == "mapping" else super()._read(name, key, arrays=arrays)
+        return None if name in (Stage.MAPPING, Stage.REFINEMENT) else super()._read(name, key, arrays=arrays)
 
 
 def _run(progress: StageProgress, drive_folder: Path, config: EngineConfig, store: StageStore) -> stages.Run:
@@ -196,8 +195,8 @@ def _map(
     run.report["findings"] = []
     warm_up(run, features, matches, prior)
     start_memory_bytes = memory_bytes()
-    model = stages.mapping(run, features, matches, prior)[0]
-    return _mapped(run, stages.scene(run, model, features, matches, prior), start_memory_bytes)
+    scene, _ = stages.refinement(run, stages.mapping(run, features, matches, prior), prior)
+    return _mapped(run, scene, start_memory_bytes)
 
 
 def _mapped(run: stages.Run, scene: Scene, start_memory_bytes: int | None) -> Mapped:

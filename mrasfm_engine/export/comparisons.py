@@ -144,14 +144,23 @@ def _baselines(scene: Scene, centres: Floats) -> Rows:
             yield Row(f"rigs: the distance of cameras {a} and {b}", float(np.ptp(lengths)), 0.0, POSE_TOLERANCE)
 
 
-def points_text(scene: Scene, found: ModelPoints) -> Rows:
+def points_text(scene: Scene, found: Iterator[ModelPoints]) -> Rows:
     """Every point, its colour and its track."""
-    yield Row("its point ids", np.sort(found.ids), np.arange(1, len(scene.points_m) + 1))
-    index = found.ids - 1
-    yield Row("a point", found.xyz, scene.points_m[index], POSE_TOLERANCE)
-    yield Row("a colour", found.colors, scene.point_colors[index], 0.0)
-    observations = (scene.observation_point + 1, scene.observation_image + 1, scene.observation_keypoint)
-    yield Row("a track", _sorted_rows(found.observations), _sorted_rows(np.column_stack(observations)))
+    times_read = np.zeros(len(scene.points_m), dtype=np.int64)
+    first = np.searchsorted(scene.observation_point, np.arange(len(scene.points_m) + 1))
+    for part in found:
+        index = part.ids - 1
+        none_such = part.ids[(index < 0) | (index >= len(times_read))]
+        yield Row("a point id", none_such, none_such[:0])
+        np.add.at(times_read, index, 1)
+        yield Row("a point", part.xyz, scene.points_m[index], POSE_TOLERANCE)
+        yield Row("a colour", part.colors, scene.point_colors[index], 0.0)
+        counts = first[index + 1] - first[index]
+        rows = np.arange(counts.sum()) + np.repeat(first[index] - np.cumsum(counts) + counts, counts)
+        observations = (scene.observation_point[rows], scene.observation_image[rows], scene.observation_keypoint[rows])
+        expected = np.column_stack(observations) + np.array([1, 1, 0])
+        yield Row("a track", _sorted_rows(part.observations), _sorted_rows(expected))
+    yield Row("the number of its lines about a point", times_read, np.ones_like(times_read))
 
 
 def points_binary(scene: Scene, found: ModelPoints) -> Rows:

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, NoReturn
 
@@ -25,6 +26,8 @@ from mrasfm_engine.export.colmap import BINARY_FILES, TEXT_FILES
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.types import Floats, Ints
 from schemas import DriveManifest
+
+POINTS_AT_ONE_TIME = 20_000
 
 
 class ModelImage(NamedTuple):
@@ -159,9 +162,17 @@ def images_text(path: Path) -> Iterator[ModelImage]:
             yield ModelImage(int(image_id), name, [float(v) for v in numbers], rows[:, :2], rows[:, 2])
 
 
-def points_text(path: Path) -> ModelPoints:
-    """All points of a text model."""
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+def points_text(path: Path) -> Iterator[ModelPoints]:
+    """All points of a text model, some thousand at one time: a long drive's take more memory than its scene."""
+    with path.open(encoding="utf-8", newline="\n") as file:
+        lines = (line for line in file if not line.startswith("#"))
+        while part := list(islice(lines, POINTS_AT_ONE_TIME)):
+            yield _points_of_lines(part)
+
+
+def _points_of_lines(lines: Sequence[str]) -> ModelPoints:
+    if not lines[-1].endswith("\n"):
+        raise ValueError("it ends early")
     counts = np.array([line.rstrip().count(" ") + 1 for line in lines], dtype=np.int64)
     numbers, ends = _numbers(" ".join(lines)), np.cumsum(counts)
     if len(numbers) != counts.sum():

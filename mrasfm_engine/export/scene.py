@@ -40,6 +40,7 @@ from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_free
 from mrasfm_engine.export.report_page import scene_page, write_page
 from mrasfm_engine.io.images import mask_png
+from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas.artifacts import (
@@ -255,7 +256,7 @@ def write_json(path: Path, document: Mapping[str, Any], *, in_lines: Sequence[st
 
 
 def _encode(value: Any, *, indent: int | None = None) -> str:
-    return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False, default=_plain)
+    return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False, default=plain)
 
 
 def _in_lines(document: Mapping[str, Any], lists: Sequence[str]) -> str:
@@ -265,14 +266,6 @@ def _in_lines(document: Mapping[str, Any], lists: Sequence[str]) -> str:
         text = "[\n  " + ",\n  ".join(map(_encode, value)) + "\n ]" if key in lists else _encode(value)
         lines.append(f" {_encode(key)}: {text}")
     return "{\n" + ",\n".join(lines) + "\n}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def _size_bytes(scene: Scene) -> int:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.errors import storage_error
+from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.scene.drive import Drive
 from schemas.artifacts import checkpoint_file
 
@@ -90,7 +91,8 @@ class StageWriter:
 
     def finish(self, report: Mapping[str, Any]) -> None:
         """Put the stage in the place of an earlier one, in one step; raises as `add` does."""
-        self._write("header", np.array(json.dumps({"key": self._key, "report": report, "arrays": self._names})))
+        header = {"key": self._key, "report": report, "arrays": self._names}
+        self._write("header", np.array(json.dumps(header, default=plain)))
         try:
             self._archive.close()
             self._file.flush()

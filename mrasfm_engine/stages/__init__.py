@@ -9,21 +9,22 @@ from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
 from mrasfm_engine.stages._cut import count_of_submaps, cut_drive, is_cut
 from mrasfm_engine.stages._extraction_size import extraction_sizes
 from mrasfm_engine.stages._features import features, store_features
-from mrasfm_engine.stages._mapping import mapping
+from mrasfm_engine.stages._mapping import MappedDrive, mapping
 from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
 from mrasfm_engine.stages._own_car import own_cars
+from mrasfm_engine.stages._refinement import refinement
 from mrasfm_engine.stages._run import VERSIONS, Run, store_of
-from mrasfm_engine.stages._scene import components, numbered_components, pictures, scene
+from mrasfm_engine.stages._scene import numbered_components, pictures
 from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
 from mrasfm_engine.stages._submap_run import SubmapRun
 from mrasfm_engine.stages._submaps import mapped
 
 __all__ = [
     "VERSIONS",
+    "MappedDrive",
     "Run",
     "SubmapRun",
     "all_units",
-    "components",
     "count_of_submaps",
     "cut_drive",
     "extraction_sizes",
@@ -42,7 +43,7 @@ __all__ = [
     "preflight",
     "prior",
     "probe",
-    "scene",
+    "refinement",
     "store_features",
     "store_of",
     "unpack_pairs",

@@ -10,7 +10,6 @@ import numpy as np
 
 from mrasfm_engine.features.stored_features import JoinedFeatures
 from mrasfm_engine.io.stage_store import Arrays, StageWriter, fingerprint
-from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.submaps import join
 from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import match_pairs
@@ -20,19 +19,18 @@ from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.submaps import share_a_submap
 from mrasfm_engine.stages._features import describe_features, left_out_of, require_features
-from mrasfm_engine.stages._mapping import keypoints_of, mappers, mapping_of, packed
+from mrasfm_engine.stages._mapping import MappedDrive, map_once, mapping_of, packed
 from mrasfm_engine.stages._matches import describe_matches, match_settings, read_pairs, require_matches, write_pairs
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.stages._submap_run import SubmapRun
+from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import Bools, Ints
 from schemas.artifacts import Stage
 
 _COUNTED = ("candidate_pairs", "rejected_pairs", "prior", "dropped_between_classes")  # of the matches' reports
 
 
-def join_submaps(
-    run: Run, submaps: Sequence[SubmapRun], known: PriorTrajectory
-) -> tuple[JoinedFeatures, list[PairMatches], list[Mapper]]:
+def join_submaps(run: Run, submaps: Sequence[SubmapRun], known: PriorTrajectory) -> MappedDrive:
     """Features, matches and mapped components of the whole drive, from those of its sub-maps.
 
     Raises
@@ -44,15 +42,14 @@ def join_submaps(
     run.key = fingerprint(run.key or run.drive_key, [submap.run.key for submap in submaps])
     found = _joined_features(run, submaps)
     pairs = _joined_matches(run, submaps, found, known)
-    keypoints, numbered_pairs = keypoints_of(run, found, pairs)
-    parts = [part for submap in submaps for part in submap.parts()]
-    keyframe = _keyframes(run, submaps)
 
-    def work() -> tuple[Arrays, dict[str, Any]]:
-        arrays, report = packed(join(mapping_of(run, keypoints, numbered_pairs, known), parts, keyframe), found)
+    def work(keypoints: Keypoints, numbered_pairs: list[PairMatches]) -> tuple[Arrays, dict[str, Any]]:
+        parts = [part for submap in submaps for part in submap.parts()]
+        joined = join(mapping_of(run, keypoints, numbered_pairs, known), parts, _keyframes(run, submaps))
+        arrays, report = packed(joined, found)
         return arrays, report | _joined_counts([report, *(submap.entry(Stage.MAPPING) for submap in submaps)])
 
-    return found, pairs, mappers(run, keypoints, known, work)
+    return map_once(run, found, pairs, known, work)
 
 
 def _joined_features(run: Run, submaps: Sequence[SubmapRun]) -> JoinedFeatures:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,19 +21,36 @@ from mrasfm_engine.triangulation.tracks import Keypoints
 from schemas.artifacts import Stage
 from schemas.findings import as_json
 
+MappingWork = Callable[[Keypoints, list[PairMatches]], tuple[Arrays, dict[str, Any]]]  # arrays and report of the stage
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappedDrive:
+    """Features and matches of a drive, and what was mapped of them.
+
+    Attributes
+    ----------
+    mappers
+        Makes the model of every component, the largest first. Models of a long drive are most of what stands in memory,
+        and whoever finds the refined scene in the store needs none.
+    """
+
+    features: Sequence[ImageFeatures]
+    pairs: Sequence[PairMatches]
+    mappers: Callable[[], list[Mapper]]
+
 
 def mapping(
     run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory
-) -> list[Mapper]:
-    """Units registered one by one, points triangulated, everything adjusted; of every component, the largest first."""
-    keypoints, numbered_pairs = keypoints_of(run, found, pairs)
+) -> MappedDrive:
+    """Units registered one by one, points triangulated, everything adjusted."""
 
-    def work() -> tuple[Arrays, dict[str, Any]]:
+    def work(keypoints: Keypoints, numbered_pairs: list[PairMatches]) -> tuple[Arrays, dict[str, Any]]:
         begun = mapping_of(run, keypoints, numbered_pairs, known)
         begun.map_from_seeds()
         return packed(begun.finish(), found)
 
-    return mappers(run, keypoints, known, work)
+    return map_once(run, found, pairs, known, work)
 
 
 def keypoints_of(
@@ -84,16 +102,32 @@ def mapping_settings(run: Run) -> object:
     return [*(section.model_dump() for section in sections), run.config.seed, run.config.use_gnss]
 
 
-def mappers(
-    run: Run, keypoints: Keypoints, known: PriorTrajectory, work: Callable[[], tuple[Arrays, dict[str, Any]]]
-) -> list[Mapper]:
-    """The stage of mapping by some work, or from the store."""
-    arrays, report = run.stage(Stage.MAPPING, mapping_settings(run), work)
+def map_once(
+    run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], known: PriorTrajectory, work: MappingWork
+) -> MappedDrive:
+    """The stage of mapping by some work on what `keypoints_of` gives, or from the store."""
+    keypoints, arrays, report = _mapped_once(run, found, pairs, work)
     run.report["findings"] += report["findings"]
-    return [
-        Mapper.from_arrays(run.drive, keypoints, run.config, known.world_from_rig, numbered(arrays, number))
-        for number in range(len(report["components"]))
-    ]
+
+    def mappers() -> list[Mapper]:
+        lined_up = keypoints_of(run, found, pairs)[0] if keypoints is None else keypoints
+        return [
+            Mapper.from_arrays(run.drive, lined_up, run.config, known.world_from_rig, numbered(arrays, number))
+            for number in range(len(report["components"]))
+        ]
+
+    return MappedDrive(features=found, pairs=pairs, mappers=mappers)
+
+
+def _mapped_once(
+    run: Run, found: Sequence[ImageFeatures], pairs: Sequence[PairMatches], work: MappingWork
+) -> tuple[Keypoints | None, Arrays, dict[str, Any]]:
+    """Arrays and report of the stage, and the keypoints where it was done now; nobody needs its matches any more."""
+    settings = mapping_settings(run)
+    if run.is_done(Stage.MAPPING, settings):
+        return None, *run.stage(Stage.MAPPING, settings, lambda: work(*keypoints_of(run, found, pairs)))
+    lined_up = keypoints_of(run, found, pairs)  # no part of what the stage takes
+    return lined_up[0], *run.stage(Stage.MAPPING, settings, lambda: work(*lined_up))
 
 
 def numbered(arrays: Arrays, number: int) -> Arrays:

@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
 OWN_CAR_VERSION, EXTRACTION_SIZE_VERSION = 4, 2
-VERSIONS = {Stage.FEATURES: 6, Stage.MATCHES: 8, Stage.MAPPING: 12}
+VERSIONS = {Stage.FEATURES: 6, Stage.MATCHES: 8, Stage.MAPPING: 12, Stage.REFINEMENT: 1}
 
 
 def new_report() -> dict[str, Any]:
@@ -127,6 +127,10 @@ class Run:
     def next_key(self, stage: Stage, settings: object) -> str:
         """The fingerprint of a stage that follows those done so far."""
         return fingerprint(self.key or self.drive_key, stage, settings, VERSIONS[stage])
+
+    def is_done(self, stage: Stage, settings: object) -> bool:
+        """Return whether the next stage is in the store."""
+        return self.store.has(stage, self.next_key(stage, settings))
 
     def stage(
         self, name: Stage, settings: object, work: Callable[[], tuple[Arrays, dict[str, Any]]]

@@ -10,13 +10,11 @@ from typing import Any
 
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import ReconstructionError
-from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.scene.submaps import Span
 from mrasfm_engine.stages._features import features
 from mrasfm_engine.stages._join import join_submaps
-from mrasfm_engine.stages._mapping import mapping
+from mrasfm_engine.stages._mapping import MappedDrive, mapping
 from mrasfm_engine.stages._matches import matches
 from mrasfm_engine.stages._run import Run, new_report
 from mrasfm_engine.stages._submap_run import SubmapRun
@@ -27,9 +25,7 @@ from schemas.artifacts import SUBMAP_STAGES, Stage
 THREADS_A_PROCESS = 4  # one process has not enough to do for more all of the time: units are registered one by one
 
 
-def mapped(
-    run: Run, spans: Sequence[Span], known: PriorTrajectory
-) -> tuple[Sequence[ImageFeatures], list[PairMatches], list[Mapper]]:
+def mapped(run: Run, spans: Sequence[Span], known: PriorTrajectory) -> MappedDrive:
     """Features, matches and mapped components of a drive: of its sub-maps where it is cut, else in one piece.
 
     Raises
@@ -40,8 +36,7 @@ def mapped(
     if spans:
         return join_submaps(run, run_submaps(run, spans), known)
     found = features(run)
-    pairs = matches(run, found, known)
-    return found, pairs, mapping(run, found, pairs, known)
+    return mapping(run, found, matches(run, found, known), known)
 
 
 def run_submaps(run: Run, spans: Sequence[Span]) -> list[SubmapRun]:

@@ -125,11 +125,13 @@ class Tracks:
 
     @staticmethod
     def from_labels(of_keypoint: Ints) -> Tracks:
-        """Tracks of the keypoints' labels, -1 for none; labels are numbered anew without gaps."""
+        """Tracks of the keypoints' labels, -1 for none; labels with gaps are numbered anew."""
         members = np.flatnonzero(of_keypoint >= 0)
         _, labels = np.unique(of_keypoint[members], return_inverse=True)
-        result = np.full(len(of_keypoint), -1, dtype=np.int64)
-        result[members] = labels
+        result = of_keypoint
+        if not np.array_equal(labels, of_keypoint[members]):
+            result = np.full(len(of_keypoint), -1, dtype=np.int64)
+            result[members] = labels
         order = np.argsort(labels, kind="stable")
         count = int(labels.max()) + 1 if len(labels) else 0
         return Tracks(

@@ -131,8 +131,8 @@ def _scene(route: LongRoute, number: int, start: int, work: Path) -> Path:
     run.report["drive"], run.report["settings"] = drive.manifest.name, config.model_dump(mode="json")
     stages.load_models(run)
     prior = stages.prior(run)
-    features, matches, (model, *_) = stages.mapped(run, [], prior)
-    write_scene(stages.scene(run, model, features, matches, prior), scene, run.report)
+    refined, _ = stages.refinement(run, stages.mapped(run, [], prior), prior)
+    write_scene(refined, scene, run.report)
     return scene
 
 

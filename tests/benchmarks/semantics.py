@@ -33,7 +33,9 @@ from mrasfm_engine.geometry.alignment import align_rigid
 from mrasfm_engine.geometry.camera_model import pack_cameras, project_points, unproject_pixels
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.road import RoadAssessment, assess_road
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.road import Thickness
@@ -231,8 +233,8 @@ def finished_model(drive: Path, scene: Path) -> Mapper:
     prior = stages.prior(run)
     features = stages.features(run)
     matches = stages.matches(run, features, prior)
-    mapper = stages.mapping(run, features, matches, prior)[0]
-    stages.scene(run, mapper, features, matches, prior)
+    mapper = stages.mapping(run, features, matches, prior).mappers()[0]
+    refine(mapper, AbsolutePriors.from_trajectory(prior))
     assert all(stage["reused"] for stage in run.report["stages"][:3]), "the scene's stages were to be used again"
     return mapper
 

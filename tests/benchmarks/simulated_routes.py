@@ -76,8 +76,7 @@ def _reconstructed(route: SimulatedDrive, receiver: Receiver, seed: int, folder:
     )
     run.report["findings"] = []
     prior = stages.prior(run)
-    model = stages.mapping(run, route.features, route.pairs, prior)[0]
-    scene = stages.scene(run, model, route.features, route.pairs, prior)
+    scene, _ = stages.refinement(run, stages.mapping(run, route.features, route.pairs, prior), prior)
     errors = compare_known(scene.world_from_rig, route.world_from_rig)
     if errors is None:
         return Found(georeferenced=False, metric_rmse_m=np.inf, similarity_rmse_m=np.inf, scale_sigmas=np.inf)

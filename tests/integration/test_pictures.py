@@ -16,6 +16,7 @@ from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.synthetic.options import SynthOptions
 from mrasfm_engine.synthetic.streets import lay_out
+from schemas.artifacts import CHECKPOINTED
 from tests.integration.conftest import CommandResult, Variant, read_report, synth
 
 Run = Callable[..., CommandResult]
@@ -110,5 +111,5 @@ def test_pictures_can_be_turned_off_and_leave_with_the_scene_they_show(variant: 
     assert not (variant.scene / "pictures").exists()
     report = read_report(variant.scene)
     assert "pictures" not in report["by_stage"]
-    assert all(report["by_stage"][name]["reused"] for name in ("features", "matches", "mapping"))
+    assert all(report["by_stage"][name]["reused"] for name in CHECKPOINTED)
     assert (variant.scene / "poses.tum").read_bytes() == poses

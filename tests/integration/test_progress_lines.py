@@ -43,5 +43,5 @@ def test_stages_begin_and_end_in_lines(small: Variant) -> None:
     assert re.fullmatch(r", 3/3, \d+\.\d s", ends["mapping"])
     assert re.fullmatch(r", \d+\.\d s", ends["export"])
     again = run(small)
-    assert [stage for stage, what, _ in again if what == "reused"] == ["features", "matches", "mapping"]
-    assert [stage for stage, what, _ in again if what == "begins"] == ["preflight", "refinement", "pictures", "export"]
+    assert [stage for stage, what, _ in again if what == "reused"] == ["features", "matches", "mapping", "refinement"]
+    assert [stage for stage, what, _ in again if what == "begins"] == ["preflight", "pictures", "export"]

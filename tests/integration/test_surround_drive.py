@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 
+from schemas.artifacts import CHECKPOINTED
 from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, leftovers, read_report
 
 Run = Callable[..., CommandResult]
@@ -82,14 +84,26 @@ def test_georeferenced_frame(surround_drive: Path, surround_scene: Path) -> None
 def test_second_run_reuses_everything(variant: Variant, mrasfm: Run) -> None:
     variant.keep(cameras=["front", "left"], units=4).save()
     assert mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES, "--no-gnss").code == 0
-    before = (variant.scene / "poses.tum").read_bytes()
-    first = read_report(variant.scene)["stages"]
-    assert [stage["reused"] for stage in first] == [False] * len(first)
+    before, first = _contents(variant.scene), read_report(variant.scene)
+    assert [stage["reused"] for stage in first["stages"]] == [False] * len(first["stages"])
     assert mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES, "--no-gnss").code == 0
-    again = read_report(variant.scene)["by_stage"]
-    assert all(again[name]["reused"] for name in ("features", "matches", "mapping"))
-    assert (variant.scene / "poses.tum").read_bytes() == before
+    again = read_report(variant.scene)
+    assert all(again["by_stage"][name]["reused"] for name in CHECKPOINTED)
+    assert _contents(variant.scene) == before
+    assert [_of_what_was_found(stage) for stage in again["stages"]] == [_of_what_was_found(s) for s in first["stages"]]
+    assert (again["findings"], again["summary"]) == (first["findings"], first["summary"])
     _check_not_georeferenced(variant.scene)
+
+
+def _contents(scene: Path) -> dict[str, bytes]:
+    """Files of a scene that hold no times."""
+    files = (path for path in scene.rglob("*") if path.is_file() and ".stages" not in path.parts)
+    timed = ("report.json", "report.html", "features.db")
+    return {str(path.relative_to(scene)): path.read_bytes() for path in files if path.name not in timed}
+
+
+def _of_what_was_found(stage: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in stage.items() if name not in ("seconds", "reused")}
 
 
 def _check_not_georeferenced(scene: Path) -> None:

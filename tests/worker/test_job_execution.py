@@ -112,10 +112,11 @@ def test_stages_are_found_again_on_another_machine(world: World, brief_drive: Pa
         "artifacts_url": world.settings.resolved_artifacts_url,
         "database_url": SecretStr(world.settings.resolved_database_url),
     }
-    assert run(world, world.ask(drive_id, wake=False), **elsewhere).reused == ["features", "matches", "mapping"]
+    reused = ["features", "matches", "mapping", "refinement"]
+    assert run(world, world.ask(drive_id, wake=False), **elsewhere).reused == reused
     with world.database.read() as session:
         stored = sorted(row.name.removesuffix(".npz") for row in session.query(Checkpoint))
-        assert stored == ["extraction-size", "features", "mapping", "matches", "own-car"]
+        assert stored == ["extraction-size", "features", "mapping", "matches", "own-car", "refinement"]
     other = run(world, world.ask(drive_id, wake=False, max_keypoints=500))
     assert (other.state, other.reused) == ("SUCCEEDED", [])
 
