@@ -9,7 +9,7 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """What JSON holds of an array, a number of numpy's or a path: for `default` of Python's encoder.
+    """A value as JSON holds it, of an array, a number of numpy's or a path: for `default` of Python's encoder.
 
     Raises
     ------
