@@ -189,7 +189,8 @@ class BundleAdjustmentConfig(_Section):
     sigma_rotation_deg: Positive = Field(2.0, description="prior of `rig_from_cam` where the manifest declares none")
     sigma_translation_m: Positive = Field(0.05, description="prior of `rig_from_cam` where the manifest declares none")
     sigma_focal: Positive = Field(
-        0.002, description="prior of a focal length relative to itself, where intrinsics vary"
+        0.01,
+        description="prior of a focal length relative to itself, where intrinsics vary and the manifest declares none",
     )
     sigma_principal_point: Positive = Field(
         0.002, description="prior of a principal point relative to the focal length, where intrinsics vary"
@@ -212,10 +213,10 @@ class BundleAdjustmentConfig(_Section):
         description="each camera's constant offset of its timestamps varies with its prior where `rig_from_cam` varies "
         "and cameras are not simultaneous, or the manifest declares how well their times are known",
     )
-    refine_focal: bool = Field(
-        False,
+    refine_focal: bool | None = Field(
+        None,
         description="the intrinsics of each camera's model vary with their priors, where `rig_from_cam` varies too and "
-        "the drive observes the focal length",
+        "the drive observes the focal length; by default those of a single camera alone",
     )
     min_heading_change_deg: Positive = Field(
         15.0,

@@ -103,6 +103,8 @@ def _say(report: dict[str, Any], out: Path) -> None:
     print(f"  calibration:      {'refined' if calibration['adjusted'] else 'held'} ({calibration['reason']})")
     for line in _verdicts(calibration):
         print(f"    {line}")
+    for camera, focal in calibration.get("focal_lengths_px", {}).items():
+        print(f"    {camera}: intrinsics refined, focal length {focal['refined']:.1f} px, was {focal['given']:.1f}")
     if "pictures" in stages:
         print(f"  road from above:  {_birds_eye(stages['pictures']['birds_eye'], out)}")
     for camera, images in Counter(image["camera"] for image in mapping["images_occluded"]).items():

@@ -95,6 +95,18 @@ def held_intrinsics(mapper: Mapper) -> IntrinsicsDecision:
     return IntrinsicsDecision(free=np.zeros((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_))
 
 
+def intrinsics_may_vary(mapper: Mapper, *, calibration_varies: bool) -> bool:
+    """True where the settings let intrinsics vary: with the cameras' places in the rig, or those of a single camera.
+
+    By default the latter alone: what is wrong with its lens no other camera takes.
+    """
+    settings = mapper.config.bundle_adjustment
+    is_alone = mapper.drive.has_single_camera and settings.priors and settings.camera_set_adjustment
+    if settings.refine_focal is None:
+        return is_alone
+    return settings.refine_focal and (calibration_varies or is_alone)
+
+
 def assess_intrinsics(
     mapper: Mapper, *, free_units: Bools, terms: Sequence[Term], options: SolverOptions
 ) -> IntrinsicsDecision:
@@ -114,9 +126,15 @@ def assess_intrinsics(
         terms=[prior, *terms],
         options=options,
     )
-    # At the solution: residuals of a focal length that is off would pass for errors that its observations share.
-    sigma = covariances(problem, solve(problem)[0]).sigma_camera[:, 6]
+    # Errors that observations share come on top of that, and are known at the solution alone: residuals of a focal
+    # length that is off would pass for them.
+    sigma = covariances(problem, problem.state, shared_errors=False).sigma_camera[:, 6]
     observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
+    if observed.any():
+        sigma = covariances(problem, solve(problem)[0]).sigma_camera[:, 6]
+        observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
+    if not observed.any() and not mapper.config.bundle_adjustment.refine_focal:
+        return held_intrinsics(mapper)
     return IntrinsicsDecision(
         free=_of_models(mapper) & observed[:, None], sigma_focal=sigma, prior_sigma_focal=prior.sigma[:, 0]
     )

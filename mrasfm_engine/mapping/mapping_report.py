@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.solver import Report
+from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.mapping import rig_motion
 from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
@@ -99,6 +100,21 @@ def _covered(mapper: Mapper, log: MappingLog) -> list[dict[str, Any]]:
     ]
 
 
+def _focal_lengths(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
+    """Focal lengths of the cameras whose intrinsics varied; nothing where none did."""
+    if not refinement.intrinsics_vary or refinement.intrinsics is None:
+        return {}
+    return {
+        "focal_lengths_px": {
+            camera.name: {"given": camera.params[0], "refined": unpack_camera(camera.model, params)[0]}
+            for camera, params, free in zip(
+                mapper.drive.cameras, mapper.state.camera_params, refinement.intrinsics.free[:, 0], strict=True
+            )
+            if free
+        }
+    }
+
+
 def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
     """Alignment, adjustments and certainty of the last stage."""
     placement, certainty = refinement.placement, refinement.certainty
@@ -121,6 +137,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "reason": refinement.calibration.reason,
             "heading_change_deg": heading_change_deg(mapper),
             **_directions(mapper, refinement),
+            **_focal_lengths(mapper, refinement),
         },
         "georeferenced": refinement.georeferenced,
         "moving_objects": _moving(refinement.moving),

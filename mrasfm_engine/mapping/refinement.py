@@ -28,7 +28,13 @@ from mrasfm_engine.mapping.calibration import (
 from mrasfm_engine.mapping.georeferencing import BENT
 from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
 from mrasfm_engine.mapping.inlier_gates import observation_sigma_px
-from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, assess_intrinsics, held_intrinsics, intrinsics_prior
+from mrasfm_engine.mapping.intrinsics import (
+    IntrinsicsDecision,
+    assess_intrinsics,
+    held_intrinsics,
+    intrinsics_may_vary,
+    intrinsics_prior,
+)
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
     MIN_OTHERS,
@@ -78,6 +84,7 @@ class Refinement:
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     given_scale: ScalePrior | None = None  # what the rotations as given say of it, where positions do not
     intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
+    is_of_one_camera: bool = False  # whose intrinsics may vary, at its place in the rig as given
     times_vary: bool = False
     mean_time_varies: bool = False
     times: TimeCertainty | None = None  # of the cameras' time offsets; None where it is not known
@@ -95,6 +102,11 @@ class Refinement:
     wrong_pair: MiscalibratedPair | None = None  # of a rig of two cameras
     moving: MovingTracks = field(default_factory=MovingTracks)
     road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
+
+    @property
+    def intrinsics_vary(self) -> bool:
+        """True where any camera's intrinsics are free."""
+        return self.intrinsics is not None and bool(self.intrinsics.free.any())
 
     @property
     def placement(self) -> Placement | None:
@@ -175,7 +187,8 @@ def refine(
             options=_options(mapper, result.sigma_px),
         )
     result.intrinsics = held_intrinsics(mapper)
-    if mapper.config.bundle_adjustment.refine_focal and result.calibration.free:
+    if calibrated is None and intrinsics_may_vary(mapper, calibration_varies=result.calibration.free):
+        result.is_of_one_camera = mapper.drive.has_single_camera
         result.intrinsics = assess_intrinsics(
             mapper,
             free_units=free_units,
@@ -274,7 +287,7 @@ def _adjust(
         adjust_poses(
             mapper,
             free_units & mapper.registered,
-            free_cameras=result.recalibrated,
+            free_cameras=result.recalibrated | (result.is_of_one_camera and result.intrinsics_vary),
             free_intrinsics=None if result.intrinsics is None else result.intrinsics.free,
             free_times=result.recalibrated if result.times_vary else None,
             terms=terms,
@@ -428,7 +441,9 @@ def _terms(mapper: Mapper, result: Refinement) -> list[Term]:
         # The cameras that stay hold the gauge.
         of_others = (~result.recalibrated).astype(np.float64)
         terms.append(replace(calibration_prior(mapper, result.held), gauge_weights=of_others))
-    if result.intrinsics is not None and result.intrinsics.free.any():
+    if result.is_of_one_camera:
+        terms.append(calibration_prior(mapper, np.ones((1, 6), dtype=np.bool_)))
+    if result.intrinsics_vary:
         terms.append(intrinsics_prior(mapper))
     if result.times_vary:
         terms.append(time_prior(mapper, mean_varies=result.mean_time_varies, held=result.held_times))
@@ -450,16 +465,15 @@ def _certainty(mapper: Mapper, result: Refinement) -> Covariances | None:
     if not (mapper.config.bundle_adjustment.priors and mapper.config.bundle_adjustment.camera_set_adjustment):
         return None
     several = not mapper.drive.has_single_camera
-    terms = [
-        term for term in _terms(mapper, result) if result.calibration.free or not isinstance(term, CalibrationPrior)
-    ]
+    is_kept = result.calibration.free or result.is_of_one_camera
+    terms = [term for term in _terms(mapper, result) if is_kept or not isinstance(term, CalibrationPrior)]
     if several and not result.calibration.free:
         terms.append(calibration_prior(mapper))
     free_intrinsics = None
     if result.intrinsics is not None and result.intrinsics.asked:
         # Whoever lets the focal length vary is not certain of the others either.
-        free_intrinsics = np.full((len(mapper.camera_kind), INTRINSICS), several)
-        if not result.intrinsics.free.any():
+        free_intrinsics = np.ones((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_)
+        if not result.intrinsics_vary:
             terms.append(intrinsics_prior(mapper))
     times_vary = several and times_may_vary(mapper)
     if times_vary:
@@ -467,7 +481,7 @@ def _certainty(mapper: Mapper, result: Refinement) -> Covariances | None:
         terms.append(ReadoutPrior(sigma_s=SIGMA_READOUT_S))
     problem, _ = mapper.problem(
         _free_units(mapper, result.absolute),
-        free_cameras=np.full(len(mapper.camera_kind), several),
+        free_cameras=np.full(len(mapper.camera_kind), several or result.is_of_one_camera),
         free_intrinsics=free_intrinsics,
         free_times=np.full(len(mapper.camera_kind), times_vary),
         free_readouts=undeclared_readouts(mapper) & times_vary,

@@ -83,6 +83,34 @@ def test_focal_lengths_that_are_given_too_long_are_found() -> None:
     assert (np.abs(error) < 3 * result.certainty.sigma_camera[:, 6]).all()
 
 
+@pytest.mark.parametrize("refine_focal", [None, *slow(True, False)])
+def test_a_single_camera_by_default(refine_focal: bool | None) -> None:
+    """Nothing else takes what is wrong with its lens; its place in the rig stays as given."""
+    mapper, simulated = model(straight=False, focal=1.01, cameras=1)
+    settings = BundleAdjustmentConfig(refine_focal=refine_focal)
+    mapper.config = EngineConfig(threads=1, bundle_adjustment=settings)
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
+    error = mapper.state.camera_params[:, 0] / simulated.truth.camera_params[:, 0] - 1
+    np.testing.assert_allclose(mapper.state.rig_from_cam, mapper.drive.rig_from_cam, atol=1e-6)
+    assert result.certainty is not None
+    if refine_focal is False:
+        np.testing.assert_allclose(error, 0.01)
+    else:
+        assert np.abs(error).max() < 0.003
+        assert (np.abs(error) < 3 * result.certainty.sigma_camera[:, 6]).all()
+        assert (result.certainty.sigma_camera[:, 6] < 0.003).all()
+
+
+def test_a_single_camera_on_a_straight_street_says_nothing() -> None:
+    mapper, simulated = model(straight=True, focal=1.001, cameras=1)
+    mapper.config = EngineConfig(threads=1)
+    given = mapper.state.camera_params.copy()
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
+    np.testing.assert_array_equal(mapper.state.camera_params, given)
+    assert result.intrinsics is not None
+    assert result.intrinsics.findings(mapper) == []
+
+
 def test_leaving_the_prior_is_a_finding() -> None:
     mapper, _ = model(straight=False, cameras=2)
     mapper.state.camera_params[0, :2] *= 1.1
