@@ -24,9 +24,11 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import Floats
+from schemas.artifacts import Stage
 
 FULL = "full"
 WARM_UP_UNITS = 5
+TIMED = (Stage.MAPPING, Stage.REFINEMENT)
 Progress = Callable[[str, str, int, int], None]  # row, stage, done, total
 
 
@@ -161,14 +163,14 @@ def ablate(
 
 
 class _Store(StageStore):
-    """Stages of one row, and of those that another row has already finished; mapping is always done, as it is timed."""
+    """Stages of one row, and of those that another row has already finished; what is timed is always done."""
 
     def __init__(self, folder: Path, shared: StageStore | None = None) -> None:
         super().__init__(folder)
         self._shared = shared
 
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
-        if name == "mapping":
+        if name in TIMED:
             return None
         own = super()._read(name, key, arrays=arrays)
         return own if own is not None or self._shared is None else self._shared._read(name, key, arrays=arrays)
@@ -191,7 +193,7 @@ def _require_truth(drive: Drive, truth: Trajectory) -> None:
 
 def _remark(switch: Switch, drive: Drive, config: EngineConfig) -> str:
     if drive.has_single_camera and switch.field.startswith("camera_set"):
-        return "one camera: there is no camera set"
+        return "one camera: there is no camera set, and its intrinsics are held"
     has_masks = config.semantics.model is not None or any(image.mask for image in drive.images)
     if switch.field == "semantic_triangulation" and not has_masks:
         return "the drive has no masks: the road is known by geometry alone"

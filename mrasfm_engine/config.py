@@ -207,7 +207,11 @@ class BundleAdjustmentConfig(_Section):
         2000.0,
         description="prior of a camera's time offset where the manifest declares none: clocks that software reads",
     )
-    refine_calibration: bool = Field(True, description="`rig_from_cam` varies where motion or GNSS make it observable")
+    refine_calibration: bool = Field(
+        True,
+        description="`rig_from_cam` varies where motion or GNSS make it observable; `false` holds a single camera's "
+        "intrinsics as well",
+    )
     refine_time_offsets: bool = Field(
         True,
         description="each camera's constant offset of its timestamps varies with its prior where `rig_from_cam` varies "
@@ -215,8 +219,8 @@ class BundleAdjustmentConfig(_Section):
     )
     refine_focal: bool | None = Field(
         None,
-        description="the intrinsics of each camera's model vary with their priors, where `rig_from_cam` varies too and "
-        "the drive observes the focal length; by default those of a single camera alone",
+        description="the intrinsics of each camera's model vary with their priors where the drive observes the focal "
+        "length: those of several cameras where `rig_from_cam` varies too; by default those of a single camera alone",
     )
     min_heading_change_deg: Positive = Field(
         15.0,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine import stages
-from mrasfm_engine.ablation import warm_up
+from mrasfm_engine.ablation import TIMED, warm_up
 from mrasfm_engine.benchmark import simulated_drive
 from mrasfm_engine.benchmark.simulated_descriptors import store_descriptors
 from mrasfm_engine.config import EngineConfig
@@ -174,7 +174,7 @@ class _MappedAnew(StageStore):
     """Finished stages, of which mapping and what follows is always done again: it is what is timed."""
 
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
-        return None if name in (Stage.MAPPING, Stage.REFINEMENT) else super()._read(name, key, arrays=arrays)
+        return None if name in TIMED else super()._read(name, key, arrays=arrays)
 
 
 def _run(progress: StageProgress, drive_folder: Path, config: EngineConfig, store: StageStore) -> stages.Run:

@@ -16,6 +16,7 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
 
 LARGEST_DENSE = 4000  # unknowns
+MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 SINGULAR = 1e-11  # pivots and eigenvalues of the scaled matrix below this are rounding
 UNKNOWN_SCALE = 1e3  # sigma of the scale, relative: no image knows it so badly, and rounding no better
 

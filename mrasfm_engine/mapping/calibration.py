@@ -188,6 +188,7 @@ def take_calibration(mapper: Mapper, other: Mapper) -> None:
     if min(lengths_m) ** 2 >= MIN_BASELINES_M2:
         scale_with_baselines(mapper, float(lengths_m[1] / lengths_m[0]))
     mapper.state = mapper.state.with_cameras_of(other.state)
+    mapper.renew_rays()
     mapper.renew_motion()
 
 

@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.marginal_covariances import MAX_UNKNOWNS_FOR_COVARIANCE, covariances
+from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.types import Bools, Floats
+from mrasfm_engine.types import Bools, Cancel, Floats
 from schemas.drive import CAMERA_MODELS, Camera
 from schemas.findings import Finding, warning
 
@@ -54,13 +55,13 @@ class IntrinsicsDecision:
         return len(self.sigma_focal) > 0
 
     def findings(self, mapper: Mapper) -> list[Finding]:
-        """Focal lengths that the drive does not observe, those that left their priors, and lenses of which some terms
-        are held while the others vary.
+        """Focal lengths that the drive does not observe although the settings ask for them, those that left their
+        priors, and lenses of which some terms are held while the others vary.
         """
         found = []
         off = np.log(mapper.state.camera_params[:, 0] / pack_cameras(mapper.drive.cameras)[1][:, 0])
         for c, camera in enumerate(mapper.drive.cameras if self.asked else ()):
-            if not self.free[c, 0]:
+            if not self.free[c, 0] and mapper.config.bundle_adjustment.refine_focal:
                 found.append(
                     warning(
                         "focal-not-observed",
@@ -69,7 +70,7 @@ class IntrinsicsDecision:
                         "Give a drive that turns, or leave refine_focal off.",
                     )
                 )
-            elif abs(off[c]) > BEYOND_PRIOR_SIGMAS * self.prior_sigma_focal[c]:
+            elif self.free[c, 0] and abs(off[c]) > BEYOND_PRIOR_SIGMAS * self.prior_sigma_focal[c]:
                 found.append(
                     warning(
                         "focal-beyond-prior",
@@ -101,20 +102,26 @@ def intrinsics_may_vary(mapper: Mapper, *, calibration_varies: bool) -> bool:
     By default the latter alone: what is wrong with its lens no other camera takes.
     """
     settings = mapper.config.bundle_adjustment
-    is_alone = mapper.drive.has_single_camera and settings.priors and settings.camera_set_adjustment
+    is_alone = mapper.drive.has_single_camera and settings.refine_calibration
+    is_alone = is_alone and settings.priors and settings.camera_set_adjustment
     if settings.refine_focal is None:
         return is_alone
     return settings.refine_focal and (calibration_varies or is_alone)
 
 
 def assess_intrinsics(
-    mapper: Mapper, *, free_units: Bools, terms: Sequence[Term], options: SolverOptions
+    mapper: Mapper,
+    *,
+    free_units: Bools,
+    terms: Sequence[Term],
+    options: SolverOptions,
+    cancel: Cancel | None = None,
 ) -> IntrinsicsDecision:
     """Free the intrinsics that the cameras' models have where the drive observes the focal length.
 
     Parameters
     ----------
-    free_units, terms, options
+    free_units, terms, options, cancel
         Of the adjustment that would follow, with the calibration's prior; that of the intrinsics is added.
     """
     cameras = len(mapper.camera_kind)
@@ -126,15 +133,13 @@ def assess_intrinsics(
         terms=[prior, *terms],
         options=options,
     )
-    # Errors that observations share come on top of that, and are known at the solution alone: residuals of a focal
-    # length that is off would pass for them.
-    sigma = covariances(problem, problem.state, shared_errors=False).sigma_camera[:, 6]
-    observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
-    if observed.any():
-        sigma = covariances(problem, solve(problem)[0]).sigma_camera[:, 6]
-        observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
-    if not observed.any() and not mapper.config.bundle_adjustment.refine_focal:
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return held_intrinsics(mapper)
+    # At the solution: residuals of a focal length that is off would pass for errors that its observations share.
+    an_image = mapper.config.mapping.pose_observations
+    solution, _ = solve_with_chosen_points(problem, mapper.image_size_px, an_image=an_image, cancel=cancel)
+    sigma = covariances(problem, solution).sigma_camera[:, 6]
+    observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
     return IntrinsicsDecision(
         free=_of_models(mapper) & observed[:, None], sigma_focal=sigma, prior_sigma_focal=prior.sigma[:, 0]
     )

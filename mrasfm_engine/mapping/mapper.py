@@ -137,8 +137,13 @@ class Mapper:
             mapper.set_image_pose(int(image), arrays["unit_from_image"][image])
         return mapper
 
+    def renew_rays(self) -> None:
+        """Let the keypoints' viewing rays be those through the present lenses, from which points are triangulated."""
+        self.keypoints = self.keypoints.seen_through(self.camera_kind, self.state.camera_params)
+        self.triangulator = self.triangulator.with_keypoints(self.keypoints)
+
     def rays_of(self, pair: PairMatches) -> tuple[Floats, Floats]:
-        """Viewing rays (n, 3) of all of a pair's matches in image_a and image_b, through the lenses as given."""
+        """Viewing rays (n, 3) of all of a pair's matches in image_a and image_b."""
         first = self.keypoints.first
         a, b = first[pair.image_a] + pair.matches[:, 0], first[pair.image_b] + pair.matches[:, 1]
         return self.keypoints.rays[a], self.keypoints.rays[b]

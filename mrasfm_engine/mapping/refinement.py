@@ -7,7 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
+from mrasfm_engine.bundle_adjustment.marginal_covariances import (
+    MAX_UNKNOWNS_FOR_COVARIANCE,
+    Covariances,
+    covariances,
+)
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
@@ -70,7 +74,6 @@ STRAIGHTENED = 0.7  # and each leaves at most so much of it
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
 ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
-MAX_UNKNOWNS_FOR_COVARIANCE = 200_000  # of units and cameras: 33,000 units; above, it takes minutes
 BEHIND = 0.1  # of an observation's sigma, beyond which a scene that stayed behind its baselines is adjusted
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
 
@@ -194,6 +197,7 @@ def refine(
             free_units=free_units,
             terms=_terms(mapper, result),
             options=_options(mapper, result.sigma_px),
+            cancel=cancel,
         )
     _rescale(mapper, result, _terms(mapper, result))
     steady = _unbend(mapper, result, free_units, cancel)
@@ -296,6 +300,8 @@ def _adjust(
             cancel=cancel,
         )
     )
+    if result.intrinsics_vary:
+        mapper.renew_rays()
     _rescale(mapper, result, terms)
 
 
@@ -361,7 +367,7 @@ def _directions(
 ) -> Observability | None:
     """Directions that the drive observes by its certainty, or by another `covariance` of the calibration."""
     cameras = len(mapper.camera_kind)
-    if certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
+    if mapper.drive.has_single_camera or certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
         return None
     prior = calibration_prior(mapper)
     return assess_directions(

@@ -31,8 +31,8 @@ class MappedDrive:
     Attributes
     ----------
     mappers
-        Makes the model of every component, the largest first. Models of a long drive are most of what stands in memory,
-        and whoever finds the refined scene in the store needs none.
+        Makes a mapper of every component, the largest first; once, as they change the arrays that they are made of.
+        Mappers of a long drive are most of what stands in memory, and a refined scene in the store needs none.
     """
 
     features: Sequence[ImageFeatures]
@@ -110,9 +110,11 @@ def map_once(
     run.report["findings"] += report["findings"]
 
     def mappers() -> list[Mapper]:
-        lined_up = keypoints_of(run, found, pairs)[0] if keypoints is None else keypoints
+        in_row = keypoints_of(run, found, pairs)[0] if keypoints is None else keypoints
+        mapped = dict(arrays)
+        arrays.clear()
         return [
-            Mapper.from_arrays(run.drive, lined_up, run.config, known.world_from_rig, numbered(arrays, number))
+            Mapper.from_arrays(run.drive, in_row, run.config, known.world_from_rig, numbered(mapped, number))
             for number in range(len(report["components"]))
         ]
 
@@ -126,8 +128,8 @@ def _mapped_once(
     settings = mapping_settings(run)
     if run.is_done(Stage.MAPPING, settings):
         return None, *run.stage(Stage.MAPPING, settings, lambda: work(*keypoints_of(run, found, pairs)))
-    lined_up = keypoints_of(run, found, pairs)  # no part of what the stage takes
-    return lined_up[0], *run.stage(Stage.MAPPING, settings, lambda: work(*lined_up))
+    given = keypoints_of(run, found, pairs)  # no part of what the stage takes
+    return given[0], *run.stage(Stage.MAPPING, settings, lambda: work(*given))
 
 
 def numbered(arrays: Arrays, number: int) -> Arrays:

@@ -27,7 +27,7 @@ from mrasfm_engine.stages._run import Run
 from schemas.artifacts import Stage
 from schemas.findings import as_json
 
-Part = tuple[Scene, dict[str, Any]]  # a component in a frame of its own, and its report
+RefinedComponent = tuple[Scene, dict[str, Any]]  # a component in a frame of its own, and its report
 _DOCUMENT = "document"  # all of a scene that is no array, as JSON in UTF-8
 
 
@@ -62,7 +62,7 @@ class _Refined:
         return _Refined(scene=scene, **document)
 
 
-def refinement(run: Run, mapped: MappedDrive, known: PriorTrajectory) -> tuple[Scene, list[Part]]:
+def refinement(run: Run, mapped: MappedDrive, known: PriorTrajectory) -> tuple[Scene, list[RefinedComponent]]:
     """Georeferencing, the final adjustment with all priors, and how certain the result is, of every component.
 
     Returns
@@ -99,7 +99,7 @@ def _refined_components(run: Run, mapped: MappedDrive, known: PriorTrajectory) -
     return result
 
 
-def _part(run: Run, refined: _Refined, number: int, whole: Scene) -> Part:
+def _part(run: Run, refined: _Refined, number: int, whole: Scene) -> RefinedComponent:
     """A component besides the largest, `whole`, with its own images alone; and its report."""
     part, stage = refined.scene, run.report["stages"][-1]
     inside = part.unit_registered[part.image_unit]

@@ -15,13 +15,15 @@ from mrasfm_engine.freed_memory import return_freed_memory
 from mrasfm_engine.mapping.components import LinkedBy
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.unit_components import connected_units
-from mrasfm_engine.stages._refinement import Part
+from mrasfm_engine.stages._refinement import RefinedComponent
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.visualization.pictures import draw_pictures
 from schemas.artifacts import Stage
 
 
-def numbered_components(run: Run, whole: Scene, others: Sequence[Part]) -> tuple[Scene, list[Part]]:
+def numbered_components(
+    run: Run, whole: Scene, others: Sequence[RefinedComponent]
+) -> tuple[Scene, list[RefinedComponent]]:
     """The scenes with the number of every unit's component.
 
     Those in frames of their own have the numbers of their folders; those that positions or rough poses alone put into

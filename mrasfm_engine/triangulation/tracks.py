@@ -28,7 +28,7 @@ class Keypoints:
     camera: Ints  # (n,)
     band: Ints  # (n,) index into the drive's row bands, see `scene.row_bands`
     xy_px: Floats  # (n, 2)
-    rays: Floats  # (n, 3) unit viewing rays in camera axes under the given intrinsics
+    rays: Floats  # (n, 3) unit viewing rays in camera axes, by the intrinsics as given or see `seen_through`
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
     classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # (images,) which have a feature of a known class, here or among those that are not lined up; by default none
@@ -39,6 +39,10 @@ class Keypoints:
             object.__setattr__(self, "classes", np.zeros(len(self.image), np.uint8))
         if not len(self.is_masked):
             object.__setattr__(self, "is_masked", np.zeros(len(self.first) - 1, np.bool_))
+
+    def seen_through(self, kinds: Ints, params: Floats) -> Keypoints:
+        """The same with the rays of cameras of these kinds (c,) and parameters (c, PARAMETERS)."""
+        return replace(self, rays=_rays_of(self.xy_px, self.camera, kinds, params))
 
     @staticmethod
     def from_features(drive: Drive, features: Sequence[ImageFeatures], bands: RowBands | None = None) -> Keypoints:
@@ -90,11 +94,6 @@ class Keypoints:
             is_masked.append(bool((known != UNKNOWN).any()))
         xy = np.concatenate(positions).astype(np.float64).reshape(-1, 2)
         camera = camera_of_image[image]
-        rays = np.empty((len(xy), 3))
-        kinds, params = pack_cameras(drive.cameras)
-        for c, (kind, p) in enumerate(zip(kinds, params, strict=True)):
-            rows = camera == c
-            rays[rows] = unproject_pixels(int(kind), p, xy[rows])
         return Keypoints(
             first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
             number=np.concatenate(numbers).astype(np.int64),
@@ -103,10 +102,19 @@ class Keypoints:
             camera=camera,
             band=image if bands is None else bands.of_pixels(image, xy),
             xy_px=xy,
-            rays=rays,
+            rays=_rays_of(xy, camera, *pack_cameras(drive.cameras)),
             classes=np.concatenate(classes),
             is_masked=np.array(is_masked),
         )
+
+
+def _rays_of(xy_px: Floats, camera: Ints, kinds: Ints, params: Floats) -> Floats:
+    """Viewing rays (n, 3) of pixels (n, 2) of cameras (n,)."""
+    rays = np.empty((len(xy_px), 3))
+    for c, (kind, of_camera) in enumerate(zip(kinds, params, strict=True)):
+        rows = camera == c
+        rays[rows] = unproject_pixels(int(kind), of_camera, xy_px[rows])
+    return rays
 
 
 def _inliers_of(pair: PairMatches) -> PairMatches:

@@ -7,6 +7,7 @@ in which units were registered, so all points can be triangulated anew after pos
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -302,6 +303,12 @@ class Triangulator:
         self._few_bands = len(band_unit) <= ALL_SHOTS
         self.max_error_px = max_error_px
         self._min_angle = math.radians(min_angle_deg)
+
+    def with_keypoints(self, keypoints: Keypoints) -> Triangulator:
+        """The same for other keypoints of the drive."""
+        result = copy.copy(self)
+        result._keypoints = keypoints
+        return result
 
     def _cam_from_world(self, state: State, keypoints: Ints | None) -> tuple[Floats, Floats]:
         """Poses of all row bands; where there are many, only those of some keypoints' row bands are filled in."""

@@ -27,7 +27,10 @@ class ReconstructionSettings(RequestBody):
         None, description="pixels; larger images are extracted at reduced size"
     )
     refine_calibration: bool | None = Field(None, description="rig_from_cam, where the drive makes it observable")
-    refine_focal: bool | None = Field(None, description="focal lengths, where rig_from_cam varies too")
+    refine_focal: bool | None = Field(
+        None,
+        description="intrinsics, where the drive observes focal lengths; by default of a single camera",
+    )
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(None, description="of all that is drawn at random")
     extractor: ExtractorName | None = Field(None, description="of keypoints; all but sift need a model on the workers")
     matcher: MatcherName | None = Field(

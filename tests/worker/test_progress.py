@@ -186,4 +186,4 @@ def test_every_setting_of_a_request_reaches_the_engine() -> None:
     assert config.semantics.model == "streets"
     assert config.submaps.count == 4
     assert (config.mapping.semantic_triangulation, config.mapping.motion_compensation) == (False, False)
-    assert (plain.use_gnss, plain.features.max_keypoints, plain.bundle_adjustment.refine_focal) == (True, 2048, False)
+    assert (plain.use_gnss, plain.features.max_keypoints, plain.bundle_adjustment.refine_focal) == (True, 2048, None)

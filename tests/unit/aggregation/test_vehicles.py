@@ -265,13 +265,31 @@ def test_focal_lengths_are_shared_where_intrinsics_are_asked_for(base: SourceSce
     asked = CONFIG.model_copy(update={"refine_focal": True})
     (vehicle,) = vehicles_of(scenes, asked)
     expected = vehicle.expected[1]
-    # By the prior of 0.2 % the first found a little less than its images say.
+    # By its prior the first found a little less than its images say.
     np.testing.assert_allclose(expected.correction[:, 6], np.log(1.004), rtol=0.08)
     assert (expected.sigma[:, 6] > 0.0002).all()
     assert (expected.sigma[:, 6] < 0.001).all()
     assert expected.learns
     assert np.isinf(vehicle.expected[0].sigma[:, 6]).all()
     assert np.isinf(one_vehicle(scenes).expected[1].sigma[:, 6]).all()
+
+
+@pytest.mark.parametrize("refine_focal", [None, False])
+def test_focal_lengths_of_single_cameras_are_shared_by_default(base: SourceScene, refine_focal: bool | None) -> None:
+    rng = np.random.default_rng(11)
+    truth = true_vehicle(base, 2, rng)
+    both = [with_focal(seen(base, str(k), truth, k, WELL, rng), 0.004, 0.0002) for k in range(2)]
+    config = CONFIG.model_copy(update={"refine_focal": refine_focal})
+    (vehicle,) = vehicles_of([first_camera_of(scene) for scene in both], config)
+    known = np.isfinite(vehicle.expected[1].sigma[:, 6])
+    assert known.all() if refine_focal is None else not known.any()
+
+
+def first_camera_of(scene: SourceScene) -> SourceScene:
+    cameras = scene.manifest.rig.cameras[:1]
+    manifest = scene.manifest.model_copy(update={"rig": scene.manifest.rig.model_copy(update={"cameras": cameras})})
+    entries = {camera.name: scene.calibration["cameras"][camera.name] for camera in cameras}
+    return replace(scene, manifest=manifest, calibration={**scene.calibration, "cameras": entries})
 
 
 def test_no_false_alarms(base: SourceScene) -> None:

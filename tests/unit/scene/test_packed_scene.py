@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.scene.packed_scene import GIVEN, pack_scene, unpack_scene
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
 from mrasfm_engine.scene.road_relief import Relief
-from mrasfm_engine.scene.scene import CalibrationObservability, Scene
+from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibration, Georeference, Scene
+from mrasfm_engine.stages import VERSIONS
+from schemas.artifacts import Stage
 from tests.helpers.export_example import make_scene
 
 
@@ -38,6 +41,13 @@ def assert_same(a: object, b: object, name: str) -> None:
             assert_same(*pair, f"{name}.{number}")
     else:
         assert a == b or (a != a and b != b), name
+
+
+def test_a_stored_refinement_has_a_version_for_its_fields() -> None:
+    """Raise `VERSIONS[Stage.REFINEMENT]` with every change of these: older files have others."""
+    kinds = (Scene, CameraCalibration, CalibrationObservability, Georeference, Road, RoadSurface, RoadPoints, Relief)
+    names = ",".join(f"{kind.__name__}.{field.name}" for kind in kinds for field in fields(kind))
+    assert (VERSIONS[Stage.REFINEMENT], len(names), zlib.crc32(names.encode())) == (1, 1492, 14841771)
 
 
 def test_every_field(tmp_path: Path) -> None:
