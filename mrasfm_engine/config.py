@@ -227,6 +227,10 @@ class BundleAdjustmentConfig(_Section):
         description="with `reassessment = false` alone: without GNSS, straighter drives hold the calibration as given",
     )
 
+    def intrinsics_may_vary(self, *, is_single_camera: bool) -> bool:
+        """Return whether the settings let intrinsics vary; by default those of a single camera."""
+        return is_single_camera if self.refine_focal is None else self.refine_focal
+
 
 class GnssConfig(_Section):
     """Use of the receiver's positions."""

@@ -196,9 +196,8 @@ def _calibration(
     sigma = sigma_given.copy()
     if scene.certainty_of_cameras is not None:
         sigma[:, :6] = scene.certainty_of_cameras[0]
-    # By default those of a single camera vary, see `mapping.intrinsics`.
-    focal_varies = len(cameras) == 1 if config.refine_focal is None else config.refine_focal
-    observed = np.isfinite(scene.sigma_focal_px) & focal_varies
+    may_vary = config.intrinsics_may_vary(is_single_camera=len(cameras) == 1)
+    observed = np.isfinite(scene.sigma_focal_px) & may_vary
     sigma[observed, 6] = (scene.sigma_focal_px / manifest_focal_px)[observed]
     says = sigma < NOTHING_OBSERVED * sigma_given
     information = np.where(says, sigma**-2.0 - sigma_given**-2.0, 0.0)

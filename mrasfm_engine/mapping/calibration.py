@@ -182,6 +182,24 @@ def _share_of_baselines(mapper: Mapper, certainty: Covariances) -> tuple[float, 
     return float(np.clip(covariance / variance, 0.0, 1.0)), covariance**2 / variance
 
 
+def of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
+    """The certainty of the cameras' poses among one another; the gauge is as soft as it has to be to be solved."""
+    cameras = len(mapper.camera_kind)
+    if certainty.calibration.shape != (6 * cameras, 6 * cameras) or not np.isfinite(certainty.calibration).all():
+        return certainty
+    prior = calibration_prior(mapper)
+    calibration = prior.without_gauge(certainty.calibration)
+    sigma_camera = certainty.sigma_camera.copy()
+    sigma_camera[:, :6] = np.sqrt(np.maximum(np.diagonal(calibration), 0.0)).reshape(cameras, 6)
+    return replace(
+        certainty,
+        calibration=calibration,
+        calibration_of_independent_errors=prior.without_gauge(certainty.calibration_of_independent_errors),
+        scale_with_calibration=prior.without_gauge(certainty.scale_with_calibration),
+        sigma_camera=sigma_camera,
+    )
+
+
 def take_calibration(mapper: Mapper, other: Mapper) -> None:
     """Give the mapper's cameras the calibration of another scene of the drive; units and points follow its scale."""
     lengths_m = [np.linalg.norm(_about_their_mean(m.state.camera_position_m)) for m in (mapper, other)]

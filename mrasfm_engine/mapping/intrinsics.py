@@ -102,11 +102,10 @@ def intrinsics_may_vary(mapper: Mapper, *, calibration_varies: bool) -> bool:
     By default the latter alone: what is wrong with its lens no other camera takes.
     """
     settings = mapper.config.bundle_adjustment
-    is_alone = mapper.drive.has_single_camera and settings.refine_calibration
-    is_alone = is_alone and settings.priors and settings.camera_set_adjustment
-    if settings.refine_focal is None:
-        return is_alone
-    return settings.refine_focal and (calibration_varies or is_alone)
+    is_single = mapper.drive.has_single_camera
+    is_free = settings.refine_calibration and settings.priors and settings.camera_set_adjustment
+    may_vary = settings.intrinsics_may_vary(is_single_camera=is_single)
+    return may_vary and (calibration_varies or (is_single and is_free))
 
 
 def assess_intrinsics(

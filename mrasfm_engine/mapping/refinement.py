@@ -25,6 +25,7 @@ from mrasfm_engine.mapping.calibration import (
     calibration_prior,
     has_few_units,
     hold_baselines,
+    of_cameras_alone,
     resolve_scale,
     sigma_scale_of_images,
     take_calibration,
@@ -496,22 +497,4 @@ def _certainty(mapper: Mapper, result: Refinement) -> Covariances | None:
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return None
-    return _of_cameras_alone(mapper, covariances(problem, problem.state))
-
-
-def _of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
-    """The certainty of the cameras' poses among one another; the gauge is as soft as it has to be to be solved."""
-    cameras = len(mapper.camera_kind)
-    if certainty.calibration.shape != (6 * cameras, 6 * cameras) or not np.isfinite(certainty.calibration).all():
-        return certainty
-    prior = calibration_prior(mapper)
-    calibration = prior.without_gauge(certainty.calibration)
-    sigma_camera = certainty.sigma_camera.copy()
-    sigma_camera[:, :6] = np.sqrt(np.maximum(np.diagonal(calibration), 0.0)).reshape(cameras, 6)
-    return replace(
-        certainty,
-        calibration=calibration,
-        calibration_of_independent_errors=prior.without_gauge(certainty.calibration_of_independent_errors),
-        scale_with_calibration=prior.without_gauge(certainty.scale_with_calibration),
-        sigma_camera=sigma_camera,
-    )
+    return of_cameras_alone(mapper, covariances(problem, problem.state))

@@ -126,10 +126,10 @@ def _mapped_once(
 ) -> tuple[Keypoints | None, Arrays, dict[str, Any]]:
     """Arrays and report of the stage, and the keypoints where it was done now; nobody needs its matches any more."""
     settings = mapping_settings(run)
-    if run.is_done(Stage.MAPPING, settings):
-        return None, *run.stage(Stage.MAPPING, settings, lambda: work(*keypoints_of(run, found, pairs)))
-    given = keypoints_of(run, found, pairs)  # no part of what the stage takes
-    return given[0], *run.stage(Stage.MAPPING, settings, lambda: work(*given))
+    # No part of what the stage takes.
+    given = None if run.is_done(Stage.MAPPING, settings) else keypoints_of(run, found, pairs)
+    arrays, report = run.stage(Stage.MAPPING, settings, lambda: work(*(given or keypoints_of(run, found, pairs))))
+    return None if given is None else given[0], arrays, report
 
 
 def numbered(arrays: Arrays, number: int) -> Arrays:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.export.colmap import approximations
+from mrasfm_engine.io.packed_scene import pack_scene, unpack_scene
 from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
@@ -20,7 +21,6 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.scene.packed_scene import pack_scene, unpack_scene
 from mrasfm_engine.scene.scene import ImageFeatures, Scene
 from mrasfm_engine.stages._mapping import MappedDrive, numbered
 from mrasfm_engine.stages._run import Run

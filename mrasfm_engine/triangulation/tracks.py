@@ -135,9 +135,10 @@ class Tracks:
     def from_labels(of_keypoint: Ints) -> Tracks:
         """Tracks of the keypoints' labels, -1 for none; labels with gaps are numbered anew."""
         members = np.flatnonzero(of_keypoint >= 0)
-        _, labels = np.unique(of_keypoint[members], return_inverse=True)
+        given = of_keypoint[members]
+        _, labels = np.unique(given, return_inverse=True)
         result = of_keypoint
-        if not np.array_equal(labels, of_keypoint[members]):
+        if not np.array_equal(labels, given):
             result = np.full(len(of_keypoint), -1, dtype=np.int64)
             result[members] = labels
         order = np.argsort(labels, kind="stable")

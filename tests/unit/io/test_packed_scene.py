@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mrasfm_engine.io.packed_scene import GIVEN, pack_scene, unpack_scene
 from mrasfm_engine.io.stage_store import StageStore
-from mrasfm_engine.scene.packed_scene import GIVEN, pack_scene, unpack_scene
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
 from mrasfm_engine.scene.road_relief import Relief
 from mrasfm_engine.scene.scene import CalibrationObservability, CameraCalibration, Georeference, Scene

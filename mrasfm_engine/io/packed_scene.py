@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.road import Road, RoadPoints, RoadSource, RoadSurface
 from mrasfm_engine.scene.road_relief import Relief
@@ -22,8 +23,6 @@ from mrasfm_engine.scene.scene import (
     Scene,
 )
 from mrasfm_engine.types import Bools
-
-Arrays = dict[str, NDArray[Any]]
 
 # Whoever unpacks a scene has these, from where they came to it.
 GIVEN = ("drive", "features", "pairs", "own_cars")
@@ -73,8 +72,6 @@ def _packed(value: object, name: str, arrays: Arrays) -> Any:
     if isinstance(value, np.ndarray):
         arrays[name] = value
         return {"array": name}
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, Enum):
         return {"kind": type(value).__name__, "value": value.value}
     if is_dataclass(value) and not isinstance(value, type):
